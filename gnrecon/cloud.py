@@ -1,0 +1,127 @@
+"""Point clouds and the frame that maps a file's coordinates to the unit ball and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.errors import InputError
+
+Float = npt.NDArray[np.float64]
+
+
+def _as_rows(name: str, values: npt.ArrayLike) -> Float:
+    rows = np.ascontiguousarray(values, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise InputError(f"{name} must have shape (N, 3), but have shape {rows.shape}.")
+    return rows
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in the file's own frame and units.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3)
+        Positions, kept in float64 so that projected (UTM-sized) coordinates stay exact.
+    normals : array of shape (N, 3), optional
+        Outward directions; not necessarily of unit length as read from a file.
+    attributes : mapping of name to array of shape (N,) or (N, C)
+        Whatever else the file carries for each point (colour, intensity, labels).
+
+    Raises
+    ------
+    InputError
+        When a shape does not fit.
+    """
+
+    points: Float
+    normals: Float | None = None
+    attributes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", _as_rows("points", self.points))
+        if self.normals is not None:
+            object.__setattr__(self, "normals", _as_rows("normals", self.normals))
+            if len(self.normals) != len(self.points):
+                raise InputError(f"{len(self.points)} points cannot go with {len(self.normals)} normals.")
+        for name, values in self.attributes.items():
+            if len(values) != len(self.points):
+                raise InputError(f"{len(self.points)} points cannot go with {len(values)} values of {name!r}.")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.integer]) -> PointCloud:
+        """Return the cloud of the given rows (a mask of shape (N,), or indices), attributes included."""
+        return PointCloud(
+            self.points[rows],
+            None if self.normals is None else self.normals[rows],
+            {name: values[rows] for name, values in self.attributes.items()},
+        )
+
+    def with_normals(self, normals: Float | None) -> PointCloud:
+        """Return the same cloud with other normals, of shape (N, 3)."""
+        return replace(self, normals=normals)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The similarity between file coordinates x and unit coordinates u: ``x = center + scale * u``.
+
+    The centre is the mean of the points and the scale the largest distance from it, as in the paper's experiments.
+
+    Parameters
+    ----------
+    center : array of shape (3,), file units
+    scale : float, file units per unit radius
+    """
+
+    center: Float
+    scale: float
+
+    @classmethod
+    def of(cls, points: Float) -> Frame:
+        """Return the frame that puts `points`, of shape (N, 3), into the unit ball around their mean.
+
+        Raises
+        ------
+        InputError
+            When all points coincide.
+        """
+        center = points.mean(axis=0)
+        scale = float(np.linalg.norm(points - center, axis=1).max())
+        if not scale > 0:
+            raise InputError("All points coincide, so there is no surface to fit.")
+        return cls(center, scale)
+
+    def to_unit(self, points: Float) -> Float:
+        """Map file coordinates, of shape (N, 3), to unit coordinates."""
+        return (points - self.center) / self.scale
+
+    def to_world(self, points: Float) -> Float:
+        """Map unit coordinates, of shape (N, 3), to file coordinates."""
+        return self.center + self.scale * points
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What a fit sees: unit-ball positions with unit normals, and the frame that leads back to the file.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), unit coordinates
+    normals : array of shape (N, 3), outward, of length one
+    frame : Frame
+    """
+
+    points: Float
+    normals: Float
+    frame: Frame
+
+    def __len__(self) -> int:
+        return len(self.points)

@@ -1,0 +1,64 @@
+"""Failures that end a run, each with the exit code that the command line returns for it.
+
+Every message is one sentence for the person who ran the command: it names the offending thing and what was expected.
+"""
+
+from __future__ import annotations
+
+import enum
+
+
+class ExitCode(enum.IntEnum):
+    """Exit codes of the command line."""
+
+    OK = 0
+    USAGE = 2
+    INPUT = 3
+    FIT = 4
+    MESH = 5
+    OUTPUT = 6
+    MEMORY = 7
+    BATCH = 8
+    INTERRUPTED = 130
+
+
+class GnreconError(Exception):
+    """Base of all failures that gnrecon foresees; ``exit_code`` is what the command line returns."""
+
+    exit_code: ExitCode = ExitCode.USAGE
+
+
+class UsageError(GnreconError, ValueError):
+    """An option or argument is unknown, out of range, or contradicts another."""
+
+    exit_code = ExitCode.USAGE
+
+
+class InputError(GnreconError, ValueError):
+    """A file or array cannot be read, or what it holds cannot be reconstructed."""
+
+    exit_code = ExitCode.INPUT
+
+
+class FitError(GnreconError, RuntimeError):
+    """The field could not be fitted (non-finite values, a singular system)."""
+
+    exit_code = ExitCode.FIT
+
+
+class MeshError(GnreconError, RuntimeError):
+    """The mesh is empty, open, not manifold or not oriented, and could not be repaired."""
+
+    exit_code = ExitCode.MESH
+
+
+class OutputError(GnreconError, OSError):
+    """A result could not be written."""
+
+    exit_code = ExitCode.OUTPUT
+
+
+class MemoryLimitError(GnreconError, MemoryError):
+    """The work needs more memory than there is."""
+
+    exit_code = ExitCode.MEMORY

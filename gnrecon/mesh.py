@@ -1,0 +1,94 @@
+"""Triangle meshes, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.errors import InputError
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles over shared vertices; counter-clockwise seen from outside.
+
+    Parameters
+    ----------
+    vertices : array of shape (V, 3)
+        Positions, in file units unless said otherwise.
+    faces : integer array of shape (F, 3)
+        Rows of vertex indices.
+    normals : array of shape (V, 3), optional
+        Unit vertex normals, outward.
+
+    Raises
+    ------
+    InputError
+        When a shape does not fit or an index points outside of the vertices.
+    """
+
+    vertices: Float
+    faces: Int
+    normals: Float | None = None
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64).reshape(-1, 3)
+        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise InputError(f"A face names a vertex outside of 0 to {len(vertices) - 1}.")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        if self.normals is not None:
+            normals = np.ascontiguousarray(self.normals, dtype=np.float64)
+            if normals.shape != vertices.shape:
+                raise InputError(f"Normals of shape {normals.shape} do not fit {len(vertices)} vertices.")
+            object.__setattr__(self, "normals", normals)
+
+    @property
+    def corners(self) -> Float:
+        """Corner positions of every face, of shape (F, 3, 3)."""
+        return self.vertices[self.faces]
+
+    @property
+    def face_vectors(self) -> Float:
+        """Area vectors of the faces, of shape (F, 3): along the normal, as long as the area."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return 0.5 * np.cross(b - a, c - a)
+
+    @property
+    def area(self) -> float:
+        """Surface area, in squared units of the vertices."""
+        return float(np.linalg.norm(self.face_vectors, axis=1).sum())
+
+    @property
+    def volume(self) -> float:
+        """Signed enclosed volume by the divergence theorem; positive when the faces look outward."""
+        if not len(self.faces):
+            return 0.0
+        # Measured from the mesh's own corner, because far-off coordinates would cancel badly.
+        a, b, c = np.moveaxis(self.corners - self.vertices[0], 1, 0)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+    @property
+    def euler_characteristic(self) -> int:
+        """V - E + F over the vertices that faces use."""
+        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return len(np.unique(self.faces)) - len(np.unique(edges, axis=0)) + len(self.faces)
+
+    def vertex_normals(self) -> Float:
+        """Unit vertex normals, of shape (V, 3): the stored ones, else the area-weighted mean of the faces'."""
+        if self.normals is not None:
+            return self.normals
+        sums = np.zeros_like(self.vertices)
+        for corner in range(3):
+            np.add.at(sums, self.faces[:, corner], self.face_vectors)
+        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+    def with_vertices(self, vertices: Float) -> Mesh:
+        """Return the same faces and normals over moved vertices, of shape (V, 3)."""
+        return replace(self, vertices=vertices)
