@@ -87,7 +87,8 @@ class Mesh:
         sums = np.zeros_like(self.vertices)
         for corner in range(3):
             np.add.at(sums, self.faces[:, corner], self.face_vectors)
-        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        lengths: Float = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        return sums / lengths
 
     def with_vertices(self, vertices: Float) -> Mesh:
         """Return the same faces and normals over moved vertices, of shape (V, 3)."""
