@@ -1,0 +1,100 @@
+"""Writing that either succeeds as a whole or leaves nothing behind.
+
+Bytes go to a hidden temporary file in the target's own folder (so the last step never crosses file systems), are
+verified there and flushed to the disk, and only then receive the target's name. A process killed at any moment leaves
+the target as it was. Without permission to overwrite, the name is given by a hard link, which fails if somebody else
+created the target meanwhile, so nobody's file is lost.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gnrecon.errors import GnreconError, OutputError
+
+
+@contextmanager
+def atomic_write(
+    path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
+) -> Iterator[Path]:
+    """Yield a temporary path with the target's suffix; rename it to the target when the block ends well.
+
+    Parameters
+    ----------
+    path : the target; where it is a symbolic link, the file that it points to
+    overwrite : whether an existing file may be replaced
+    verify : called with the temporary path before the renaming; whatever it raises prevents that
+
+    Raises
+    ------
+    OutputError
+        When the folder is missing or not writable, the target exists, or writing fails (a full disk).
+    """
+    target = Path(os.path.realpath(path))
+    _check(target, path, overwrite)
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
+    try:
+        # Created here, and exclusively, so that the user's umask holds and no other file is hit.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        yield temporary
+        if verify is not None:
+            verify(temporary)
+        _sync(temporary)
+        _rename(temporary, target, overwrite)
+        _sync(target.parent)
+    except GnreconError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{path} could not be written: {error.strerror or error}.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
+    """Write a text file, UTF-8, atomically.
+
+    Raises
+    ------
+    OutputError
+        As `atomic_write` does.
+    """
+    with atomic_write(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _check(target: Path, path: str | Path, overwrite: bool) -> None:
+    """Refuse early what cannot succeed, in words that say what to do."""
+    if not target.parent.is_dir():
+        raise OutputError(f"{path} cannot be written: the folder {target.parent} does not exist.")
+    if not target.exists():
+        return
+    if not target.is_file():
+        raise OutputError(f"{path} cannot be written: it exists and is not a regular file.")
+    if not overwrite:
+        raise OutputError(f"{path} exists already; choose another name or allow overwriting.")
+
+
+def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
+    if overwrite:
+        temporary.replace(target)
+        return
+    try:
+        os.link(temporary, target)
+    except FileExistsError:
+        raise OutputError(f"{target} was created by somebody else meanwhile, and is left alone.") from None
+    except OSError:
+        # Some file systems (exFAT, network shares) have no hard links; looking once more is the best that is left.
+        _check(target, target, overwrite)
+        temporary.replace(target)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

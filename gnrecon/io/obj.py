@@ -1,0 +1,112 @@
+"""OBJ, Wavefront's text format: positions, vertex normals and polygons.
+
+The file's own vertices are kept in their order. Readers made for rendering split a vertex wherever its texture or
+normal differs between faces, which opens closed surfaces; here a vertex gets the mean of its corners' normals.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.errors import InputError
+from gnrecon.io.contents import Contents, no_faces
+from gnrecon.io.polygons import fan
+from gnrecon.io.text import format_rows, numbers, read_text
+from gnrecon.mesh import Mesh
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+
+def read_obj(path: Path) -> Contents:
+    """Read vertices (with colours, where they follow the position), vertex normals and faces.
+
+    Raises
+    ------
+    InputError
+        When there is no vertex, a word is no number, or an index points nowhere.
+    """
+    lines = [line.strip() for line in read_text(path).replace("\\\n", " ").splitlines()]
+    vertices = _rows([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "v")
+    normals = _rows([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "vn")
+    if not len(vertices):
+        raise InputError("the file holds no vertex line ('v x y z').")
+    colors = {"colors": vertices[:, 3:6]} if vertices.shape[1] >= 6 else {}
+    points = np.ascontiguousarray(vertices[:, :3])
+    counts, corners = _corners(lines)
+    if not len(counts):
+        given = normals[:, :3] if len(normals) == len(points) else None
+        return Contents(points, given, no_faces(), colors)
+    corner_vertices = _indices([word.partition("/")[0] for word in corners], lines, counts, "v")
+    if corner_vertices.max() >= len(points):
+        raise InputError(f"a face names vertex {corner_vertices.max() + 1}, but there are {len(points)}.")
+    given = _normals(corners, corner_vertices, normals, lines, counts, len(points))
+    return Contents(points, given, fan(counts, corner_vertices), colors)
+
+
+def _rows(lines: list[str], kind: str) -> Float:
+    """Return the numbers of all lines of one kind, as an array of equally many columns, at least 3."""
+    if not lines:
+        return np.empty((0, 3))
+    columns = len(lines[0].split())
+    values = numbers(" ".join(lines).split())
+    if columns < 3 or len(values) != columns * len(lines):
+        raise InputError(f"the '{kind}' lines do not all hold the same number of coordinates, at least 3.")
+    return values.reshape(-1, columns)
+
+
+def _corners(lines: list[str]) -> tuple[Int, list[str]]:
+    """Return the number of corners of every face, and all corner words (``v``, ``v/t``, ``v//n``, ``v/t/n``)."""
+    faces = [line[2:].split() for line in lines if line.startswith(("f ", "f\t"))]
+    return np.array([len(face) for face in faces], np.int64), [word for face in faces for word in face]
+
+
+def _indices(words: list[str], lines: list[str], counts: Int, kind: str) -> Int:
+    """Return zero-based indices; a negative one counts back from the lines of its `kind` that precede its face."""
+    try:
+        stated = np.array(list(map(int, words)), np.int64)
+    except ValueError:
+        raise InputError("a face holds a corner that is no vertex index.") from None
+    before = np.zeros(len(words), np.int64)
+    if (stated < 0).any():
+        seen = np.cumsum([line.startswith((f"{kind} ", f"{kind}\t")) for line in lines])
+        is_face = np.array([line.startswith(("f ", "f\t")) for line in lines])
+        before = np.repeat(seen[is_face], counts)
+    indices: Int = np.where(stated < 0, before + stated, stated - 1)
+    if (indices < 0).any():
+        raise InputError(f"a face names {kind} {stated[indices < 0][0]}, but indices begin at 1.")
+    return indices
+
+
+def _normals(
+    corners: list[str], corner_vertices: Int, normals: Float, lines: list[str], counts: Int, size: int
+) -> Float | None:
+    """Return a normal for every vertex, or None where not all corners name one."""
+    words = [word.split("/")[2] if word.count("/") == 2 else "" for word in corners]
+    if not len(normals) or not all(words):
+        return None
+    corner_normals = _indices(words, lines, counts, "vn")
+    if corner_normals.max() >= len(normals):
+        raise InputError(f"a face names normal {corner_normals.max() + 1}, but there are {len(normals)}.")
+    if len(normals) == size and (corner_normals == corner_vertices).all():
+        return normals[:, :3]  # exactly as stored
+    sums = np.zeros((size, 3))
+    np.add.at(sums, corner_vertices, normals[corner_normals, :3])
+    lengths: Float = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return sums / lengths
+
+
+def write_obj(mesh: Mesh, path: Path) -> None:
+    """Write positions with all digits of float64, vertex normals where the mesh has them, and triangles."""
+    blocks = format_rows("v %r %r %r\n", mesh.vertices)
+    corners = mesh.faces + 1
+    if mesh.normals is None:
+        blocks += format_rows("f %d %d %d\n", corners)
+    else:
+        blocks += format_rows("vn %.7g %.7g %.7g\n", mesh.normals)
+        blocks += format_rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1))
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(blocks)

@@ -1,0 +1,89 @@
+"""OFF, the Object File Format: counts, vertices and polygons in text, with the variants COFF, NOFF and CNOFF."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.errors import InputError
+from gnrecon.io.contents import Contents, no_faces
+from gnrecon.io.polygons import fan
+from gnrecon.io.text import format_rows, meaningful_lines, numbers, read_text
+from gnrecon.mesh import Mesh
+
+Int = npt.NDArray[np.int64]
+
+_KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF\b", re.IGNORECASE)
+
+
+def read_off(path: Path) -> Contents:
+    """Read vertices, the normals and colours that NOFF and COFF add, and faces.
+
+    Raises
+    ------
+    InputError
+        When the keyword or the counts are missing, rows are missing or too short, or a word is no number.
+    """
+    lines = meaningful_lines(read_text(path))
+    keyword = _KEYWORD.match(lines[0]) if lines else None
+    if keyword is None or "BINARY" in lines[0].upper():
+        raise InputError("expected a text file that begins with the word OFF.")
+    rest = lines[0][keyword.end() :].split()
+    words, lines = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
+    if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
+        raise InputError(f"expected the numbers of vertices and faces, but found {' '.join(words)[:60]!r}.")
+    vertex_count, face_count = int(words[0]), int(words[1])
+    if len(lines) < vertex_count + face_count:
+        raise InputError(
+            f"the header declares {vertex_count} vertices and {face_count} faces, but {len(lines)} rows follow."
+        )
+    table = _vertices(lines[:vertex_count])
+    has_normals, has_colors = bool(keyword[3]), bool(keyword[2])
+    if has_normals and table.shape[1] < 6:
+        raise InputError(f"NOFF vertices need 6 numbers each, but hold {table.shape[1]}.")
+    first_color = 6 if has_normals else 3
+    colors = {"colors": table[:, first_color : first_color + 4]} if has_colors and table.shape[1] > first_color else {}
+    return Contents(
+        np.ascontiguousarray(table[:, :3]),
+        table[:, 3:6] if has_normals else None,
+        _faces(lines[vertex_count : vertex_count + face_count]),
+        colors,
+    )
+
+
+def _vertices(lines: list[str]) -> npt.NDArray[np.float64]:
+    """Return the vertex rows as a table, of shape (V, columns)."""
+    if not lines:
+        raise InputError("the header declares no vertices.")
+    columns = len(lines[0].split())
+    values = numbers(" ".join(lines).split())
+    if columns < 3 or len(values) != columns * len(lines):
+        raise InputError("the vertex rows do not all hold the same number of coordinates, at least 3.")
+    return values.reshape(-1, columns)
+
+
+def _faces(lines: list[str]) -> Int:
+    """Return the triangles of rows ``n i1 ... in [colour]``."""
+    if not lines:
+        return no_faces()
+    counts, corners = [], []
+    for line in lines:
+        words = line.split()
+        count = int(words[0]) if words[0].isdecimal() else -1
+        if not 0 <= count < len(words):
+            raise InputError(f"the face row {line[:60]!r} is not a count and as many vertex indices.")
+        counts.append(count)
+        corners += words[1 : count + 1]
+    return fan(np.array(counts, np.int64), numbers(corners).astype(np.int64))
+
+
+def write_off(mesh: Mesh, path: Path) -> None:
+    """Write positions with all digits of float64 and triangles; plain OFF has no normals."""
+    blocks = [f"OFF\n{len(mesh.vertices)} {len(mesh.faces)} 0\n"]
+    blocks += format_rows("%r %r %r\n", mesh.vertices)
+    blocks += format_rows("3 %d %d %d\n", mesh.faces)
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(blocks)

@@ -1,0 +1,182 @@
+"""PLY, the Stanford polygon format: ASCII and binary of either byte order, any scalar types, polygons of any size.
+
+A header names elements (vertex, face, ...) with their properties; rows of values follow. ASCII words are first turned
+into an array of float64, which is then walked exactly as a binary file whose every property is a double. One walker
+thus serves all three encodings. Common libraries either round doubles, drop scalar properties, reject polygons of
+differing size, or accept a file that ends too early; that is why the walker is written here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.errors import InputError
+from gnrecon.io.contents import Contents, from_columns
+from gnrecon.io.ply_header import ORDERS, Element, Property, parse_header, too_short
+from gnrecon.io.polygons import fan
+from gnrecon.io.text import numbers
+from gnrecon.mesh import Mesh
+
+Int = npt.NDArray[np.int64]
+
+
+@dataclass
+class _Rows:
+    """Values of one element: scalar columns of shape (count,), lists as (lengths, values in a row)."""
+
+    scalars: dict[str, npt.NDArray[np.generic]]
+    lists: dict[str, tuple[Int, Int]]
+
+
+def read_ply(path: Path) -> Contents:
+    """Read vertices with all their scalar properties, and the faces where there are some.
+
+    Raises
+    ------
+    InputError
+        When the header is malformed, the file ends before the declared rows, or a word is no number.
+    """
+    data = path.read_bytes()
+    encoding, elements, start = parse_header(data)
+    if encoding == "ascii":
+        buffer = numbers(data[start:].decode("ascii", errors="replace").split()).tobytes()
+    else:
+        buffer = data[start:]
+    rows: dict[str, _Rows] = {}
+    offset = 0
+    for element in elements:
+        rows[element.name], offset = _walk(buffer, offset, element, ORDERS[encoding])
+        if "vertex" in rows and ("face" in rows or not any(later.name == "face" for later in elements)):
+            break  # what follows (range grids, edges, materials) is not used
+    if "vertex" not in rows:
+        raise InputError("the PLY header declares no vertex element.")
+    polygons = rows["face"].lists if "face" in rows else {}
+    corners = polygons.get("vertex_indices", polygons.get("vertex_index"))
+    return from_columns(rows["vertex"].scalars, None if corners is None else fan(*corners))
+
+
+def _walk(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
+    """Return the element's rows and the offset behind them; `order` is empty for words turned into doubles."""
+    lists = [prop for prop in element.properties if prop.count_type]
+    if lists and element.count:
+        lengths = _first_lengths(buffer, offset, element, order)
+        layout = _layout(element, order, lengths)
+        end = offset + element.count * layout.itemsize
+        table = np.frombuffer(buffer[offset:end], layout) if end <= len(buffer) else None
+        if table is None or any((table[f"#{prop.name}"] != lengths[prop.name]).any() for prop in lists):
+            return _walk_slowly(buffer, offset, element, order)
+    else:
+        layout = _layout(element, order, {prop.name: 0 for prop in lists})
+        end = offset + element.count * layout.itemsize
+        if end > len(buffer):
+            raise too_short(element, (len(buffer) - offset) // layout.itemsize)
+        table = np.frombuffer(buffer[offset:end], layout)
+    scalars = {p.name: _native(table[p.name], p, order) for p in element.properties if not p.count_type}
+    found = {p.name: (table[f"#{p.name}"].astype(np.int64), _indices(table[p.name]).ravel()) for p in lists}
+    return _Rows(scalars, found), end
+
+
+def _walk_slowly(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
+    """Walk row by row, for lists of differing lengths."""
+    scalars: dict[str, list[npt.NDArray[np.generic]]] = {p.name: [] for p in element.properties if not p.count_type}
+    counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
+    items: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in counts}
+    for row in range(element.count):
+        try:
+            for prop in element.properties:
+                kind = np.dtype(order + prop.type if order else "f8")
+                if not prop.count_type:
+                    scalars[prop.name].append(np.frombuffer(buffer, kind, 1, offset)[0])
+                    offset += kind.itemsize
+                    continue
+                length, offset = _length(buffer, offset, prop, order)
+                counts[prop.name].append(length)
+                items[prop.name].append(np.frombuffer(buffer, kind, length, offset))
+                offset += length * kind.itemsize
+        except ValueError:  # numpy's word for a buffer that is too short
+            raise too_short(element, row) from None
+    by_name = {prop.name: prop for prop in element.properties}
+    columns = {name: _native(np.array(values), by_name[name], order) for name, values in scalars.items()}
+    lists = {name: (np.array(counts[name], np.int64), _indices(np.concatenate(items[name]))) for name in counts}
+    return _Rows(columns, lists), offset
+
+
+def _length(buffer: bytes, offset: int, prop: Property, order: str) -> tuple[int, int]:
+    """Return the length of the list that begins at `offset`, and the offset of its first item."""
+    kind = np.dtype(order + (prop.count_type or "") if order else "f8")
+    value = float(np.frombuffer(buffer, kind, 1, offset)[0])
+    if not (value >= 0 and value.is_integer()):
+        raise InputError(f"a list of {prop.name} has the length {value:g}, but a count was expected.")
+    return int(value), offset + kind.itemsize
+
+
+def _first_lengths(buffer: bytes, offset: int, element: Element, order: str) -> dict[str, int]:
+    """Return the list lengths of the element's first row, which most often are those of all rows."""
+    lengths: dict[str, int] = {}
+    try:
+        for prop in element.properties:
+            kind = np.dtype(order + prop.type if order else "f8")
+            length = 1
+            if prop.count_type:
+                length, offset = _length(buffer, offset, prop, order)
+                lengths[prop.name] = length
+            offset += length * kind.itemsize
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise too_short(element, 0) from None
+    if offset > len(buffer):
+        raise too_short(element, 0)
+    return lengths
+
+
+def _layout(element: Element, order: str, lengths: dict[str, int]) -> np.dtype[np.void]:
+    """Return the record type of a row whose lists have the given lengths; ``#name`` is a list's count."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
+    for prop in element.properties:
+        kind = order + prop.type if order else "f8"
+        if prop.count_type:
+            fields.append((f"#{prop.name}", order + prop.count_type if order else "f8"))
+            fields.append((prop.name, kind, (lengths[prop.name],)))
+        else:
+            fields.append((prop.name, kind))
+    return np.dtype(fields)
+
+
+def _native(values: npt.NDArray[np.generic], prop: Property, order: str) -> npt.NDArray[np.generic]:
+    """Return a column in this machine's byte order; text keeps all digits even where the header says float."""
+    if not order and prop.type.startswith("f"):
+        return values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # text may hold nan where the header declares an integer
+        return values.astype(prop.type)
+
+
+def _indices(values: npt.NDArray[np.generic]) -> Int:
+    with np.errstate(invalid="ignore"):  # an index that is no number becomes one out of range, refused by Mesh
+        return values.astype(np.int64)
+
+
+def write_ply(mesh: Mesh, path: Path) -> None:
+    """Write binary little-endian PLY: double positions, float normals where the mesh has them, int faces."""
+    fields = [(name, "<f8") for name in ("x", "y", "z")]
+    if mesh.normals is not None:
+        fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
+    vertices = np.empty(len(mesh.vertices), np.dtype(fields))
+    for axis, name in enumerate(("x", "y", "z")):
+        vertices[name] = mesh.vertices[:, axis]
+        if mesh.normals is not None:
+            vertices[f"n{name}"] = mesh.normals[:, axis]
+    faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
+    faces["count"] = 3
+    faces["corners"] = mesh.faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines += [f"property {'double' if kind == '<f8' else 'float'} {name}" for name, kind in fields]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    with path.open("wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        vertices.tofile(file)
+        faces.tofile(file)

@@ -1,0 +1,25 @@
+"""Polygons of any number of corners, cut into fans of triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Int = npt.NDArray[np.int64]
+
+
+def fan(counts: Int, corners: Int) -> Int:
+    """Return triangles, of shape (F, 3), that cover polygons.
+
+    A polygon v0 v1 ... v(n-1) becomes the n - 2 triangles v0 v(k+1) v(k+2); fewer than three corners give none.
+
+    Parameters
+    ----------
+    counts : integer array of shape (P,), the number of corners of each polygon
+    corners : integer array of shape (counts.sum(),), the vertex indices of all polygons in a row
+    """
+    triangles = np.maximum(counts - 2, 0)
+    polygon = np.repeat(np.arange(len(counts)), triangles)
+    first = (np.cumsum(counts) - counts)[polygon]
+    k = np.arange(len(polygon)) - (np.cumsum(triangles) - triangles)[polygon]
+    return np.column_stack([corners[first], corners[first + k + 1], corners[first + k + 2]])

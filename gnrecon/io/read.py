@@ -1,0 +1,118 @@
+"""Reading a file as a cloud, as a mesh, or as whichever it holds; every malformed file is one `InputError`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gnrecon.cloud import PointCloud
+from gnrecon.errors import InputError, MemoryLimitError, UsageError
+from gnrecon.io.contents import Contents
+from gnrecon.io.formats import READERS, SIGNATURES
+from gnrecon.mesh import Mesh
+
+
+def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
+    """Read the points of a cloud or the vertices of a mesh, in the file's own units, exactly.
+
+    Normals are the file's own; a mesh without any gives the area-weighted normals of its faces (zero for a vertex that
+    no face uses). Rows with NaN come as they are.
+
+    Parameters
+    ----------
+    path : file to read
+    format : extension that says how to read it, such as ``"ply"``; by default the file's own
+
+    Raises
+    ------
+    InputError
+        When the file is missing, empty, malformed, or of no supported kind.
+    UsageError
+        When `format` is no supported one.
+    """
+    contents = _read(Path(path), format)
+    normals = contents.normals
+    if normals is None and len(contents.faces):
+        normals = _mesh(contents, Path(path)).vertex_normals()
+    return PointCloud(contents.points, normals, contents.attributes)
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Read a mesh with exactly the stored vertices and triangles (polygons are cut into fans; STL corners merged).
+
+    Raises
+    ------
+    InputError
+        As `read_cloud` does, and when the file holds no faces.
+    """
+    contents = _read(Path(path), None)
+    if not len(contents.faces):
+        raise InputError(f"{path}: expected a mesh, but the file holds {len(contents.points)} points and no faces.")
+    return _mesh(contents, Path(path))
+
+
+def read_reference(path: str | Path) -> Mesh | PointCloud:
+    """Read a mesh where the file has faces, else a cloud.
+
+    Raises
+    ------
+    InputError
+        As `read_cloud` does.
+    """
+    contents = _read(Path(path), None)
+    if len(contents.faces):
+        return _mesh(contents, Path(path))
+    return PointCloud(contents.points, contents.normals, contents.attributes)
+
+
+def _mesh(contents: Contents, path: Path) -> Mesh:
+    try:
+        return Mesh(contents.points, contents.faces, contents.normals)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _read(path: Path, format: str | None) -> Contents:
+    extension = path.suffix.lower() if format is None else f".{format.lower().lstrip('.')}"
+    supported = ", ".join(suffix[1:] for suffix in READERS)
+    if format is not None and extension not in READERS:
+        raise UsageError(f"The format {format!r} is not supported; expected one of {supported}.")
+    _check_file(path, extension)
+    if extension not in READERS:
+        raise InputError(f"{path}: the extension {extension!r} is not supported; expected one of {supported}.")
+    try:
+        contents = READERS[extension](path)
+        if not len(contents.points):
+            raise InputError("the file holds no points.")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except MemoryError:
+        raise MemoryLimitError(f"{path}: the file holds more than fits into this machine's memory.") from None
+    except OSError as error:
+        raise InputError(f"{path}: the file cannot be read: {error.strerror or error}.") from None
+    # Damaged numbers can break a parser in ways that its own checks do not foresee; the user needs one sentence.
+    except (ValueError, OverflowError, IndexError, KeyError, RuntimeError) as error:
+        raise InputError(f"{path}: the file is malformed ({error}).") from None
+    return contents
+
+
+def _check_file(path: Path, extension: str) -> None:
+    """Refuse what is no file, is empty, or begins as a file of another kind."""
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file.")
+    if not path.is_file():
+        raise InputError(f"{path}: expected a file, but this is a folder or a device.")
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError as error:
+        raise InputError(f"{path}: the file cannot be read: {error.strerror or error}.") from None
+    if not head.strip():
+        raise InputError(f"{path}: the file is empty.")
+    kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
+    if kind == extension or extension not in READERS:
+        return
+    if kind in READERS:
+        raise InputError(
+            f"{path}: the file holds {kind[1:].upper()} data; rename it or give its format as {kind[1:]!r}."
+        )
+    raise InputError(f"{path}: expected {extension[1:].upper()} data, but the file is a {kind} file.")

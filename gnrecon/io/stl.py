@@ -1,0 +1,53 @@
+"""STL, triangles without shared vertices: read by trimesh, with equal corners merged; written binary (float32)."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from gnrecon.errors import InputError
+from gnrecon.io.contents import Contents
+from gnrecon.mesh import Mesh
+
+
+def read_stl(path: Path) -> Contents:
+    """Read a binary or text STL; corners of exactly equal position become one vertex, in order of appearance.
+
+    Raises
+    ------
+    InputError
+        When the file is neither, ends too early, or holds no triangle.
+    """
+    from trimesh.exchange.stl import HeaderError, load_stl
+
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # how numpy reports words that are no numbers
+            loaded = load_stl(file)
+    except (HeaderError, DeprecationWarning, ValueError):
+        raise InputError("the file is neither a complete binary STL nor a well-formed text STL.") from None
+    solids = [loaded] if "vertices" in loaded else list(loaded["geometry"].values())
+    if not solids:
+        raise InputError("the file holds no complete STL solid: it is empty, cut short, or of another format.")
+    corners = np.concatenate([np.asarray(solid["vertices"], np.float64) for solid in solids])
+    _, first, which = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return Contents(corners[first[order]], None, rank[which].reshape(-1, 3))
+
+
+def write_stl(mesh: Mesh, path: Path) -> None:
+    """Write binary STL; coordinates are rounded to float32, the only precision that the format has."""
+    record = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets = np.zeros(len(mesh.faces), record)
+    area = mesh.face_vectors
+    lengths = np.maximum(np.linalg.norm(area, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    facets["normal"] = area / lengths
+    facets["corners"] = mesh.corners
+    with path.open("wb") as file:
+        file.write(b"binary STL".ljust(80, b" "))
+        np.array(len(facets), "<u4").tofile(file)
+        facets.tofile(file)

@@ -1,0 +1,76 @@
+"""Writing a mesh, in the format that the file's extension names, atomically."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from gnrecon.errors import MeshError, UsageError
+from gnrecon.io.atomic import atomic_write
+from gnrecon.io.formats import WRITERS
+from gnrecon.mesh import Mesh
+
+_NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
+_INT32_LIMIT = 2**31
+
+
+def write_mesh(
+    mesh: Mesh, path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
+) -> list[str]:
+    """Write a mesh and return sentences about what the format could not keep.
+
+    Parameters
+    ----------
+    mesh : in file units
+    path : target; its extension names the format
+    overwrite : whether an existing file may be replaced
+    verify : called with the temporary file before it receives the target's name; what it raises prevents that
+
+    Raises
+    ------
+    UsageError
+        When the extension is no supported one.
+    MeshError
+        When the mesh has no faces, or coordinates are not finite.
+    OutputError
+        When the file cannot be written.
+    """
+    extension = check_writable(path)
+    if not len(mesh.faces):
+        raise MeshError("The mesh has no faces, so there is nothing to write.")
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError("The mesh has vertices that are not finite, so it is not written.")
+    if len(mesh.vertices) >= _INT32_LIMIT:
+        raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices can name.")
+    with atomic_write(path, overwrite, verify) as temporary:
+        WRITERS[extension](mesh, temporary)
+    return _rounding(mesh) if extension == ".stl" else []
+
+
+def check_writable(path: str | Path) -> str:
+    """Return the extension of `path` when a mesh can be written so.
+
+    Raises
+    ------
+    UsageError
+        When the extension is no supported one.
+    """
+    extension = Path(path).suffix.lower()
+    if extension not in WRITERS:
+        supported = ", ".join(suffix[1:] for suffix in WRITERS)
+        raise UsageError(
+            f"A mesh cannot be written as {extension or 'a file without an extension'!r}; use {supported}."
+        )
+    return extension
+
+
+def _rounding(mesh: Mesh) -> list[str]:
+    """Return a sentence about the rounding to float32, where that is notable beside the mesh's size."""
+    with np.errstate(over="ignore"):  # beyond float32 the rounding is infinite, and said to be
+        rounding = float(np.abs(mesh.vertices - mesh.vertices.astype(np.float32)).max())
+    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if rounding <= _NOTABLE_ROUNDING * diagonal:
+        return []
+    return [f"STL stores float32: coordinates are rounded by up to {rounding:.2g} units; PLY or OBJ keep them exactly."]
