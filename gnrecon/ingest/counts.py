@@ -1,0 +1,52 @@
+"""What ingest did to a cloud, in numbers and in sentences."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+
+@dataclass(frozen=True)
+class IngestCounts:
+    """Numbers of points, from the file to the fit.
+
+    Parameters
+    ----------
+    read : points in the file
+    non_finite : dropped, because a coordinate was NaN or infinite
+    zero_normals : dropped, because they had no direction although most others did
+    duplicates : dropped, because another point has exactly the same position
+    outliers : dropped as scattered far off the surface
+    outliers_found : found so, but left alone because they are too many or because removal is off
+    thinned : left out by subsampling
+    kept : what remains
+    normals : how they came about, such as ``"given"``, ``"given, flipped"`` or ``"estimated"``
+    """
+
+    read: int
+    non_finite: int = 0
+    zero_normals: int = 0
+    duplicates: int = 0
+    outliers: int = 0
+    outliers_found: int = 0
+    thinned: int = 0
+    kept: int = 0
+    normals: str = "missing"
+
+    def as_dict(self) -> dict[str, int | str]:
+        """Return the fields by name, for reports."""
+        return asdict(self)
+
+    def remarks(self) -> list[str]:
+        """Return one sentence for everything that was not taken as it came."""
+        dropped = {
+            "with a coordinate that is not finite": self.non_finite,
+            "with a zero or non-finite normal": self.zero_normals,
+            "at the position of another": self.duplicates,
+            "scattered far off the surface": self.outliers,
+        }
+        sentences = [f"Dropped {count} of {self.read} points {why}." for why, count in dropped.items() if count]
+        if self.outliers_found:
+            sentences.append(f"Left {self.outliers_found} points alone that look like outliers.")
+        if self.normals != "given":
+            sentences.append(f"Normals: {self.normals}.")
+        return sentences

@@ -1,0 +1,57 @@
+"""Voxel thinning: one real point for each occupied cube, with the cube's size searched for the wanted count."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Float = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.intp]
+
+_FINEST = 2.0**-20  # of the extent: three cell numbers then fit into one 64-bit key
+_BISECTIONS = 30
+_TOLERANCE = 0.02  # of the count, within which the search stops
+
+
+def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -> Rows:
+    """Return `count` row indices, each the point nearest to the mean of its cube.
+
+    The cubes are the largest that give at least `count`, and the surplus is cut off at random. Points closer than a
+    millionth of the extent always share a cube, so there may be fewer where the cloud is extremely uneven.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), distinct, N >= count >= 1
+    """
+    extent = float(np.ptp(points, axis=0).max())
+    low, high = np.log(_FINEST), 0.0
+    cells = _cells(points, extent * _FINEST)
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        coarser = _cells(points, extent * float(np.exp(middle)))
+        if coarser.max() + 1 >= count:
+            low, cells = middle, coarser
+        else:
+            high = middle
+        if cells.max() + 1 <= (1 + _TOLERANCE) * count:
+            break
+    return rng.permutation(_nearest_to_means(points, cells))[:count]
+
+
+def _cells(points: Float, size: float) -> Rows:
+    """Return for each point the number, from 0, of the occupied cube of side `size` that holds it; shape (N,)."""
+    corner = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+    sides = corner.max(axis=0) + 1
+    key = (corner[:, 0] * sides[1] + corner[:, 1]) * sides[2] + corner[:, 2]
+    cells: Rows = np.unique(key, return_inverse=True)[1]
+    return cells
+
+
+def _nearest_to_means(points: Float, cells: Rows) -> Rows:
+    """Return for each cube the row of the point nearest to the mean of the cube's points."""
+    sizes = np.bincount(cells)
+    means = np.column_stack([np.bincount(cells, weights=points[:, axis]) / sizes for axis in range(3)])
+    distances = np.linalg.norm(points - means[cells], axis=1)
+    order = np.lexsort((distances, cells))
+    nearest: Rows = order[np.cumsum(sizes) - sizes]
+    return nearest
