@@ -1,0 +1,24 @@
+"""From a field to a verified mesh: extract, project, repair, verify, measure, draw."""
+
+from gnrecon.export.definitions import Metrics
+from gnrecon.export.extract import extract
+from gnrecon.export.metrics import measure
+from gnrecon.export.project import project
+from gnrecon.export.protocol import SignedDistance
+from gnrecon.export.repair import repair
+from gnrecon.export.stray import remove_stray
+from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
+
+__all__ = [
+    "MeshFacts",
+    "Metrics",
+    "SignedDistance",
+    "extract",
+    "measure",
+    "project",
+    "remove_stray",
+    "repair",
+    "require_sound",
+    "verify",
+    "verify_file",
+]

@@ -1,0 +1,100 @@
+"""The regular lattice on which a field is sampled, closed at the border of its box.
+
+Nodes are integer triples. The lattice lives in unit coordinates, where the shape has radius one, so that a far-off
+origin (projected coordinates in metres) costs no digits; only the field itself is asked in file coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.cloud import Float
+from gnrecon.errors import MeshError, UsageError
+from gnrecon.export.protocol import SignedDistance
+
+Int = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cubic cells over a box.
+
+    Parameters
+    ----------
+    field : SignedDistance
+        What is sampled.
+    origin : array of shape (3,), unit coordinates
+        Position of node (0, 0, 0).
+    cell : float, unit coordinates
+        Edge length of a cell.
+    cells : integer array of shape (3,)
+        Number of cells along each axis; there is one node more.
+    batch : int
+        Most points to ask the field for at once.
+    """
+
+    field: SignedDistance
+    origin: Float
+    cell: float
+    cells: Int
+    batch: int
+
+    @classmethod
+    def over(cls, field: SignedDistance, resolution: int, bounds: Float | None, batch: int) -> Lattice:
+        """Return the lattice of `resolution` cells along the longest side of `bounds`, centred on them.
+
+        Raises
+        ------
+        UsageError
+            When the resolution is below 4, the batch below 1, or the bounds are no box.
+        """
+        if resolution < 4:
+            raise UsageError(f"The resolution is {resolution}, but must be at least 4 cells.")
+        if batch < 1:
+            raise UsageError(f"The batch is {batch} points, but must be at least 1.")
+        box = np.asarray(field.bounds if bounds is None else bounds, dtype=np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
+            raise UsageError(f"The bounds {box.tolist()} are not a lower and an upper corner of a box.")
+        low, high = field.frame.to_unit(box)
+        cell = float((high - low).max() / resolution)
+        # The small allowance keeps a side that is a whole number of cells from gaining one by rounding.
+        cells = np.maximum(np.ceil((high - low) / cell - 1e-9), 1).astype(np.int64)
+        return cls(field, (low + high - cell * cells) / 2, cell, cells, batch)
+
+    def world(self, nodes: npt.NDArray[np.floating] | Int) -> Float:
+        """File coordinates of lattice coordinates, both of shape (N, 3)."""
+        return self.field.frame.to_world(self.origin + self.cell * nodes)
+
+    def values(self, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
+        """Field in cells over its slope, of shape (N,), at lattice coordinates of shape (N, 3), closed at the box.
+
+        Closing is the intersection with the box that ends half a cell before the outermost layer, so that this layer
+        is always outside and a shape that reaches further ends in a flat cap.
+
+        Raises
+        ------
+        MeshError
+            When the field is not finite somewhere.
+        """
+        inside = np.clip(nodes, 0, self.cells)
+        depth = np.minimum(nodes, self.cells - nodes).min(axis=1)
+        out = np.empty(len(nodes))
+        for start in range(0, len(nodes), self.batch):
+            rows = slice(start, start + self.batch)
+            out[rows] = self.field.sdf(self.world(inside[rows]))
+        if not np.isfinite(out).all():
+            raise MeshError(f"The field is not finite at {np.count_nonzero(~np.isfinite(out))} of {len(out)} points.")
+        closed: Float = np.maximum(out / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
+        return closed
+
+    def slopes(self, nodes: npt.NDArray[np.floating] | Int) -> Float:
+        """Length of the gradient, of shape (N,), at lattice coordinates of shape (N, 3)."""
+        inside = np.clip(nodes, 0, self.cells)
+        parts = [
+            np.linalg.norm(self.field.gradient(self.world(inside[start : start + self.batch])), axis=1)
+            for start in range(0, len(nodes), self.batch)
+        ]
+        return np.concatenate(parts)

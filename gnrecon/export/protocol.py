@@ -1,0 +1,29 @@
+"""What the exporter needs to know of a field: a signed distance with its gradient, in the file's coordinates."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from gnrecon.cloud import Float, Frame
+
+
+class SignedDistance(Protocol):
+    """A scalar field whose zero level is the surface; a fitted network, or any function with these four members."""
+
+    @property
+    def frame(self) -> Frame:
+        """The similarity between file coordinates and the unit ball around the shape."""
+        ...
+
+    @property
+    def bounds(self) -> Float:
+        """Lower and upper corner, of shape (2, 3) and in file units, of the box within which the field is trusted."""
+        ...
+
+    def sdf(self, points: Float) -> Float:
+        """Signed distance in file units, of shape (N,), negative inside, at file coordinates of shape (N, 3)."""
+        ...
+
+    def gradient(self, points: Float) -> Float:
+        """Gradient of the distance, of shape (N, 3) and without unit, at file coordinates of shape (N, 3)."""
+        ...

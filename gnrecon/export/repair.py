@@ -1,0 +1,183 @@
+"""Make a solid of a mesh that is not quite one.
+
+A sound mesh comes back as it is. For any other, attempts follow from the mildest to the strongest, and the first whose
+result is sound wins:
+
+1. collapsed, repeated and fin-like faces are dropped, vertices where several fans of faces touch are split, and an
+   inside-out mesh is turned round;
+2. manifold3d sews open edges whose ends coincide, and pairs up the faces on crowded edges;
+3. pymeshlab orients the faces coherently, cuts edges with more than two faces and closes small holes, and the first two
+   are tried again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gnrecon.errors import MeshError
+from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
+from gnrecon.export.topology import Edges, Mask, corner_fans, split_vertices, submesh
+from gnrecon.export.verify import require_sound, verify
+from gnrecon.mesh import Mesh
+
+APART = 1e-3
+"""How far vertices at one place are moved apart, as a share of the way to the middle of their faces."""
+
+HOLE = 100
+"""Most edges of a hole that is closed; a larger one is missing surface, which no repair should invent."""
+
+
+def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
+    """Return a sound mesh and one sentence for each thing that was done to it (none if it was sound).
+
+    Normals are carried over from the nearest vertex of the given mesh.
+
+    Raises
+    ------
+    MeshError
+        When no attempt gives a sound mesh; the sentence names what is still wrong.
+    """
+    failure = _failure(mesh)
+    if failure is None:
+        return mesh, []
+    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+        raise MeshError(failure)
+    tidy, actions = _tidy(mesh)
+    result, sewing = _sewn(tidy)
+    if result is None:
+        patched, patching = _patch(tidy)
+        tidy, tidying = _tidy(patched)
+        result, sewing = _sewn(tidy)
+        actions += patching + tidying
+    if result is None:
+        raise MeshError(f"Repair was not enough: {str(_failure(tidy)).replace('The', 'the', 1)}")
+    return _with_normals_of(result, mesh), actions + sewing
+
+
+def _failure(mesh: Mesh) -> str | None:
+    """Why a mesh is not sound, or None."""
+    try:
+        require_sound(mesh)
+    except MeshError as error:
+        return str(error)
+    return None
+
+
+def _tidy(mesh: Mesh) -> tuple[Mesh, list[str]]:
+    """Drop faces that bound nothing, split touching fans, turn an inside-out mesh round."""
+    actions = []
+    keep = _bounding(mesh)
+    if not keep.any():
+        raise MeshError("The mesh has no face that could bound anything.")
+    if not keep.all():
+        actions.append(f"Dropped {np.count_nonzero(~keep)} collapsed, repeated or fin-like faces.")
+    tidy = submesh(mesh, keep)
+    edges = Edges.of(tidy)
+    split = split_vertices(tidy, edges)
+    if (edges.count == 2).all() and len(split):
+        actions.append(f"Split {len(split)} vertices where several fans of faces touched.")
+        tidy = _split_fans(tidy, edges)
+    facts = verify(tidy)
+    if facts.closed and facts.oriented and facts.volume < 0:
+        actions.append("Turned the faces round, because the mesh was inside out.")
+        tidy = Mesh(tidy.vertices, tidy.faces[:, ::-1], None if tidy.normals is None else -tidy.normals)
+    return tidy, actions
+
+
+def _bounding(mesh: Mesh) -> Mask:
+    """Which faces, of shape (F,), are left without collapsed ones, repetitions and fins.
+
+    A fin hangs on an edge that has two faces without it, and has an open edge itself.
+    """
+    faces = mesh.faces
+    keep: Mask = ~(faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    # With its lowest vertex first, a face equals its repetitions, but not the same face the other way round.
+    lowest_first = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    repeated = np.ones(len(faces), dtype=bool)
+    repeated[np.unique(lowest_first, axis=0, return_index=True)[1]] = False
+    keep &= ~repeated
+    while True:
+        rows = np.flatnonzero(keep)
+        edges = Edges.of(Mesh(mesh.vertices, faces[rows]))
+        shared = np.empty(3 * len(rows), dtype=np.int64)
+        shared[edges.corner] = np.repeat(edges.count, edges.count)
+        fins = (shared == 1).reshape(-1, 3).any(axis=1) & (shared > 2).reshape(-1, 3).any(axis=1)
+        if not fins.any():
+            return keep
+        keep[rows[fins]] = False
+
+
+def _split_fans(mesh: Mesh, edges: Edges) -> Mesh:
+    """Give each fan of faces a vertex of its own."""
+    _, first, faces = np.unique(corner_fans(mesh, edges), return_index=True, return_inverse=True)
+    origin = mesh.faces.reshape(-1)[first]
+    normals = None if mesh.normals is None else mesh.normals[origin]
+    return Mesh(mesh.vertices[origin], faces.reshape(-1, 3), normals)
+
+
+def _set_apart(mesh: Mesh) -> Mesh:
+    """Move vertices that lie on one another a little into their own faces, so that no format joins them again."""
+    _, place, count = np.unique(mesh.vertices, axis=0, return_inverse=True, return_counts=True)
+    shared = count[place.reshape(-1)] > 1
+    if not shared.any():
+        return mesh
+    middle = np.zeros_like(mesh.vertices)
+    np.add.at(middle, mesh.faces.reshape(-1), np.repeat(mesh.corners.mean(axis=1), 3, axis=0))
+    middle /= np.maximum(np.bincount(mesh.faces.reshape(-1), minlength=len(middle)), 1)[:, None]
+    return mesh.with_vertices(
+        np.where(shared[:, None], mesh.vertices + APART * (middle - mesh.vertices), mesh.vertices)
+    )
+
+
+def _sewn(mesh: Mesh) -> tuple[Mesh | None, list[str]]:
+    """A mesh as it is if it is sound, else with its edges sewn and paired by manifold3d; None where that fails too."""
+    apart = _set_apart(mesh)
+    if _failure(apart) is None:
+        return apart, []
+    solid = to_solid(mesh, merge=True)
+    if refusal(solid) is not None or solid.is_empty():
+        return None, []
+    sewn, tidying = _tidy(from_solid(solid, mesh))
+    sewn = _set_apart(sewn)
+    if _failure(sewn) is not None:
+        return None, []
+    change = f"{len(mesh.faces)} faces became {len(sewn.faces)}"
+    return sewn, [f"Sewed open and crowded edges with manifold3d; {change}.", *tidying]
+
+
+def _patch(mesh: Mesh) -> tuple[Mesh, list[str]]:
+    """Cut crowded edges, close small holes and orient the faces with pymeshlab."""
+    import pymeshlab
+
+    centre, size = centre_and_size(mesh)
+    work = pymeshlab.MeshSet(verbose=False)
+    work.add_mesh(pymeshlab.Mesh((mesh.vertices - centre) / size, mesh.faces.astype(np.int32)))
+    work.meshing_remove_duplicate_vertices()
+    work.meshing_remove_duplicate_faces()
+    work.meshing_repair_non_manifold_edges(method="Split Vertices")
+    work.meshing_repair_non_manifold_vertices(vertdispratio=APART)
+    try:
+        work.meshing_re_orient_faces_coherently()
+        work.meshing_close_holes(maxholesize=HOLE, selfintersection=False)
+    except pymeshlab.PyMeshLabException as error:
+        raise MeshError(f"The mesh could not be repaired: pymeshlab says {error}.") from error
+    result = work.current_mesh()
+    patched = Mesh(centre + size * result.vertex_matrix(), result.face_matrix().astype(np.int64))
+    before, after = verify(mesh), verify(patched)
+    return patched, [
+        f"Patched with pymeshlab: {before.boundary_edges} open, {before.crowded_edges} crowded and "
+        f"{before.turned_edges} disagreeing edges became {after.boundary_edges}, {after.crowded_edges} and "
+        f"{after.turned_edges}."
+    ]
+
+
+def _with_normals_of(mesh: Mesh, source: Mesh) -> Mesh:
+    if source.normals is None or mesh.normals is not None:
+        return mesh
+    _, nearest = cKDTree(source.vertices).query(mesh.vertices)
+    normals = source.normals[nearest]
+    by_faces = Mesh(mesh.vertices, mesh.faces).vertex_normals()
+    # A mesh that was turned round, or a new patch, has sides that the old normals do not know.
+    agree = np.einsum("ij,ij->i", normals, by_faces) > 0
+    return Mesh(mesh.vertices, mesh.faces, np.where(agree[:, None], normals, by_faces))

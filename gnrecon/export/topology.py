@@ -1,0 +1,104 @@
+"""How a mesh's faces hang together: its edges, its vertex fans and its components.
+
+A face (a, b, c) walks the half-edges a -> b, b -> c and c -> a. In a closed, oriented surface every edge is walked
+exactly twice, once each way. Around a vertex of a 2-manifold the faces form a single fan: linking the corners of
+faces that share an edge there leaves one group of corners for each vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gnrecon.mesh import Int, Mesh
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Half-edges of a mesh, sorted so that those of one edge follow each other.
+
+    Parameters
+    ----------
+    ends : integer array of shape (3 F, 2)
+        Lower and higher vertex of each half-edge.
+    forward : boolean array of shape (3 F,)
+        Whether the face walks from the lower to the higher vertex.
+    corner : integer array of shape (3 F,)
+        Index ``3 face + k`` of the corner that the half-edge starts from.
+    first : integer array of shape (E,)
+        Where each edge's half-edges begin.
+    count : integer array of shape (E,)
+        How many half-edges each edge has.
+    """
+
+    ends: Int
+    forward: Mask
+    corner: Int
+    first: Int
+    count: Int
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> Edges:
+        """Sort the half-edges of `mesh`."""
+        start = mesh.faces.reshape(-1)
+        end = np.roll(mesh.faces, -1, axis=1).reshape(-1)
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        key = low * max(len(mesh.vertices), 1) + high
+        order = np.argsort(key, kind="stable")
+        _, first, count = np.unique(key[order], return_index=True, return_counts=True)
+        ends = np.stack([low[order], high[order]], axis=1)
+        return cls(ends, (start < end)[order], order.astype(np.int64), first.astype(np.int64), count.astype(np.int64))
+
+    def balanced(self) -> Mask:
+        """Which edges are walked as often one way as the other, of shape (E,)."""
+        sums = np.add.reduceat(np.where(self.forward, 1, -1), self.first) if len(self.first) else np.empty(0)
+        return np.asarray(sums == 0)
+
+
+def split_vertices(mesh: Mesh, edges: Edges) -> Int:
+    """Vertices, of shape (N,), whose faces form more than one fan.
+
+    Edges with other than two half-edges link nothing, so that only vertices of closed meshes are told apart well.
+    """
+    fans = corner_fans(mesh, edges)
+    pairs = np.unique(np.stack([mesh.faces.reshape(-1), fans], axis=1), axis=0)
+    vertices, count = np.unique(pairs[:, 0], return_counts=True)
+    return np.asarray(vertices[count > 1], dtype=np.int64)
+
+
+def corner_fans(mesh: Mesh, edges: Edges) -> Int:
+    """Label of the fan that each corner belongs to, of shape (3 F,)."""
+    size = mesh.faces.size
+    first = edges.first[edges.count == 2]
+    one, other = edges.corner[first], edges.corner[first + 1]
+    # A half-edge's start corner and the next corner of its face are the two places where fans meet along the edge.
+    one_end, other_end = one - one % 3 + (one + 1) % 3, other - other % 3 + (other + 1) % 3
+    vertex = mesh.faces.reshape(-1)
+    opposite = vertex[one] == vertex[other_end]
+    rows = np.concatenate([one, one_end])
+    columns = np.concatenate([np.where(opposite, other_end, other), np.where(opposite, other, other_end)])
+    links = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(size, size))
+    labels: Int = connected_components(links, directed=False)[1].astype(np.int64)
+    return labels
+
+
+def face_components(mesh: Mesh) -> Int:
+    """Label from 0 of the component that each face belongs to, of shape (F,); faces that share a vertex are joined."""
+    start, end = mesh.faces[:, [0, 1]].reshape(-1), mesh.faces[:, [1, 2]].reshape(-1)
+    size = len(mesh.vertices)
+    links = coo_array((np.ones(len(start), dtype=np.int8), (start, end)), shape=(size, size))
+    labels = connected_components(links, directed=False)[1][mesh.faces[:, 0]]
+    return np.unique(labels, return_inverse=True)[1].astype(np.int64)
+
+
+def submesh(mesh: Mesh, faces: Mask) -> Mesh:
+    """The mesh of the given faces, a mask of shape (F,), with the vertices that they use and their normals."""
+    used, inverse = np.unique(mesh.faces[faces], return_inverse=True)
+    normals = None if mesh.normals is None else mesh.normals[used]
+    return Mesh(mesh.vertices[used], inverse.reshape(-1, 3), normals)

@@ -1,0 +1,144 @@
+"""What a mesh is, in numbers, and whether it bounds a solid.
+
+A mesh is sound when it is not empty, every edge is shared by exactly two faces that walk it in opposite directions, the
+faces around each vertex form one fan, its total volume is positive, and manifold3d takes it as a solid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gnrecon.errors import MeshError
+from gnrecon.export.solid import refusal, to_solid
+from gnrecon.export.topology import Edges, face_components, split_vertices
+from gnrecon.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class MeshFacts:
+    """Counts and sizes of a mesh.
+
+    Parameters
+    ----------
+    vertices, faces, components : int
+        Vertices that faces use; faces; parts that share no vertex.
+    euler_characteristic : int
+        Vertices - edges + faces.
+    genus : int or None
+        Number of handles of all components together; None unless closed, manifold and oriented.
+    area, volume : float
+        In squared and cubed units of the vertices; the volume is signed, positive when the faces look outward.
+    closed, manifold, oriented : bool
+        No edge has a single face; no edge has more than two faces and no vertex several fans; every edge is walked as
+        often one way as the other.
+    degenerate_faces, boundary_edges, crowded_edges, turned_edges, split_vertices : int
+        Faces that name a vertex twice; edges with one face; edges with more than two; edges whose two faces walk them
+        the same way; vertices whose faces form several fans.
+    """
+
+    vertices: int
+    faces: int
+    components: int
+    euler_characteristic: int
+    genus: int | None
+    area: float
+    volume: float
+    closed: bool
+    manifold: bool
+    oriented: bool
+    degenerate_faces: int
+    boundary_edges: int
+    crowded_edges: int
+    turned_edges: int
+    split_vertices: int
+
+    def as_dict(self) -> dict[str, object]:
+        """All facts by name, ready for JSON."""
+        return asdict(self)
+
+
+def verify(mesh: Mesh) -> MeshFacts:
+    """Count what there is to know about a mesh; nothing is required of it."""
+    edges = Edges.of(mesh)
+    pairs = edges.count == 2
+    boundary, crowded = int((edges.count == 1).sum()), int((edges.count > 2).sum())
+    turned = int((pairs & ~edges.balanced()).sum())
+    split = len(split_vertices(mesh, edges))
+    faces = mesh.faces
+    degenerate = int(((faces == np.roll(faces, 1, axis=1)).any(axis=1)).sum())
+    vertices = len(np.unique(faces))
+    euler = vertices - len(edges.count) + len(faces)
+    components = int(face_components(mesh).max(initial=-1)) + 1
+    closed, manifold, oriented = boundary == 0, crowded == split == degenerate == 0, turned == 0
+    return MeshFacts(
+        vertices=vertices,
+        faces=len(faces),
+        components=components,
+        euler_characteristic=euler,
+        genus=components - euler // 2 if closed and manifold and oriented else None,
+        area=mesh.area,
+        volume=mesh.volume,
+        closed=closed,
+        manifold=manifold,
+        oriented=oriented,
+        degenerate_faces=degenerate,
+        boundary_edges=boundary,
+        crowded_edges=crowded,
+        turned_edges=turned,
+        split_vertices=split,
+    )
+
+
+def require_sound(mesh: Mesh) -> MeshFacts:
+    """Return the facts of a mesh that bounds a solid.
+
+    Raises
+    ------
+    MeshError
+        Naming the first thing that is wrong.
+    """
+    broken = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    if broken:
+        raise MeshError(f"The mesh has {broken} vertices that are not finite.")
+    facts = verify(mesh)
+    failure = _first_failure(facts)
+    if failure is None:
+        error = refusal(to_solid(mesh, merge=False))
+        failure = f"is refused by manifold3d ({error})" if error else None
+    if failure is not None:
+        raise MeshError(f"The mesh {failure}.")
+    return facts
+
+
+def verify_file(path: str | Path) -> MeshFacts:
+    """Read a mesh back from its file and require it to be sound; STL corners are joined by position.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    MeshError
+        When what it holds does not bound a solid; the sentence names the file.
+    """
+    from gnrecon.io import read_mesh
+
+    try:
+        return require_sound(read_mesh(Path(path)))
+    except MeshError as error:
+        raise MeshError(f"{path}, read back: {error}") from error
+
+
+def _first_failure(facts: MeshFacts) -> str | None:
+    failures = (
+        (facts.faces == 0, "is empty"),
+        (facts.degenerate_faces > 0, f"has {facts.degenerate_faces} faces that name a vertex twice"),
+        (not facts.closed, f"is open: {facts.boundary_edges} edges have only one face"),
+        (facts.crowded_edges > 0, f"has {facts.crowded_edges} edges shared by more than two faces"),
+        (facts.turned_edges > 0, f"is not consistently oriented: faces disagree across {facts.turned_edges} edges"),
+        (facts.split_vertices > 0, f"has {facts.split_vertices} vertices where several fans of faces touch"),
+        (facts.volume <= 0, f"is inside out: its volume is {facts.volume:.6g}"),
+    )
+    return next((sentence for failed, sentence in failures if failed), None)

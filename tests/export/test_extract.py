@@ -1,0 +1,173 @@
+"""Extraction against the whole grid's marching cubes and against shapes of known genus, area and volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from shapes import UNIT, UTM, Field, plate, shells, sines, sphere, torus, union
+from skimage.measure import marching_cubes
+
+from gnrecon.cloud import Frame
+from gnrecon.errors import MeshError, UsageError
+from gnrecon.export import extract, project, require_sound
+from gnrecon.export.band import NUDGE, narrow_band
+from gnrecon.export.lattice import Lattice
+
+SHAPES = {
+    "sphere": sphere(),
+    "torus": torus(),
+    "two spheres": union(sphere(0.3, (-0.5, 0, 0)), sphere(0.25, (0.4, 0.3, 0.1))),
+    "nested shells": shells(),
+    "thin plate": plate(0.03),
+    "sphere beyond the box": sphere(1.3),
+    "random sines": sines(7),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_narrow_band_gives_the_whole_grids_surface(name: str) -> None:
+    field = Field(SHAPES[name])
+    mesh = extract(field, resolution=64)
+    lattice = Lattice.over(field, 64, None, 65536)
+    nodes = np.stack(np.meshgrid(*[np.arange(n + 1) for n in lattice.cells], indexing="ij"), axis=-1)
+    values = lattice.values(nodes.reshape(-1, 3), narrow_band(lattice).slope).reshape(nodes.shape[:3])
+    values = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
+    expected = lattice.world(vertices.astype(np.float64))
+    assert len(mesh.faces) == len(faces)
+    assert len(mesh.vertices) == len(expected)
+    # scikit-image works in float32.
+    distance, nearest = _nearest(expected, mesh.vertices)
+    assert distance.max() < 2e-5 * lattice.cell
+    assert len(np.unique(nearest)) == len(expected)
+    ours = {tuple(np.roll(face, -int(np.argmin(face)))) for face in mesh.faces}
+    theirs = nearest[faces]
+    assert {tuple(np.roll(face, -int(np.argmin(face)))) for face in theirs} == ours
+
+
+def _nearest(queries: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(targets).query(queries)
+
+
+def test_few_points_are_asked() -> None:
+    field = Field(sphere())
+    mesh = extract(field, resolution=256)
+    assert field.asked < 7 * len(mesh.vertices) < 0.1 * 256**3
+
+
+@pytest.mark.parametrize("frame", [UNIT, UTM], ids=["unit", "UTM"])
+@pytest.mark.parametrize(
+    ("function", "components", "genus", "volume"),
+    [
+        (sphere(), 1, 0, 4 / 3 * np.pi * 0.8**3),
+        (torus(), 1, 1, 2 * np.pi**2 * 0.6 * 0.2**2),
+        (SHAPES["two spheres"], 2, 0, 4 / 3 * np.pi * (0.3**3 + 0.25**3)),
+        (shells(), 3, 0, 4 / 3 * np.pi * (0.9**3 - 0.7**3 + 0.3**3)),
+        (plate(), 1, 0, 8 * 0.8 * 0.7 * 0.011),
+    ],
+    ids=["sphere", "torus", "two spheres", "nested shells", "thin plate"],
+)
+def test_known_shapes(function: object, components: int, genus: int, volume: float, frame: Frame) -> None:
+    field = Field(function, frame=frame)  # type: ignore[arg-type]
+    mesh = project(extract(field, resolution=128), field)
+    facts = require_sound(mesh)
+    assert (facts.components, facts.genus) == (components, genus)
+    assert facts.volume == pytest.approx(volume * frame.scale**3, rel=0.015)
+    assert np.abs(field.sdf(mesh.vertices)).max() < 1e-9 * frame.scale
+    assert mesh.normals is not None
+    assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1)
+
+
+def test_projection_beats_interpolation_and_gives_the_exact_normals() -> None:
+    field = Field(sphere(0.8), frame=UTM)
+    rough = extract(field, resolution=32)
+    fine = project(rough, field)
+    assert np.abs(field.sdf(rough.vertices)).max() > 1e-3
+    assert np.abs(field.sdf(fine.vertices)).max() < 1e-8
+    radial = UTM.to_unit(fine.vertices)
+    assert np.allclose(fine.normals, radial / np.linalg.norm(radial, axis=1, keepdims=True), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_projection_turns_no_face_over(seed: int) -> None:
+    field = Field(sines(seed, frequency=9.0))
+    rough = extract(field, resolution=40)
+    fine = project(rough, field)
+    assert np.array_equal(fine.faces, rough.faces)
+    old, new = rough.face_vectors, fine.face_vectors
+    assert (np.einsum("ij,ij->i", old, new) > 0).all()
+    free = np.abs(rough.vertices).max(axis=1) < 1.0
+    assert np.mean(np.abs(field.sdf(fine.vertices[free])) < 1e-9) > 0.9
+    assert np.mean(np.abs(field.sdf(rough.vertices[free])) < 1e-9) < 0.1
+    assert require_sound(fine).volume > 0
+
+
+def test_a_wrong_gradient_scale_does_not_lose_the_surface() -> None:
+    for factor in (0.05, 40.0):
+        mesh = extract(Field(lambda x, factor=factor: factor * sphere()(x)), resolution=64)
+        exact = extract(Field(sphere()), resolution=64)
+        assert np.allclose(mesh.vertices, exact.vertices, atol=1e-4)
+
+
+def test_a_slope_that_gradients_do_not_show_leaves_no_hole() -> None:
+    """A step 1e-3 wide between two constants: its gradient vanishes at every sample, propagation alone follows it."""
+    steep = Field(lambda x: np.clip(500 * sphere(0.63)(x), -1, 1))
+    facts = require_sound(extract(steep, resolution=96))
+    assert (facts.components, facts.genus) == (1, 0)
+    assert facts.volume == pytest.approx(4 / 3 * np.pi * 0.63**3, rel=0.05)
+
+
+def test_values_of_zero_on_nodes_make_no_degenerate_faces() -> None:
+    cube = Field(lambda x: np.abs(x).max(axis=1) - 0.5, reach=1.0)
+    mesh = extract(cube, resolution=32)
+    assert np.linalg.norm(mesh.face_vectors, axis=1).min() > 0
+    assert require_sound(mesh).volume == pytest.approx(1.0, rel=0.03)
+
+
+def test_a_shape_beyond_the_box_ends_in_flat_caps() -> None:
+    field = Field(sphere(1.3), reach=1.0, frame=UTM)
+    mesh = project(extract(field, resolution=40), field)
+    facts = require_sound(mesh)
+    unit = UTM.to_unit(mesh.vertices)
+    assert np.abs(unit).max() <= 1.0
+    capped = np.abs(unit).max(axis=1) > 0.97
+    assert capped.sum() > 100
+    assert facts.volume == pytest.approx(UTM.scale**3 * 7.1, rel=0.1)
+
+
+def test_bounds_narrow_the_box() -> None:
+    mesh = extract(Field(sphere(0.5)), resolution=40, bounds=np.array([[0, -1, -1], [1, 1, 1.0]]))
+    assert mesh.vertices[:, 0].min() >= 0
+    # The cap lies half a cell inside of the box, at x = 0.025.
+    expected = np.pi * (0.25 * 0.475 - (0.5**3 - 0.025**3) / 3)
+    assert require_sound(mesh).volume == pytest.approx(expected, rel=0.05)
+
+
+def test_same_bytes_again_whatever_the_batch() -> None:
+    one = extract(Field(torus()), resolution=48)
+    two = extract(Field(torus()), resolution=48, batch=997)
+    assert np.array_equal(one.vertices, two.vertices)
+    assert np.array_equal(one.faces, two.faces)
+
+
+def test_nothing_to_mesh_is_said() -> None:
+    with pytest.raises(MeshError, match="no zero level"):
+        extract(Field(lambda x: np.ones(len(x))), resolution=16)
+    with pytest.raises(MeshError, match="not finite"):
+        extract(Field(lambda x: np.full(len(x), np.nan)), resolution=16)
+
+
+def test_senseless_options_are_refused() -> None:
+    with pytest.raises(UsageError, match="resolution is 3"):
+        extract(Field(sphere()), resolution=3)
+    with pytest.raises(UsageError, match="batch is 0"):
+        extract(Field(sphere()), batch=0)
+    with pytest.raises(UsageError, match="not a lower and an upper corner"):
+        extract(Field(sphere()), bounds=np.zeros((2, 3)))
+    mesh = extract(Field(sphere()), resolution=8)
+    with pytest.raises(UsageError, match="steps is -1"):
+        project(mesh, Field(sphere()), steps=-1)
+    with pytest.raises(UsageError, match="limit is 0"):
+        project(mesh, Field(sphere()), limit=0)
