@@ -3,6 +3,7 @@
 from gnrecon.export.definitions import Metrics
 from gnrecon.export.extract import extract
 from gnrecon.export.metrics import measure
+from gnrecon.export.picture import render
 from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.repair import repair
@@ -17,6 +18,7 @@ __all__ = [
     "measure",
     "project",
     "remove_stray",
+    "render",
     "repair",
     "require_sound",
     "verify",

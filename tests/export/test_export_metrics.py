@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from shapes import UTM, Field, sphere, torus
+from analytic_fields import UTM, Field, sphere, torus
 
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import InputError, UsageError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from shapes import UTM, Field, plate, shells, sines, sphere, union
-from test_verify import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
+from analytic_fields import UTM, Field, plate, shells, sines, sphere, union
+from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
 
 from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import extract, project, remove_stray, repair, require_sound, verify

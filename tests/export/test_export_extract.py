@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from shapes import UNIT, UTM, Field, plate, shells, sines, sphere, torus, union
+from analytic_fields import UNIT, UTM, Field, plate, shells, sines, sphere, torus, union
 from skimage.measure import marching_cubes
 
 from gnrecon.cloud import Frame

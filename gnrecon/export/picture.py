@@ -1,0 +1,154 @@
+"""Pictures of meshes and scans, drawn by casting rays, so that no display and no graphics card is needed.
+
+Every pixel is the mean of nine samples. Surfaces are shaded by interpolated vertex normals, points as small balls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from gnrecon.cloud import Float, PointCloud
+from gnrecon.errors import UsageError
+from gnrecon.export.camera import Camera, View
+from gnrecon.export.nearest import ray_scene
+from gnrecon.export.shading import shade, sky_share, to_bytes, to_linear
+from gnrecon.export.splats import draw_points
+from gnrecon.mesh import Mesh
+
+CLAY, SLATE = (230, 208, 180), (86, 120, 164)
+"""Colours of meshes and of points."""
+
+PAPER_TOP, PAPER_BOTTOM = 1.0, 0.86
+"""Linear light of the background."""
+
+SUPERSAMPLING = 3
+"""Samples along each side of a pixel."""
+
+Image = npt.NDArray[np.uint8]
+
+
+def render(
+    mesh: Mesh | None,
+    path: str | Path | None = None,
+    *,
+    size: tuple[int, int] = (900, 600),
+    views: Sequence[View] = ("three-quarter",),
+    color: tuple[int, int, int] = CLAY,
+    points: PointCloud | None = None,
+    point_color: tuple[int, int, int] = SLATE,
+    up: str = "z",
+) -> Image:
+    """Draw a mesh, a scan, or both side by side.
+
+    Parameters
+    ----------
+    mesh : Mesh, optional
+    path : path, optional
+        PNG file to write; an older one is replaced.
+    size : pair of int
+        Width and height of the whole picture in pixels.
+    views : sequence of names or (azimuth, elevation) in degrees
+        Each is a panel; see `camera.VIEWS` for the names.
+    color, point_color : sRGB from 0 to 255
+    points : PointCloud, optional
+        Drawn in a panel of its own left of the mesh's, from the same place.
+    up : str
+        The axis that points upward, ``"y"`` or ``"z"``.
+
+    Returns
+    -------
+    array of shape (height, width, 3), uint8
+
+    Raises
+    ------
+    UsageError
+        When there is nothing to draw, or a view or the size is senseless.
+    OutputError
+        When the file cannot be written.
+    """
+    shown = [part for part in (points, mesh) if part is not None and len(_places(part))]
+    panels = len(shown) * len(views)
+    if not panels:
+        raise UsageError("There is nothing to draw: give a mesh or points, and a view.")
+    if size[0] < panels or size[1] < 1:
+        raise UsageError(f"A picture of {size[0]} x {size[1]} pixels has no room for {panels} panels.")
+    # Everything is drawn about the origin and about one in size, because the ray caster works in float32.
+    places = np.concatenate([_places(part) for part in shown])
+    centre = (places.min(axis=0) + places.max(axis=0)) / 2
+    scale = float(np.linalg.norm(places - centre, axis=1).max()) or 1.0
+    edges = np.linspace(0, size[0], panels + 1).astype(int) * SUPERSAMPLING
+    height = size[1] * SUPERSAMPLING
+    strips = []
+    for index, width in enumerate(np.diff(edges)):
+        view, part = views[index // len(shown)], shown[index % len(shown)]
+        camera = Camera.framing((places - centre) / scale, view, up, int(width), height)
+        unit = (_places(part) - centre) / scale
+        if isinstance(part, Mesh):
+            strips.append(_draw_mesh(Mesh(unit, part.faces, part.normals), camera, to_linear(color)))
+        else:
+            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, to_linear(point_color)))
+    light = np.concatenate(strips, axis=1)
+    image: Image = to_bytes(light.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3).mean(axis=(1, 3)))
+    if path is not None:
+        _write(image, Path(path))
+    return image
+
+
+def _places(part: Mesh | PointCloud) -> Float:
+    return part.vertices if isinstance(part, Mesh) else part.points
+
+
+def _background(camera: Camera) -> Float:
+    """Light paper, a little darker towards the bottom, of shape (H, W, 3)."""
+    rows = np.linspace(PAPER_TOP, PAPER_BOTTOM, camera.height)
+    return np.broadcast_to(rows[:, None, None], (camera.height, camera.width, 3)).copy()
+
+
+def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
+    from open3d import core
+
+    scene = ray_scene(mesh.vertices, mesh.faces)
+    rays = camera.rays()
+    answer = scene.cast_rays(core.Tensor.from_numpy(rays.astype(np.float32)))
+    distance = answer["t_hit"].numpy()
+    hit = np.isfinite(distance)
+    corners = mesh.faces[answer["primitive_ids"].numpy()[hit]]
+    u, v = answer["primitive_uvs"].numpy()[hit].astype(np.float64).T
+    normals = np.einsum("ij,ijk->ik", np.stack([1 - u - v, u, v], axis=1), mesh.vertex_normals()[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    places = rays[hit][:, :3] + distance[hit][:, None] * rays[hit][:, 3:]
+    # The sky is looked for once a pixel of the picture, not once a sample: it varies slowly, and costs most.
+    coarse = np.zeros_like(hit)
+    coarse[::SUPERSAMPLING, ::SUPERSAMPLING] = hit[::SUPERSAMPLING, ::SUPERSAMPLING]
+    chosen = coarse[hit]
+    small = sky_share(scene, places[chosen], normals[chosen], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
+    sky = small.repeat(SUPERSAMPLING, 0).repeat(SUPERSAMPLING, 1)[: hit.shape[0], : hit.shape[1]]
+    image = _background(camera)
+    image[hit] = shade(normals, color, camera.axes, sky[hit])
+    return image
+
+
+def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
+    spacing = 0.02
+    if len(cloud) > 1:
+        # Two thousand points tell the spacing well enough.
+        some = cloud.points[:: -(-len(cloud) // 2000)]
+        spacing = float(np.median(cKDTree(cloud.points).query(some, k=2)[0][:, 1]))
+    normals = cloud.normals
+    if normals is not None:
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    return draw_points(cloud.points, normals, min(0.55 * spacing, 0.02), camera, color, _background(camera))
+
+
+def _write(image: Image, path: Path) -> None:
+    from PIL import Image as Pillow
+
+    from gnrecon.io import atomic_write
+
+    with atomic_write(path, overwrite=True) as temporary:
+        Pillow.fromarray(image).save(temporary, format="PNG")

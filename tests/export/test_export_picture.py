@@ -1,0 +1,126 @@
+"""Pictures: what is where, in which colour, and that everything stays within the frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_fields import UTM, Field, sphere, union
+
+from gnrecon.cloud import PointCloud
+from gnrecon.errors import OutputError, UsageError
+from gnrecon.export import extract, project, render
+from gnrecon.export.camera import VIEWS, Camera
+from gnrecon.mesh import Mesh
+
+SIZE = (120, 90)
+
+
+@pytest.fixture(scope="module")
+def ball() -> Mesh:
+    field = Field(sphere(), frame=UTM)
+    return project(extract(field, resolution=24), field)
+
+
+def drawn(image: np.ndarray) -> np.ndarray:
+    """Which pixels are not paper: paper is grey."""
+    return np.ptp(image.astype(int), axis=2) > 6
+
+
+def test_a_ball_is_a_disc_in_the_middle(ball: Mesh, tmp_path: Path) -> None:
+    from PIL import Image
+
+    image = render(ball, tmp_path / "ball.png", size=SIZE, color=(200, 60, 60))
+    assert image.shape == (90, 120, 3)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "ball.png")), image)
+    rows, columns = np.nonzero(drawn(image))
+    assert rows.mean() == pytest.approx(44.5, abs=1)
+    assert columns.mean() == pytest.approx(59.5, abs=1)
+    # The disc fills the margin's share of the shorter side.
+    assert np.ptp(rows) + 1 == pytest.approx(0.92 * 90, abs=3)
+    assert drawn(image).sum() == pytest.approx(np.pi / 4 * (0.92 * 90) ** 2, rel=0.05)
+    red, green, _ = image[45, 60].astype(int)
+    assert red > green + 50
+    assert image[20:40, 40:60].mean() > image[60:80, 70:90].mean() + 10, "the key light comes from above and the left"
+
+
+def test_scan_and_mesh_stand_side_by_side(ball: Mesh) -> None:
+    scan = PointCloud(ball.vertices, ball.normals)
+    image = render(ball, size=(200, 100), points=scan, color=(200, 60, 60), point_color=(60, 60, 200)).astype(int)
+    left, right = image[:, :100], image[:, 100:]
+    assert (left[..., 2] - left[..., 0]).max() > 30 > (left[..., 0] - left[..., 2]).max()
+    assert (right[..., 0] - right[..., 2]).max() > 30 > (right[..., 2] - right[..., 0]).max()
+    assert np.abs(np.argwhere(drawn(left)).mean(axis=0) - np.argwhere(drawn(right)).mean(axis=0)).max() < 2
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_named_views_see_the_side_that_they_name(up: str) -> None:
+    """A small ball to the right, one above and one in front tell the axes apart."""
+    right = np.array([1.0, 0, 0])
+    above, front = (np.array([0, 0, 1.0]), np.array([0, -1.0, 0])) if up == "z" else (np.eye(3)[1], np.eye(3)[2])
+    points = np.array([right, above, front, -right, -above, -front])
+    for view, rightward, upward, nearest in (
+        ("front", right, above, front),
+        ("right", -front, above, right),
+        ("back", -right, above, -front),
+        ("left", front, above, -right),
+        ("top", right, -front, above),
+        ("bottom", right, front, -above),
+    ):
+        camera = Camera.framing(points, view, up, 100, 100)
+        assert np.allclose(camera.axes, [rightward, upward, nearest], atol=2e-3), view
+        assert np.allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
+        column, row, depth = camera.project(points)
+        assert depth.argmin() == np.argmax(points @ nearest)
+        assert column.argmax() == np.argmax(points @ rightward)
+        assert row.argmin() == np.argmax(points @ upward)
+
+
+@pytest.mark.parametrize("view", [*VIEWS, (130.0, -40.0)])
+def test_every_view_frames_the_whole_shape(view: object) -> None:
+    points = np.random.default_rng(0).normal(size=(300, 3)) * [3, 1, 0.4] + [10, -5, 2]
+    camera = Camera.framing(points, view, "z", 160, 90)  # type: ignore[arg-type]
+    column, row, depth = camera.project(points)
+    assert depth.min() > 0
+    assert column.min() >= 0
+    assert column.max() <= 160
+    assert row.min() >= 0
+    assert row.max() <= 90
+    assert np.ptp(column) > 0.85 * 160 or np.ptp(row) > 0.85 * 90
+
+
+def test_rays_and_projection_are_inverse() -> None:
+    camera = Camera.framing(np.random.default_rng(0).normal(size=(50, 3)), "three-quarter", "z", 30, 20)
+    rays = camera.rays()
+    column, row, _ = camera.project((rays[..., :3] + 3.7 * rays[..., 3:]).reshape(-1, 3))
+    assert np.allclose(column.reshape(20, 30), np.arange(30) + 0.5)
+    assert np.allclose(row.reshape(20, 30), np.arange(20)[:, None] + 0.5)
+
+
+def test_hollows_are_darker_than_the_open() -> None:
+    """Between two close balls the sky is covered."""
+    field = Field(union(sphere(0.4, (-0.42, 0, 0)), sphere(0.4, (0.42, 0, 0))), reach=1.0)
+    mesh = project(extract(field, resolution=48), field)
+    image = render(mesh, size=(180, 90), views=[(0, 0)]).astype(int).sum(axis=2)
+    assert image[45, 78] < image[45, 20] - 60
+
+
+def test_points_without_normals_fade_with_depth() -> None:
+    cloud = PointCloud(np.array([[-1.0, -1, 0], [1.0, 1, 0]]))
+    image = render(None, size=(100, 60), points=cloud, views=["front"]).astype(int)
+    near, far = (np.ptp(half, axis=2).max() for half in (image[:, :50], image[:, 50:]))
+    assert near > far > 0
+
+
+def test_what_cannot_be_drawn_is_said(ball: Mesh, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="nothing to draw"):
+        render(None)
+    with pytest.raises(UsageError, match="'sideways' is unknown"):
+        render(ball, views=["sideways"])
+    with pytest.raises(UsageError, match="axis is 'x'"):
+        render(ball, up="x")
+    with pytest.raises(UsageError, match="no room for 2 panels"):
+        render(ball, size=(1, 10), views=["front", "top"])
+    with pytest.raises(OutputError):
+        render(ball, tmp_path / "missing" / "ball.png", size=(8, 8))
