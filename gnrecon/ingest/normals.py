@@ -7,7 +7,8 @@ Directions are the least principal axis of each neighbourhood; what is hard is t
 - *Gauss's theorem* solved for all normals at once (`gauss`): right for sparse closed clouds, thin walls included, and
   outward by construction; used on up to a few thousand points, from which the others take their sign.
 
-The winding number of the result (`winding`) fixes the overall sign and decides between the two.
+The winding number of the result (`winding`) fixes the overall sign and decides between them. Propagation gets a second
+try with smoother planes where the first leaves doubt.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from gnrecon.ingest.winding import disorder, outwardness
 Float = npt.NDArray[np.float64]
 
 _TREE_NEIGHBOURS = 8
+_JITTER = 1e-6  # of the extent
+_OFF_PLANE_PENALTY = 2.0
 _GAUSS_POINTS = 2000
-_ORDERLY = 0.25  # disorder below which a dense cloud's propagated signs are taken without a second opinion
-_CLEARLY_BETTER = 0.7  # ratio of disorders; open scans never reach it, and there propagation is the right one
-_UNCERTAIN = 0.25  # disorder above which the orientation may be wrong in places (or the scan is open)
+_ORDERLY = 0.25  # disorder above which a closed surface's signs are doubtful in places, or the scan is open
+_CLEARLY_BETTER = 0.8  # ratio of disorders that Gauss's theorem must reach against propagation
 _OPEN = 0.1  # outwardness, in size, that says nothing about inside and outside
-_INWARD = -0.6  # half a sphere with inward normals has -0.5, and may be the scan of a bowl
+_INWARD = -0.75  # half a sphere with inward normals has about -0.6, and may be the scan of a bowl
 
 
 def oriented_normals(points: Float, neighbours: int = 12) -> tuple[Float, str]:
@@ -36,7 +38,7 @@ def oriented_normals(points: Float, neighbours: int = 12) -> tuple[Float, str]:
     Parameters
     ----------
     points : array of shape (N, 3), distinct, N >= 10
-    neighbours : how many points each tangent plane is fitted to
+    neighbours : how many points each tangent plane is fitted to (fewer in clouds of less than a hundred)
 
     Returns
     -------
@@ -47,36 +49,62 @@ def oriented_normals(points: Float, neighbours: int = 12) -> tuple[Float, str]:
     Raises
     ------
     InputError
-        When the points span no volume.
+        When the points cannot be triangulated, as fewer than four.
     """
     centred = points - points.mean(axis=0)
-    directions, propagated = _propagated(centred, neighbours)
-    side = outwardness(centred, propagated)
-    if abs(side) < _OPEN:
-        side = float(propagated[:, 2].mean())
-    normals = -propagated if side < 0 else propagated
-    unrest = disorder(centred, normals)
+    directions = _tangent_planes(centred, neighbours)
+    normals, unrest = _propagated(centred, directions, directions, 0.0)
     if len(points) <= _GAUSS_POINTS or unrest > _ORDERLY:
-        alternative = _by_gauss(centred, directions)
-        other = disorder(centred, alternative)
-        if other < _CLEARLY_BETTER * unrest:
-            normals, unrest = alternative, other
-    return normals, "estimated" if unrest <= _UNCERTAIN else "estimated, orientation uncertain"
+        smooth = _tangent_planes(centred, 2 * neighbours)
+        second, other = _propagated(centred, directions, smooth, _OFF_PLANE_PENALTY)
+        if other < unrest:
+            normals, unrest = second, other
+        third = _by_gauss(centred, directions)
+        other = disorder(centred, third)
+        # An open scan stays disorderly either way, and there only propagation can be right.
+        if other < min(_ORDERLY, _CLEARLY_BETTER * unrest):
+            normals, unrest = third, other
+    return normals, "estimated" if unrest <= _ORDERLY else "estimated, orientation uncertain"
 
 
-def _propagated(points: Float, neighbours: int) -> tuple[Float, Float]:
-    """Return the directions before and after propagation of signs, each of shape (N, 3)."""
+def _tangent_planes(points: Float, neighbours: int) -> Float:
+    """Return unit normals of arbitrary sign, of shape (N, 3)."""
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    # A tangent plane is local: in the smallest clouds it must not span half of the surface.
+    local = min(neighbours, max(4, len(points) // 8))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(local))
+    return np.array(cloud.normals)
+
+
+def _propagated(points: Float, directions: Float, planes: Float, penalty: float) -> tuple[Float, float]:
+    """Return `directions` with signs propagated along `planes`, outward or upward as a whole, and their disorder.
+
+    Parameters
+    ----------
+    points, directions, planes : arrays of shape (N, 3)
+    penalty : weight against edges of the tree that leave the tangent plane, as where two sheets come close
+    """
+    import open3d
+
+    # The tree comes from a Delaunay triangulation, which fails for exactly cospherical points, so all are moved a bit.
+    jitter = _JITTER * np.abs(points).max() * np.random.default_rng(0).normal(size=points.shape)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points + jitter))
+    cloud.normals = open3d.utility.Vector3dVector(planes)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(points))))
-        directions = np.array(cloud.normals)
         try:
-            cloud.orient_normals_consistent_tangent_plane(min(_TREE_NEIGHBOURS, len(points) - 1))
-        except RuntimeError:  # its Delaunay triangulation needs points that span a volume
-            raise InputError("Normals cannot be estimated, because the points span no volume.") from None
-    return directions, np.array(cloud.normals)
+            cloud.orient_normals_consistent_tangent_plane(min(_TREE_NEIGHBOURS, len(points) - 1), penalty, 1.0)
+        except RuntimeError:  # how open3d reports points that cannot be triangulated
+            raise InputError(f"Normals cannot be estimated from {len(points)} points that span no volume.") from None
+    signs = np.where(np.einsum("ij,ij->i", directions, np.asarray(cloud.normals)) < 0, -1.0, 1.0)
+    normals: Float = directions * signs[:, None]
+    side = outwardness(points, normals)
+    if abs(side) < _OPEN:
+        side = float(normals[:, 2].mean())
+    if side < 0:
+        normals = -normals
+    return normals, disorder(points, normals)
 
 
 def _by_gauss(points: Float, directions: Float) -> Float:

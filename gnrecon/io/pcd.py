@@ -1,7 +1,8 @@
 """PCD, the Point Cloud Library's format, by open3d's tensor reader.
 
-That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). It reports failures by
-printing a warning and returning an empty cloud, so the header's count is compared with what arrived.
+That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). But it reports failures by
+printing a warning and returning an empty cloud, and fills up what a short file lacks with zeros. So the amount of data
+is compared with the header before, and the number of points after.
 """
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ import numpy.typing as npt
 
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
+from gnrecon.io.text import numbers
 
-_HEADER_BYTES = 65536
+Header = dict[str, list[str]]
+
+_KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
 def read_pcd(path: Path) -> Contents:
@@ -27,7 +31,9 @@ def read_pcd(path: Path) -> Contents:
     """
     import open3d
 
-    declared = _declared(path)
+    header, body = _split(path.read_bytes())
+    declared = int(header["POINTS"][0])
+    _require_all(header, body, declared)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, format="pcd")
     arrays: dict[str, npt.NDArray[np.generic]] = {name: cloud.point[name].numpy() for name in cloud.point}
@@ -41,26 +47,41 @@ def read_pcd(path: Path) -> Contents:
     )
 
 
-def _declared(path: Path) -> int:
-    """Return the number of points that the header declares, after checks that keep open3d from misreading it."""
-    with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
-    header: dict[str, list[str]] = {}
-    for line in head.splitlines():
-        words = line.decode("ascii", errors="replace").split()
+def _split(data: bytes) -> tuple[Header, bytes]:
+    """Return the header's words by key, and the data behind it."""
+    header: Header = {}
+    start = 0
+    while "DATA" not in header and start < len(data):
+        end = data.find(b"\n", start) + 1 or len(data)
+        words = data[start:end].decode("ascii", errors="replace").split()
         if words and not words[0].startswith("#"):
             header[words[0].upper()] = words[1:]
-        if "DATA" in header:
-            break
-    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA") if not header.get(key)]
+        start = end
+    missing = [key for key in _KEYS if not header.get(key)]
     if missing:
         raise InputError(f"the PCD header lacks {' and '.join(missing)}.")
-    absent = {"x", "y", "z"} - set(header["FIELDS"])
-    if absent:
+    if not {"x", "y", "z"} <= set(header["FIELDS"]):
         raise InputError(f"expected fields named x, y and z, but the header lists {' '.join(header['FIELDS'])}.")
-    count = (header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))])[0]
-    if not count.isdecimal():
-        raise InputError(f"the header declares {count!r} points, but a count was expected.")
-    if int(count) > path.stat().st_size * 1000:  # no encoding packs a point that tightly: do not try to allocate it
-        raise InputError(f"the header declares {count} points, more than the file can hold.")
-    return int(count)
+    for key in ("SIZE", "COUNT", "POINTS"):
+        for word in header.get(key, []):
+            if not word.isdecimal():
+                raise InputError(f"the header's {key} holds {word!r}, but a count was expected.")
+    return header, data[start:]
+
+
+def _require_all(header: Header, body: bytes, points: int) -> None:
+    """Refuse data of another size than the header declares."""
+    counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["SIZE"]))]
+    row = sum(int(size) * count for size, count in zip(header["SIZE"], counts, strict=True))
+    match header["DATA"][0]:
+        case "ascii":
+            found = len(numbers(body.decode("ascii", errors="replace").split())) // max(sum(counts), 1)
+        case "binary":
+            found = len(body) // max(row, 1)
+        case "binary_compressed":
+            packed, unpacked = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, 0)
+            found = unpacked // max(row, 1) if packed <= len(body) - 8 else 0
+        case other:
+            raise InputError(f"the PCD encoding {other!r} is unknown.")
+    if found < points:
+        raise InputError(f"the header declares {points} points, but the file ends after {found}.")
