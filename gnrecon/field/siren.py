@@ -1,0 +1,89 @@
+"""Sine networks (SIREN) and their first derivatives in closed form.
+
+With a_0 = x, each hidden layer takes z_l = W_l a_{l-1} + b_l to a_l = sin z_l, and f = W a_L + b. The usual factor
+omega_0 is no separate number here: it is part of the weights, so that Gauss-Newton may change it.
+
+The adjoints d_l = df/dz_l run backwards from d = 1: d_l = cos z_l o (W_{l+1}^T d_{l+1}), and grad f = W_1^T d_1.
+
+Source: Sitzmann et al., Implicit Neural Representations with Periodic Activation Functions (2020); the paper's
+networks for shape reconstruction are ``Siren((32, 32, 32))``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gnrecon.field.jet import Jet
+from gnrecon.field.layout import Layout
+
+
+@dataclass(frozen=True)
+class Siren:
+    """A sine network from space to one value, of any depth and width.
+
+    Parameters
+    ----------
+    widths : tuple of int
+        Sizes of the hidden layers.
+    """
+
+    widths: tuple[int, ...]
+
+    @property
+    def layout(self) -> Layout:
+        """Where each layer lies in theta."""
+        return Layout((3, *self.widths, 1))
+
+    def initial(self, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Return smooth starting parameters, of shape (p,): uniform within 1/sqrt(fan-in), as the paper starts."""
+        layers = []
+        for out, into in self.layout.shapes:
+            bound = 1.0 / math.sqrt(into)
+            weights = torch.rand(out, into + 1, generator=generator, dtype=dtype) * (2 * bound) - bound
+            layers.append((weights[:, :-1], weights[:, -1]))
+        return self.layout.flatten(layers)
+
+    def value(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return f, of shape (N,), at points x, of shape (N, 3)."""
+        *hidden, (weights, bias) = self.layout.layers(theta)
+        activation = x
+        for layer_weights, layer_bias in hidden:
+            activation = torch.addmm(layer_bias, activation, layer_weights.T).sin_()
+        return torch.addmv(bias, activation, weights[0])
+
+    def features(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return the last hidden layer's activations a_L, of shape (N, width)."""
+        activation = x
+        for weights, bias in self.layout.layers(theta)[:-1]:
+            activation = torch.addmm(bias, activation, weights.T).sin_()
+        return activation
+
+    def value_and_gradient(self, theta: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return f, of shape (N,), and its gradient in x, of shape (N, 3), at points x, of shape (N, 3)."""
+        jet = self.jet(theta, x)
+        return jet.value, jet.gradient
+
+    def jet(self, theta: Tensor, x: Tensor) -> Jet:
+        """Return activations and adjoints at points x, of shape (N, 3), from which all derivatives are made."""
+        layers = self.layout.layers(theta)
+        activations, slopes = [x], []
+        for weights, bias in layers[:-1]:
+            z = torch.addmm(bias, activations[-1], weights.T)
+            slopes.append(z.cos())
+            activations.append(z.sin_())
+        value = torch.addmv(layers[-1][1], activations[-1], layers[-1][0][0])
+        adjoints = [torch.ones_like(value)[:, None]]
+        for slope, (weights, _) in zip(reversed(slopes), reversed(layers[1:]), strict=True):
+            adjoints.insert(0, (adjoints[0] @ weights).mul_(slope))
+        return Jet(layers, activations, slopes, adjoints, value, adjoints[0] @ layers[0][0])
+
+
+def batches(count: int, size: int) -> Iterator[slice]:
+    """Yield slices that cover `count` rows, at most `size` at a time."""
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))

@@ -1,0 +1,138 @@
+"""Samples in, a fitted signed distance field out.
+
+The loss, in the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
+
+    interface   f = 0                  at the points        1
+    normal      grad f = n             at the points        (0.2 h)^2     an angle, as a height over a fifth of a spacing
+    distance    f = coarse distance    in the box           1e-4 M / N    a row of it weighs 1e-2 of a row of data
+    eikonal     |grad f| = 1           near the surface     (0.1 h)^2
+                                       and in the box
+
+One wide layer is started by a linear solve and refined by Gauss-Newton steps in random subspaces: all output weights
+and the frequencies of some hundreds of units, drawn afresh each step, so that J^T J stays small. Deeper networks are
+fitted in all parameters along undamped directions, the data's weight rising in stages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.cloud import Samples
+from gnrecon.errors import FitError
+from gnrecon.field.siren import Siren
+from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
+from gnrecon.fit.problem import FieldProblem
+from gnrecon.fit.scene import Scene
+from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.start import smooth_start, wide_start
+from gnrecon.fit.terms import Term
+from gnrecon.optim.gauss_newton import GaussNewton, StopRule
+from gnrecon.optim.search import GainRatioDamping, LogLineSearch, Search
+from gnrecon.optim.solution import Callback, Solution
+from gnrecon.residuals.first_order import eikonal, interface, signed_distance
+from gnrecon.sampling import near_surface
+
+NORMAL_REACH = 0.2
+EIKONAL_REACH = 0.1
+DISTANCE_ROW = 1e-4
+SUBSPACE_UNITS = 400
+EIKONAL_COUNT = 3000
+MAX_STEP_POINTS = 4000
+WIDE_STEPS, DEEP_STEPS = 6, 120
+DEEP_STAGES = ((0.25, 1.0), (0.5, 30.0), (1.0, 1000.0))
+"""Up to this share of the steps, the interface's weight is this."""
+
+
+def fit(samples: Samples, options: FitOptions | None = None, callback: Callback | None = None) -> tuple[NeuralSDF, Solution]:
+    """Fit a sine network to the signed distance of oriented points.
+
+    An interrupt (Ctrl-C) during the steps keeps the best field so far; `Solution.interrupted` then says so.
+
+    Parameters
+    ----------
+    samples : points and normals of shape (N, 3) in the unit ball, with their frame
+    options : choices of network, start and steps
+    callback : called with the record of each step
+
+    Raises
+    ------
+    FitError
+        When the field is not finite.
+    """
+    options = options or FitOptions()
+    rng = np.random.default_rng(options.seed)
+    scene = Scene.of(samples, options.device, rng)
+    field = Siren(options.widths)
+    fitted = (_fit_wide if len(options.widths) == 1 else _fit_deep)(field, scene, options, rng, callback)
+    if not bool(torch.isfinite(fitted.theta).all()):
+        raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
+    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box)
+    return sdf, fitted
+
+
+def _fit_wide(
+    field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
+) -> Solution:
+    theta = wide_start(field, scene, lambda x, d: [*_data_terms(scene, options), _distance_term(scene, x, d)], rng)
+    steps = WIDE_STEPS if options.steps is None else options.steps
+    search: Search = LogLineSearch() if options.search == "line" else GainRatioDamping(initial_damping=1.0)
+
+    def problem_at(number: int, theta: Tensor) -> FieldProblem:
+        del number
+        units = torch.as_tensor(np.sort(rng.permutation(field.widths[0])[:SUBSPACE_UNITS])).to(theta.device)
+        return FieldProblem(field, _step_terms(scene, options, rng, 1.0), theta, (units, None))
+
+    return GaussNewton(search).run(problem_at, theta, StopRule(steps), callback)
+
+
+def _fit_deep(
+    field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
+) -> Solution:
+    theta = smooth_start(field, scene, lambda x, d: [_distance_term(scene, x, d)], rng)
+    steps = DEEP_STEPS if options.steps is None else options.steps
+    search: Search = GainRatioDamping() if options.search == "damping" else LogLineSearch()
+
+    def problem_at(number: int, theta: Tensor) -> FieldProblem:
+        weight = next(weight for share, weight in DEEP_STAGES if number <= share * steps)
+        return FieldProblem(field, _step_terms(scene, options, rng, weight), theta)
+
+    # No stage may end early, because each one looks converged before the next raises the weight of the data.
+    return GaussNewton(search).run(problem_at, theta, StopRule(steps, tolerance=0.0, patience=steps + 1), callback)
+
+
+def _data_terms(scene: Scene, options: FitOptions, rows: Tensor | None = None) -> list[Term]:
+    points, normals = scene.points, scene.normals
+    if rows is not None:
+        points, normals = points[rows], normals[rows]
+    normal_weight = (NORMAL_REACH * scene.coarse.spacing) ** 2
+    return [
+        Term("interface", interface, points),
+        Term("normal", NORMAL_RESIDUALS[options.normals], points, normals, normal_weight),
+    ]
+
+
+def _distance_term(scene: Scene, x: Tensor, distance: Tensor) -> Term:
+    """Each row weighs DISTANCE_ROW of a row of the data, however many there are of either."""
+    return Term("distance", signed_distance, x, distance, DISTANCE_ROW * len(x) / len(scene.points))
+
+
+def _step_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, data_weight: float) -> Sequence[Term]:
+    """Draw the terms of one step afresh."""
+    rows = None
+    if len(scene.points) > MAX_STEP_POINTS:
+        rows = torch.as_tensor(np.sort(rng.permutation(len(scene.points))[:MAX_STEP_POINTS])).to(scene.points.device)
+    x = scene.box.sample(scene.volume_count, rng)
+    spacing = scene.coarse.spacing
+    near = near_surface(scene.samples.points, 2 * spacing, EIKONAL_COUNT, rng)
+    around = np.concatenate([near, x[: EIKONAL_COUNT // 3]])
+    eikonal_weight = (EIKONAL_REACH * spacing) ** 2
+    return [
+        *(replace(term, weight=term.weight * data_weight) for term in _data_terms(scene, options, rows)),
+        _distance_term(scene, scene.tensor(x), scene.tensor(scene.coarse(x))),
+        Term("eikonal", eikonal, scene.tensor(around), None, eikonal_weight * data_weight**0.5),
+    ]

@@ -1,0 +1,65 @@
+"""The choices of a fit, with their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gnrecon.errors import UsageError
+from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
+
+NORMAL_RESIDUALS: dict[str, Residual] = {
+    "vector": normal_vector,
+    "projection": normal_projection,
+    "cosine": normal_cosine,
+}
+SEARCHES = ("auto", "damping", "line")
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What a fit is asked to do.
+
+    Parameters
+    ----------
+    widths : tuple of int
+        Hidden layers of the network. One wide layer starts from random sine features and an exact linear solve; several
+        layers start smooth, as in the paper.
+    steps : int, optional
+        Gauss-Newton steps after the start; by default 6 for one wide layer, 120 for several layers.
+    normals : ``"vector"``, ``"projection"`` or ``"cosine"``
+        Residual of the given normals, see `gnrecon.residuals.first_order`.
+    search : ``"auto"``, ``"damping"`` or ``"line"``
+        Gain-ratio damping, or the paper's log-spaced line search with tiny damping; by default the one that suits the
+        network's start.
+    seed : int
+        Seeds features and samples.
+    device : str
+        A torch device, ``"cpu"`` or ``"cuda"``.
+
+    Raises
+    ------
+    UsageError
+        When a value is out of its range.
+    """
+
+    widths: tuple[int, ...] = (2000,)
+    steps: int | None = None
+    normals: str = "vector"
+    search: str = "auto"
+    seed: int = 0
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if not self.widths or min(self.widths) < 1:
+            raise UsageError(f"Network widths must be positive numbers, not {self.widths}.")
+        if self.steps is not None and self.steps < 0:
+            raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
+        if self.normals not in NORMAL_RESIDUALS:
+            raise UsageError(f"The normal residual must be one of {', '.join(NORMAL_RESIDUALS)}, not {self.normals!r}.")
+        if self.search not in SEARCHES:
+            raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the options as plain values."""
+        return asdict(self)

@@ -1,0 +1,79 @@
+"""The fitted field, answering in the file's own frame and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gnrecon.cloud import Frame
+from gnrecon.field.siren import Siren, batches
+from gnrecon.sampling import Box
+
+Float = npt.NDArray[np.float64]
+
+_BATCH_BYTES = 32_000_000
+
+
+@dataclass(frozen=True)
+class NeuralSDF:
+    """A signed distance field: negative inside, in file units.
+
+    Parameters
+    ----------
+    field : Siren
+    theta : parameters of shape (p,), of the field in unit coordinates
+    frame : the similarity from unit to file coordinates
+    box : where the field was fitted, in unit coordinates
+    """
+
+    field: Siren
+    theta: Tensor
+    frame: Frame
+    box: Box
+
+    @property
+    def bounds(self) -> Float:
+        """Lower and upper corner of the box within which the field may be trusted, of shape (2, 3), file units."""
+        return self.frame.to_world(np.stack([self.box.lower, self.box.upper]))
+
+    def sdf(self, points: npt.ArrayLike) -> Float:
+        """Return signed distances, of shape (N,), at `points`, of shape (N, 3), all in file units."""
+        x = self._unit(points)
+        values = [self.field.value(self.theta, self._tensor(x[rows])) for rows in self._batches(len(x))]
+        return self.frame.scale * self._array(values, (0,))
+
+    def gradient(self, points: npt.ArrayLike) -> Float:
+        """Return the gradient of the distance, of shape (N, 3), at `points`, of shape (N, 3); it has no unit."""
+        x = self._unit(points)
+        # The frame's scale enters value and coordinate alike and cancels.
+        gradients = [
+            self.field.value_and_gradient(self.theta, self._tensor(x[rows]))[1] for rows in self._batches(len(x))
+        ]
+        return self._array(gradients, (0, 3))
+
+    def normals(self, points: npt.ArrayLike) -> Float:
+        """Return outward unit normals of the level sets, of shape (N, 3), at `points`, of shape (N, 3)."""
+        gradient = self.gradient(points)
+        lengths = np.linalg.norm(gradient, axis=1, keepdims=True)
+        unit: Float = gradient / np.maximum(lengths, np.finfo(np.float64).tiny)
+        return unit
+
+    def _unit(self, points: npt.ArrayLike) -> Float:
+        return self.frame.to_unit(np.asarray(points, dtype=np.float64).reshape(-1, 3))
+
+    def _tensor(self, x: Float) -> Tensor:
+        return torch.as_tensor(x).to(self.theta)
+
+    def _batches(self, count: int) -> list[slice]:
+        return list(batches(count, max(256, _BATCH_BYTES // (8 * max(self.field.widths)))))
+
+    @staticmethod
+    def _array(parts: list[Tensor], empty: tuple[int, ...]) -> Float:
+        if not parts:
+            return np.zeros(empty)
+        array: Float = torch.cat(parts).cpu().numpy().astype(np.float64)
+        return array

@@ -1,0 +1,79 @@
+"""Residuals of a field's value f and gradient g, linearised:  dr = by_value df + by_gradient . dg.
+
+The names follow the paper's table of constraints; each function takes values of shape (N,), gradients of shape (N, 3)
+and its targets, and returns m residuals for every point. What a network is, or how it is sampled, is not known here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals r, of shape (N, m), and their derivatives by f, (N, m), and by grad f, (N, m, 3); None means zero."""
+
+    residual: Tensor
+    by_value: Tensor | None
+    by_gradient: Tensor | None
+
+
+Residual = Callable[[Tensor, Tensor, Tensor | None], Linearised]
+
+
+def interface(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The surface passes through the point: r = f (the paper's interface constraint)."""
+    del gradient, target
+    return Linearised(value[:, None], torch.ones_like(value)[:, None], None)
+
+
+def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The value is known: r = f - target, targets of shape (N,)."""
+    del gradient
+    assert target is not None, "signed distances are the targets of this residual"
+    return Linearised((value - target)[:, None], torch.ones_like(value)[:, None], None)
+
+
+def normal_vector(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The gradient is the unit normal n: r = grad f - n, three residuals a point, linear in f."""
+    del value
+    assert target is not None, "unit normals are the targets of this residual"
+    axes = torch.eye(3, dtype=gradient.dtype, device=gradient.device).expand(len(gradient), 3, 3)
+    return Linearised(gradient - target, None, axes)
+
+
+def normal_projection(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The derivative along the unit normal n is one: r = n . grad f - 1.
+
+    This is what the paper's experiments minimise; together with the eikonal constraint it is the prescribed normal of
+    its table, whose own cosine form `normal_cosine` is flat to first order once the normals agree.
+    """
+    del value
+    assert target is not None, "unit normals are the targets of this residual"
+    return Linearised(((gradient * target).sum(1) - 1.0)[:, None], None, target[:, None, :])
+
+
+def normal_cosine(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The gradient's direction is the unit normal n: r = n . grad f / |grad f| - 1 (the paper's table)."""
+    del value
+    assert target is not None, "unit normals are the targets of this residual"
+    length = _length(gradient)
+    unit = gradient / length
+    cosine = (unit * target).sum(1, keepdim=True)
+    return Linearised(cosine - 1.0, None, ((target - cosine * unit) / length)[:, None, :])
+
+
+def eikonal(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The field is a distance: r = |grad f| - 1 (the paper's eikonal constraint)."""
+    del value, target
+    length = _length(gradient)
+    return Linearised(length - 1.0, None, (gradient / length)[:, None, :])
+
+
+def _length(gradient: Tensor) -> Tensor:
+    """|grad f| of shape (N, 1), bounded below so that a critical point of f has a finite direction."""
+    return torch.linalg.vector_norm(gradient, dim=1, keepdim=True).clamp_min(1e-12)
