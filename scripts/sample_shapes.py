@@ -89,14 +89,16 @@ def bracket_distance(points: Float) -> Float:
 def trefoil(samples: int, scale: float) -> tuple[Float, Float]:
     """Return points on a trefoil knot, of shape (samples, 3), and their parameters; it stands on two of its lobes."""
     t = np.linspace(0.0, 2.0 * np.pi, samples, endpoint=False)
-    curve = np.stack([np.sin(t) + 2.0 * np.sin(2.0 * t), 1.3 * np.sin(3.0 * t), 2.0 * np.cos(2.0 * t) - np.cos(t)], axis=1)
+    curve = np.stack(
+        [np.sin(t) + 2.0 * np.sin(2.0 * t), 1.3 * np.sin(3.0 * t), 2.0 * np.cos(2.0 * t) - np.cos(t)], axis=1
+    )
     return scale * curve, t
 
 
 def knot_distance(points: Float) -> Float:
     """Return the distance to a trefoil of swelling thickness that stands on a stepped round plinth."""
     curve, t = trefoil(8192, 13.0)
-    away, nearest = KDTree(curve + (0.0, 0.0, 45.0)).query(points)
+    away, nearest = KDTree(curve + np.array([0.0, 0.0, 45.0])).query(points)
     knot = away - (6.0 + 1.2 * np.cos(3.0 * t[nearest]))
     x, y, z = points.T
     plinth = extrude(circle(x, y, 42.0), z - 4.0, 4.0, 1.5)
