@@ -1,0 +1,52 @@
+"""Starts a benchmark by its name; without a name, lists them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+from gnrecon.errors import ExitCode, GnreconError
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A module with a function ``main(arguments) -> exit code``, and what it measures, in a line."""
+
+    module: str
+    description: str
+
+
+BENCHMARKS = {
+    "paper": Benchmark("benchmarks.paper", "the paper's two shapes, gnrecon beside screened Poisson"),
+}
+
+
+def listing() -> str:
+    """Return the benchmarks, one a line."""
+    width = max(len(name) for name in BENCHMARKS)
+    lines = [f"  {name:{width}}  {benchmark.description}" for name, benchmark in BENCHMARKS.items()]
+    return "\n".join(["usage: bench NAME [options]     (bench NAME --help shows the options)", "", *lines])
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the benchmark that the first argument names with the other arguments; return the exit code."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(listing())
+        return ExitCode.OK
+    name, *rest = arguments
+    if name not in BENCHMARKS:
+        print(f"bench: there is no benchmark {name!r}; expected one of {', '.join(BENCHMARKS)}.", file=sys.stderr)
+        return ExitCode.USAGE
+    try:
+        return int(import_module(BENCHMARKS[name].module).main(rest))
+    except GnreconError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

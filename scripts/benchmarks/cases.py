@@ -1,0 +1,74 @@
+"""The paper's two shapes, and the scans that are drawn from them.
+
+A scan is a random choice of the mesh's vertices with their area-weighted normals. The frame is the paper's: the mean of
+all vertices is the origin, and their largest distance from it the unit of length. Vertices that no face uses have no
+normal: they count for the frame and for the number of points, but are never chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gnrecon.cloud import Frame, PointCloud
+from gnrecon.errors import InputError
+from gnrecon.io import read_mesh
+from gnrecon.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A mesh file of the data folder, and from where it is drawn: the upward axis, azimuth and elevation in degrees."""
+
+    file: str
+    up: str
+    view: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A shape, and the share of its vertices that the scan has."""
+
+    shape: Shape
+    fraction: float
+
+
+ROCKER_ARM = Shape("rocker-arm.off", up="z", view=(35.0, 25.0))
+BUNNY = Shape("bun_zipper.ply", up="y", view=(0.0, 10.0))
+
+CASES = {
+    "rockerarm-5": Case(ROCKER_ARM, 0.05),
+    "rockerarm-20": Case(ROCKER_ARM, 0.2),
+    "rockerarm-30": Case(ROCKER_ARM, 0.3),
+    "rockerarm-100": Case(ROCKER_ARM, 1.0),
+    "bunny-20": Case(BUNNY, 0.2),
+    "bunny-30": Case(BUNNY, 0.3),
+    "bunny-100": Case(BUNNY, 1.0),
+}
+DEFAULT_CASES = ("rockerarm-5", "rockerarm-20", "bunny-20")
+
+
+def load(shape: Shape, folder: Path) -> Mesh:
+    """Return a shape in its unit frame.
+
+    Raises
+    ------
+    InputError
+        When its file is missing or cannot be read.
+    """
+    path = folder / shape.file
+    if not path.is_file():
+        raise InputError(f"There is no file {path}; name the folder that holds {shape.file} with --data.")
+    mesh = read_mesh(path)
+    return Mesh(Frame.of(mesh.vertices).to_unit(mesh.vertices), mesh.faces)
+
+
+def draw(truth: Mesh, fraction: float, seed: int) -> PointCloud:
+    """Return a scan of round(fraction * V) of the V vertices, or of all that have a normal where those are fewer."""
+    normals = truth.vertex_normals()
+    candidates = np.flatnonzero(np.linalg.norm(normals, axis=1) > 0.5)
+    count = min(round(fraction * len(truth.vertices)), len(candidates))
+    rows = np.sort(np.random.default_rng(seed).choice(candidates, count, replace=False))
+    return PointCloud(truth.vertices[rows], normals[rows])

@@ -1,0 +1,43 @@
+"""What all tests share: quiet threads, seeded chance, and the way to data that is kept outside of the repository."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from pathlib import Path
+
+# Before torch, numpy or open3d is imported, because they read this once: tests must not crowd a shared machine.
+os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
+os.environ.setdefault("MKL_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
+
+import hypothesis
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+# A slow example says more about the machine than about the code.
+hypothesis.settings.register_profile("gnrecon", deadline=None)
+hypothesis.settings.load_profile("gnrecon")
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The folder that holds setup.cfg."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of test data outside of the repository; tests that need it are skipped where it is absent."""
+    folder = Path(os.environ.get("GNRECON_TEST_DATA", REPOSITORY / "../shared/data")).resolve()
+    if not folder.is_dir():
+        pytest.skip(f"there is no test data at {folder} (GNRECON_TEST_DATA names another folder)")
+    return folder
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """A random generator seeded by the test's name: every test has its own numbers, and the same ones each time."""
+    return np.random.default_rng(zlib.crc32(request.node.nodeid.encode()))
