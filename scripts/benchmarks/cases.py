@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Frame, PointCloud
+from gnrecon.cloud import Float, Frame
 from gnrecon.errors import InputError
 from gnrecon.io import read_mesh
 from gnrecon.mesh import Mesh
@@ -65,10 +65,13 @@ def load(shape: Shape, folder: Path) -> Mesh:
     return Mesh(Frame.of(mesh.vertices).to_unit(mesh.vertices), mesh.faces)
 
 
-def draw(truth: Mesh, fraction: float, seed: int) -> PointCloud:
-    """Return a scan of round(fraction * V) of the V vertices, or of all that have a normal where those are fewer."""
+def draw(truth: Mesh, fraction: float, seed: int) -> tuple[Float, Float]:
+    """Return points and unit normals, both of shape (N, 3).
+
+    N is round(fraction * V) of the mesh's V vertices, or the number of those with a normal where these are fewer.
+    """
     normals = truth.vertex_normals()
     candidates = np.flatnonzero(np.linalg.norm(normals, axis=1) > 0.5)
     count = min(round(fraction * len(truth.vertices)), len(candidates))
     rows = np.sort(np.random.default_rng(seed).choice(candidates, count, replace=False))
-    return PointCloud(truth.vertices[rows], normals[rows])
+    return truth.vertices[rows], normals[rows]

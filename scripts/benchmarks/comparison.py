@@ -57,14 +57,14 @@ def run_case(name: str, data: Path, seeds: Sequence[int], protocol: Protocol, fo
     save_mesh(truth, folder / "truth.npz")
     records = []
     for seed in seeds:
-        scan = draw(truth, case.fraction, seed)
-        save_scan(scan, folder / f"scan-{seed}.npz")
+        points, normals = draw(truth, case.fraction, seed)
+        save_scan(points, normals, folder / f"scan-{seed}.npz")
         for number, (method, settings) in enumerate(protocol.contestants()):
             print(f"bench: {name}, seed {seed}, {method} {settings or ''}", file=sys.stderr)
             files = str(folder / f"scan-{seed}.npz"), str(folder / "truth.npz")
             job = Job(method, *files, threads=protocol.threads, samples=protocol.samples, settings=settings)
             place = folder / f"{seed}-{number}"
-            record = {"case": name, "method": method, "settings": settings, "seed": seed, "points": len(scan)}
+            record = {"case": name, "method": method, "settings": settings, "seed": seed, "points": len(points)}
             records.append(record | {"folder": str(place)} | run_trial(job, place))
     return records
 

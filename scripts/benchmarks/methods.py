@@ -1,7 +1,8 @@
 """The methods that are compared, each from points and outward normals to a mesh.
 
 An entry of the table loads the libraries of its method and returns the function that does the work, so that only the
-work is timed. A function's keyword arguments are its settings.
+work is timed. The function takes points and normals, both of shape (N, 3), and its settings by keyword; it returns the
+mesh, and details that are worth keeping beside the figures.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
+from gnrecon.cloud import Float
 from gnrecon.mesh import Mesh
 
-Method = Callable[..., Mesh]
+Method = Callable[..., tuple[Mesh, dict[str, Any]]]
 
 
 def load_gnrecon() -> Method:
-    """The main job of gnrecon; `options` are those of `gnrecon.reconstruct`."""
+    """Load the main job of gnrecon, whose settings are the options of `gnrecon.reconstruct`."""
     # gnrecon itself imports these on first use.
     import manifold3d  # noqa: F401
     import open3d  # noqa: F401
@@ -26,21 +27,22 @@ def load_gnrecon() -> Method:
 
     from gnrecon.pipeline import reconstruct
 
-    def run(scan: PointCloud, **options: Any) -> Mesh:
-        return reconstruct(scan.points, normals=scan.normals, **options).mesh
+    def run(points: Float, normals: Float, **options: Any) -> tuple[Mesh, dict[str, Any]]:
+        result = reconstruct(points, normals=normals, **options)
+        return result.mesh, {"stages": result.report["stages"], "status": result.report["fit"]["status"]}
 
     return run
 
 
 def load_poisson() -> Method:
-    """Screened Poisson (Kazhdan and Hoppe 2013) as open3d has it, its mesh left untrimmed."""
+    """Load screened Poisson (Kazhdan and Hoppe 2013) as open3d has it, its mesh left untrimmed."""
     import open3d
 
-    def run(scan: PointCloud, depth: int, n_threads: int) -> Mesh:
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scan.points))
-        cloud.normals = open3d.utility.Vector3dVector(scan.normals)
+    def run(points: Float, normals: Float, depth: int, n_threads: int) -> tuple[Mesh, dict[str, Any]]:
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+        cloud.normals = open3d.utility.Vector3dVector(normals)
         mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=n_threads)
-        return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+        return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles)), {}
 
     return run
 

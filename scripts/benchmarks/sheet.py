@@ -40,12 +40,12 @@ def draw_sheet(summaries: Sequence[dict[str, Any]], folder: Path, path: Path) ->
 def _row(summary: dict[str, Any], folder: Path) -> np.ndarray[Any, np.dtype[np.uint8]]:
     shape = CASES[summary["case"]].shape
     parts: dict[str, PointCloud | Mesh | None] = {
-        f"{summary['case']}: {summary['points']:,} points": load_scan(next(folder.glob("scan-*.npz")))
+        f"{summary['case']}: {summary['points']:,} points": PointCloud(*load_scan(folder / "scan-0.npz"))
     }
     for method in ("gnrecon", "Poisson"):
         result = summary[method]
         failed = "error" in result
-        title = f"{method}: failed" if failed else f"{method}: {1e3 * result['chamfer_mean']:.2f}"
+        title = f"{method}: failed" if failed else f"{method}: {1e3 * result['chamfer_mean']:.2f}e-3"
         parts[title] = None if failed else load_mesh(Path(result["folder"]) / "mesh.npz")
     parts["truth"] = load_mesh(folder / "truth.npz")
     return np.concatenate([_panel(title, part, shape) for title, part in parts.items()], axis=1)

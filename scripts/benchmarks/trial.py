@@ -21,7 +21,7 @@ import numpy as np
 
 import gnrecon
 from benchmarks.methods import METHODS
-from gnrecon.cloud import PointCloud
+from gnrecon.cloud import Float
 from gnrecon.errors import GnreconError
 from gnrecon.export import measure, verify
 from gnrecon.mesh import Mesh
@@ -82,15 +82,15 @@ def save_mesh(mesh: Mesh, path: Path) -> None:
     np.savez(path, vertices=mesh.vertices, faces=mesh.faces)
 
 
-def load_scan(path: Path) -> PointCloud:
-    """Return a scan that `save_scan` wrote."""
+def load_scan(path: Path) -> tuple[Float, Float]:
+    """Return the points and normals that `save_scan` wrote."""
     with np.load(path) as arrays:
-        return PointCloud(arrays["points"], arrays["normals"])
+        return arrays["points"], arrays["normals"]
 
 
-def save_scan(scan: PointCloud, path: Path) -> None:
+def save_scan(points: Float, normals: Float, path: Path) -> None:
     """Write the points and normals of a scan as they are (.npz)."""
-    np.savez(path, points=scan.points, normals=scan.normals)
+    np.savez(path, points=points, normals=normals)
 
 
 def main(folder: Path) -> None:
@@ -99,18 +99,20 @@ def main(folder: Path) -> None:
     # Thread pools other than OpenMP's (TBB) go by the processors that the process may use; macOS cannot limit them.
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: job.threads])
-    scan = load_scan(Path(job.scan))
+    points, normals = load_scan(Path(job.scan))
     method = METHODS[job.method]()
     memory_before = peak_memory_mb()
     start = time.perf_counter()
-    mesh = method(scan, **job.settings)
-    figures = {
+    mesh, details = method(points, normals, **job.settings)
+    figures: dict[str, Any] = {
         "seconds": time.perf_counter() - start,
         "peak_memory_mb": peak_memory_mb(),
         "libraries_memory_mb": memory_before,
     }
     save_mesh(mesh, folder / "mesh.npz")
-    figures |= measure(mesh, load_mesh(Path(job.truth)), samples=job.samples).as_dict() | verify(mesh).as_dict()
+    figures |= (
+        measure(mesh, load_mesh(Path(job.truth)), samples=job.samples).as_dict() | verify(mesh).as_dict() | details
+    )
     (folder / "figures.json").write_text(json.dumps(figures), encoding="utf-8")
 
 
