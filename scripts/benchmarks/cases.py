@@ -35,7 +35,7 @@ class Case:
     fraction: float
 
 
-ROCKER_ARM = Shape("rocker-arm.off", up="z", view=(35.0, 25.0))
+ROCKER_ARM = Shape("rocker-arm.off", up="z", view=(70.0, 20.0))
 BUNNY = Shape("bun_zipper.ply", up="y", view=(0.0, 10.0))
 
 CASES = {

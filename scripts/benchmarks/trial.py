@@ -66,7 +66,9 @@ def run_trial(job: Job, folder: Path) -> dict[str, Any]:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         last = done.stderr.strip().splitlines()[-1:]
-        return {"error": last[0] if last else f"The process ended with status {done.returncode}."}
+        # What was killed (for want of memory, say) has said nothing about it.
+        said = last[0] if last and done.returncode > 0 else f"The process ended with status {done.returncode}."
+        return {"error": said}
     figures: dict[str, Any] = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
     return figures
 
