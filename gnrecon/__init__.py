@@ -1,1 +1,79 @@
-"""Watertight meshes from point clouds."""
+"""Watertight meshes from point clouds: sine networks fitted to the signed distance by Gauss-Newton.
+
+>>> import gnrecon
+>>> result = gnrecon.reconstruct("scan.ply")        # doctest: +SKIP
+>>> result.save("mesh.obj")                         # doctest: +SKIP
+
+The names below are imported on first use, so that ``import gnrecon`` is fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from gnrecon.cloud import Frame, PointCloud, Samples
+from gnrecon.errors import FitError, GnreconError, InputError, MeshError, OutputError, UsageError
+from gnrecon.mesh import Mesh
+from gnrecon.version import __version__
+
+if TYPE_CHECKING:
+    from gnrecon.export import extract, measure, project, remove_stray, render, repair, require_sound, verify
+    from gnrecon.fit import FitOptions, NeuralSDF, fit
+    from gnrecon.ingest import prepare
+    from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
+    from gnrecon.options import Options
+    from gnrecon.pipeline import Reconstruction, reconstruct
+
+_ROOMS = {
+    "gnrecon.export": ("extract", "measure", "project", "remove_stray", "render", "repair", "require_sound", "verify"),
+    "gnrecon.fit": ("FitOptions", "NeuralSDF", "fit"),
+    "gnrecon.ingest": ("prepare",),
+    "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
+    "gnrecon.options": ("Options",),
+    "gnrecon.pipeline": ("Reconstruction", "reconstruct"),
+}
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
+
+__all__ = [
+    "FitError",
+    "FitOptions",
+    "Frame",
+    "GnreconError",
+    "InputError",
+    "Mesh",
+    "MeshError",
+    "NeuralSDF",
+    "Options",
+    "OutputError",
+    "PointCloud",
+    "Reconstruction",
+    "Samples",
+    "UsageError",
+    "__version__",
+    "as_cloud",
+    "extract",
+    "fit",
+    "measure",
+    "prepare",
+    "project",
+    "read_cloud",
+    "read_mesh",
+    "reconstruct",
+    "remove_stray",
+    "render",
+    "repair",
+    "require_sound",
+    "to_open3d",
+    "to_trimesh",
+    "verify",
+    "write_mesh",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module 'gnrecon' has no attribute {name!r}")
+    value = getattr(import_module(_ROOM_OF[name]), name)
+    globals()[name] = value
+    return value

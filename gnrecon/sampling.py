@@ -1,16 +1,19 @@
 """Where a field is sampled: in the volume, near the surface; and a coarse signed distance to supervise it there.
 
-The coarse distance is that to the nearest point; its sign is trusted to the generalised winding number
-w(x) = sum_j a_j n_j . (p_j - x) / (4 pi |p_j - x|^3) of the cloud, with a_j the area that point j stands for: above one
-half means inside. It closes holes and open scans the way a soap film would, where the nearest normals alone would call
-all that lies behind a scan solid. Close to the data the sum is singular, so there the nearest normals vote.
+The sign is that of the generalised winding number w(x) = sum_j a_j n_j . (p_j - x) / (4 pi |p_j - x|^3) of the cloud,
+with a_j the area that point j stands for: above one half means inside. It closes holes and open scans much as a soap
+film would, and is right wherever x is farther from the surface than the points are from each other, where the nearest
+normals often are not. Source: Barill et al., Fast Winding Numbers for Soups and Clouds (2018).
 
-Source of the sum over points: Barill et al., Fast Winding Numbers for Soups and Clouds (2018).
+The size follows from the distance d to the nearest point. A surface seen through points of which each stands for a
+disk of radius rho is nearer than they are: for random points the nearest one lies rho beside the foot of x in the root
+mean square, so that sqrt(d^2 - rho^2) is used. Samples nearer than 2 rho tell nothing and are left out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +47,7 @@ def near_surface(points: Float, spread: float, count: int, rng: np.random.Genera
 
 
 class CoarseDistance:
-    """Distance to the nearest point of a cloud, signed by winding number and normals; negative inside.
+    """Signed distance to a cloud, coarse but never wrong in sign by much; negative inside.
 
     Parameters
     ----------
@@ -56,29 +59,23 @@ class CoarseDistance:
         from scipy.spatial import cKDTree
 
         self._tree = cKDTree(points)
-        self._points, self._normals = points, normals
         self.spacing = float(np.median(self._tree.query(points, k=2)[0][:, 1]))
+        self._disks = _disk_radii(points, self._tree)
         chosen = np.sort(rng.permutation(len(points))[:_SOURCES])
         self._sources = points[chosen]
-        k = min(_NEIGHBOURS, len(chosen) - 1)
-        reach = cKDTree(self._sources).query(self._sources, k + 1)[0][:, -1]
-        # The disk that reaches the k-th neighbour is shared by k points.
-        self._dipoles = normals[chosen] * (reach**2 / (4 * k))[:, None]
-        self._near = 2.0 * float(np.median(reach))
+        self._radii = _disk_radii(self._sources, cKDTree(self._sources))
+        self._dipoles = normals[chosen] * (self._radii**2 / 4)[:, None]
 
-    def __call__(self, x: Float) -> Float:
-        """Return signed distances, of shape (Q,), at points x, of shape (Q, 3)."""
-        k = min(_NEIGHBOURS, len(self._points))
-        distances, nearest = self._tree.query(x, k=k, workers=-1)
-        heights = np.einsum("qkc,qkc->qk", x[:, None, :] - self._points[nearest], self._normals[nearest])
-        vote = (heights / (distances**2 + 1e-12)).sum(axis=1)
-        far = distances[:, 0] > self._near
-        vote[far] = 0.5 - self.winding_number(x[far])
-        signed: Float = np.where(vote < 0, -1.0, 1.0) * distances[:, 0]
-        return signed
+    def sample(self, x: Float) -> tuple[Float, Float]:
+        """Return those of the points x, of shape (Q, 3), where the distance is known, and the distances there."""
+        distances, nearest = self._tree.query(x, workers=-1)
+        known = distances > 2 * self._disks[nearest]
+        x, distances, disks = x[known], distances[known], self._disks[nearest[known]]
+        sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
+        return x, sign * np.sqrt(distances**2 - disks**2)
 
     def winding_number(self, x: Float, batch: int = 2048) -> Float:
-        """Return w, of shape (Q,), at points x, of shape (Q, 3), away from the data."""
+        """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
         # sum_j d_j . (p_j - x) / |p_j - x|^3, with the squares expanded so that both factors are matrix products.
         offset = np.einsum("jc,jc->j", self._dipoles, self._sources)
         squares = np.einsum("jc,jc->j", self._sources, self._sources)
@@ -86,8 +83,14 @@ class CoarseDistance:
         for start in range(0, len(x), batch):
             q = x[start : start + batch]
             square = np.einsum("qc,qc->q", q, q)[:, None] - 2 * (q @ self._sources.T) + squares
+            square = np.maximum(square, self._radii**2)
             flux = offset - q @ self._dipoles.T
-            square = np.maximum(square, 1e-12)
             parts.append((flux / (square * np.sqrt(square))).sum(axis=1))
         return np.concatenate(parts)
 
+
+def _disk_radii(points: Float, tree: Any) -> Float:
+    """Radius of the disk that each point stands for, of shape (N,): that of its k-th neighbour's, shared by k."""
+    k = min(_NEIGHBOURS, len(points) - 1)
+    radii: Float = tree.query(points, k + 1)[0][:, -1] / np.sqrt(k)
+    return radii

@@ -6,12 +6,16 @@ by node, all others keep nothing but the sign of their centre. L is measured fro
 somewhere. What is missed is found by propagation: as long as a cell with a sign change has a corner that was not
 evaluated, the blocks of its corners are. Every node thus has exactly one sign, evaluated or not, and marching cubes
 over all of them cannot leave a hole. Memory grows with the surface: about 8 nodes for each cell that it crosses.
+
+Where the data is known, only blocks near it are searched, and what lies farther off is found by propagation, which
+follows the surface from there: sheets in free space, where a field is steep and L large, cost next to nothing then.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +31,9 @@ NUDGE = 1e-4
 
 LIMIT = 8.0
 """Greatest magnitude, likewise; together they keep crossings clear of nodes in scikit-image's float32."""
+
+REACH = 2.0
+"""How far beyond a data point the surface is searched, in cells."""
 
 OUTSIDE, INSIDE, FIRST = 0, 1, 2
 """Rows of the store: leaves known only to be outside or inside, and the first leaf with values of its own."""
@@ -97,8 +104,14 @@ class Band:
         return np.unique(np.argwhere(wanted) // LEAF, axis=0) + chunk * _LEAVES
 
 
-def narrow_band(lattice: Lattice) -> Band:
+def narrow_band(lattice: Lattice, data: Float | None = None) -> Band:
     """Evaluate the field where its zero level may pass.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    data : array of shape (N, 3), lattice coordinates, optional
+        Points near which the surface is searched; everywhere when None.
 
     Raises
     ------
@@ -114,9 +127,15 @@ def narrow_band(lattice: Lattice) -> Band:
     slope = _lipschitz(lattice, centers)
     values = lattice.values(centers, slope)
     band = Band(lattice, slope, rows, store)
+    tree = None if data is None else _tree(data)
     size = COARSE
     while True:
-        near = np.abs(values) <= size * np.sqrt(3) / 2
+        half_diagonal = size * np.sqrt(3) / 2
+        near = np.abs(values) <= half_diagonal
+        if tree is not None:
+            # A block at the box's border also holds nodes beyond it, which are outside whatever its centre is.
+            inner = near & ((blocks > 0) & ((blocks + 1) * size < lattice.cells)).all(axis=1)
+            near[inner] = tree.query(blocks[inner] * size + size / 2, workers=-1)[0] <= half_diagonal + REACH
         _mark_inside(rows, blocks[~near & (values < 0)], size // LEAF)
         if size == LEAF:
             break
@@ -126,6 +145,12 @@ def narrow_band(lattice: Lattice) -> Band:
     band.evaluate(blocks[near])
     _propagate(band)
     return band
+
+
+def _tree(data: Float) -> Any:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(data)
 
 
 def _lipschitz(lattice: Lattice, centers: Float) -> float:

@@ -22,7 +22,14 @@ from gnrecon.export.protocol import SignedDistance
 from gnrecon.mesh import Mesh
 
 
-def extract(field: SignedDistance, *, resolution: int = 256, bounds: Float | None = None, batch: int = 65536) -> Mesh:
+def extract(
+    field: SignedDistance,
+    *,
+    resolution: int = 256,
+    bounds: Float | None = None,
+    data: Float | None = None,
+    batch: int = 65536,
+) -> Mesh:
     """Mesh the zero level of a field.
 
     Parameters
@@ -32,6 +39,9 @@ def extract(field: SignedDistance, *, resolution: int = 256, bounds: Float | Non
         Cells along the longest side of the box; cells are cubes.
     bounds : array of shape (2, 3), file units, optional
         The box; by default the field's own. A shape that reaches beyond it is closed by a flat cap.
+    data : array of shape (N, 3), file units, optional
+        What the field was fitted to. Sheets that no data is near, and that do not hang together with one that is, may
+        then be left out, which saves most of the work where the field is steep in free space.
     batch : int
         Most points to ask the field for at once.
 
@@ -49,7 +59,7 @@ def extract(field: SignedDistance, *, resolution: int = 256, bounds: Float | Non
         When the resolution, the bounds or the batch make no sense.
     """
     lattice = Lattice.over(field, resolution, bounds, batch)
-    band = narrow_band(lattice)
+    band = narrow_band(lattice, None if data is None else lattice.nodes(data))
     keys, places, faces = [], [], []
     count = 0
     for chunk in band.chunks():

@@ -68,6 +68,11 @@ class Lattice:
         """File coordinates of lattice coordinates, both of shape (N, 3)."""
         return self.field.frame.to_world(self.origin + self.cell * nodes)
 
+    def nodes(self, points: Float) -> Float:
+        """Lattice coordinates of file coordinates, both of shape (N, 3)."""
+        coordinates: Float = (self.field.frame.to_unit(points) - self.origin) / self.cell
+        return coordinates
+
     def values(self, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
         """Field in cells over its slope, of shape (N,), at lattice coordinates of shape (N, 3), closed at the box.
 

@@ -148,7 +148,7 @@ def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
 def _write(image: Image, path: Path) -> None:
     from PIL import Image as Pillow
 
-    from gnrecon.io import atomic_write
+    from gnrecon.atomic import atomic_write
 
     with atomic_write(path, overwrite=True) as temporary:
         Pillow.fromarray(image).save(temporary, format="PNG")

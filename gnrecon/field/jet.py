@@ -1,6 +1,6 @@
 """Rows of the parameter Jacobian in closed form, from one forward and one backward pass.
 
-With activations a_l and adjoints d_l = df/dz_l, the derivative of f by (W_l, b_l) is the outer product d_l (a_{l-1}, 1)^T.
+With activations a_l and adjoints d_l = df/dz_l, f by (W_l, b_l) is the outer product d_l (a_{l-1}, 1)^T.
 A directional derivative D_v f = v . grad f is that product differentiated along v:
 
     D_v f  by W_l:  (D_v d_l) a_{l-1}^T + d_l (D_v a_{l-1})^T        by b_l:  D_v d_l
@@ -46,7 +46,7 @@ class LayerRows:
     def write(self, block: Tensor) -> None:
         """Write the rows into `block`, of shape (M, out * (in + 1)), in theta's order."""
         out, into = self.left.shape[1], self.inputs.shape[1]
-        weights = block[:, : out * into].unflatten(1, (out, into))
+        weights = block[:, : out * into].view(len(block), out, into)
         torch.mul(self.left[:, :, None], self.inputs[:, None, :], out=weights)
         if self.right is not None and self.tangents is not None:
             weights.addcmul_(self.right[:, :, None], self.tangents[:, None, :])

@@ -54,7 +54,7 @@ class Siren:
         activation = x
         for layer_weights, layer_bias in hidden:
             activation = torch.addmm(layer_bias, activation, layer_weights.T).sin_()
-        return torch.addmv(bias, activation, weights[0])
+        return (activation @ weights[0]).add_(bias)
 
     def features(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return the last hidden layer's activations a_L, of shape (N, width)."""
@@ -76,7 +76,7 @@ class Siren:
             z = torch.addmm(bias, activations[-1], weights.T)
             slopes.append(z.cos())
             activations.append(z.sin_())
-        value = torch.addmv(layers[-1][1], activations[-1], layers[-1][0][0])
+        value = (activations[-1] @ layers[-1][0][0]).add_(layers[-1][1])
         adjoints = [torch.ones_like(value)[:, None]]
         for slope, (weights, _) in zip(reversed(slopes), reversed(layers[1:]), strict=True):
             adjoints.insert(0, (adjoints[0] @ weights).mul_(slope))

@@ -13,6 +13,8 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
     "projection": normal_projection,
     "cosine": normal_cosine,
 }
+WIDE_STEPS, DEEP_STEPS = 6, 120
+UNITS_PER_POINT, LEAST_UNITS, MOST_UNITS = 3, 1000, 2000
 SEARCHES = ("auto", "damping", "line")
 
 
@@ -22,9 +24,9 @@ class FitOptions:
 
     Parameters
     ----------
-    widths : tuple of int
-        Hidden layers of the network. One wide layer starts from random sine features and an exact linear solve; several
-        layers start smooth, as in the paper.
+    widths : tuple of int, optional
+        Hidden layers of the network; by default one of three units a point, from 1,000 to 2,000. One wide layer starts
+        from random sine features and an exact linear solve; several layers start smooth, as in the paper.
     steps : int, optional
         Gauss-Newton steps after the start; by default 6 for one wide layer, 120 for several layers.
     normals : ``"vector"``, ``"projection"`` or ``"cosine"``
@@ -43,7 +45,7 @@ class FitOptions:
         When a value is out of its range.
     """
 
-    widths: tuple[int, ...] = (2000,)
+    widths: tuple[int, ...] | None = None
     steps: int | None = None
     normals: str = "vector"
     search: str = "auto"
@@ -51,7 +53,7 @@ class FitOptions:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        if not self.widths or min(self.widths) < 1:
+        if self.widths is not None and (not self.widths or min(self.widths) < 1):
             raise UsageError(f"Network widths must be positive numbers, not {self.widths}.")
         if self.steps is not None and self.steps < 0:
             raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
@@ -59,6 +61,20 @@ class FitOptions:
             raise UsageError(f"The normal residual must be one of {', '.join(NORMAL_RESIDUALS)}, not {self.normals!r}.")
         if self.search not in SEARCHES:
             raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
+
+    @property
+    def step_limit(self) -> int:
+        """Most Gauss-Newton steps after the start."""
+        if self.steps is not None:
+            return self.steps
+        return WIDE_STEPS if self.widths is None or len(self.widths) == 1 else DEEP_STEPS
+
+    def widths_for(self, points: int) -> tuple[int, ...]:
+        """Return the hidden layers for a number of points.
+
+        Fewer units than data rows smooth dense clouds; more of them only make sparse ones slower and less smooth.
+        """
+        return self.widths or (min(max(UNITS_PER_POINT * points, LEAST_UNITS), MOST_UNITS),)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as plain values."""

@@ -5,17 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Samples
-from gnrecon.sampling import Box, CoarseDistance
+from gnrecon.cloud import Float, Samples
+from gnrecon.sampling import Box, CoarseDistance, near_surface
 
 MARGIN = 0.1
 """How far the box reaches beyond the data, in radii."""
 
-VOLUME_COUNT = 4000
+VOLUME_COUNT = 10000
+SHELL = 4.0
+"""Standard deviation of the samples near the data, in spacings."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,12 @@ class Scene:
         coarse = CoarseDistance(samples.points, samples.normals, rng)
         return cls(points, normals, samples, coarse, Box.around(samples.points, MARGIN))
 
-    def tensor(self, values: npt.NDArray[np.float64]) -> Tensor:
+    def volume(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+        """Return about `count` points of the box, (Q, 3), half of them near the data, and their coarse distances."""
+        shell = near_surface(self.samples.points, SHELL * self.coarse.spacing, count // 2, rng)
+        inside = ((shell > self.box.lower) & (shell < self.box.upper)).all(axis=1)
+        return self.coarse.sample(np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]]))
+
+    def tensor(self, values: Float) -> Tensor:
         """Return `values` as a tensor like the data's."""
         return torch.as_tensor(values).to(self.points)

@@ -3,8 +3,9 @@
 *Wide and linear.* One hidden layer of random sine features sin(w . x + b) is linear in its output weights, so that
 f = 0, grad f = n and the coarse signed distance have one exact least-squares solution (variable projection). The
 frequencies w follow the spectral density of a Matern kernel, a Student t distribution: w = z / (l sqrt(c / nu)) with z
-normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of kernel
-interpolation with Hermite data. Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
+normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of
+kernel interpolation with Hermite data.
+Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
 Where the solution's sign disagrees with the coarse distance ("ghosts"), samples are added and the solve is repeated.
 
 *Smooth.* Deeper networks start from small weights and the same solve of their last layer on the coarse distance alone,
@@ -54,16 +55,13 @@ def wide_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Gen
     like = scene.points
     frequencies, phases = random_features(field.widths[0], rng, like)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
-    x = scene.box.sample(scene.volume_count, rng)
-    distance = scene.coarse(x)
+    x, distance = scene.volume(scene.volume_count, rng)
     for round_number in range(ROUNDS):
         theta = solve_last_layer(field, terms_of(scene.tensor(x), scene.tensor(distance)), theta)
         if round_number + 1 < ROUNDS:
-            trial = scene.box.sample(4 * scene.volume_count, rng)
-            expected = scene.coarse(trial)
+            trial, expected = scene.volume(3 * scene.volume_count, rng)
             value = field.value(theta, scene.tensor(trial)).cpu().numpy()
-            wrong = np.flatnonzero((np.sign(value) != np.sign(expected)) & (np.abs(expected) > 2 * scene.coarse.spacing))
-            wrong = wrong[: scene.volume_count // 2]
+            wrong = np.flatnonzero(value * np.sign(expected) <= 0)[: scene.volume_count // 2]
             x, distance = np.concatenate([x, trial[wrong]]), np.concatenate([distance, expected[wrong]])
     return theta
 
@@ -72,9 +70,8 @@ def smooth_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.G
     """Return parameters, of shape (p,), of a smooth network whose last layer fits the coarse distance."""
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     theta = field.initial(generator).to(scene.points)
-    x = scene.box.sample(scene.volume_count, rng)
-    volume = [term for term in terms_of(scene.tensor(x), scene.tensor(scene.coarse(x))) if term.name == "distance"]
-    return solve_last_layer(field, volume, theta)
+    x, distance = scene.volume(scene.volume_count, rng)
+    return solve_last_layer(field, terms_of(scene.tensor(x), scene.tensor(distance)), theta)
 
 
 def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tensor:

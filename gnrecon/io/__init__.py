@@ -1,6 +1,6 @@
 """Reading clouds and meshes, writing meshes, and converting other libraries' objects."""
 
-from gnrecon.io.atomic import atomic_write, write_text
+from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import READERS, WRITERS
 from gnrecon.io.objects import as_cloud, to_open3d, to_trimesh
 from gnrecon.io.read import read_cloud, read_mesh, read_reference

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gnrecon.atomic import atomic_write
 from gnrecon.errors import MeshError, UsageError
-from gnrecon.io.atomic import atomic_write
 from gnrecon.io.formats import WRITERS
 from gnrecon.mesh import Mesh
 

@@ -1,7 +1,8 @@
 """Damped normal equations by Cholesky: linearise once, solve for as many dampings as the search asks for.
 
 A Gauss-Newton step minimises |r + J s|^2 + damping |s|_D^2, so that (J^T J + damping D) s = -J^T r. Its predicted
-decrease of the loss |r|^2 / 2 is  -s^T J^T r - s^T J^T J s / 2 = (damping s^T D s - s^T J^T r) / 2, free of cancellation.
+decrease of the loss |r|^2 / 2 is  -s^T J^T r - s^T J^T J s / 2 = (damping s^T D s - s^T J^T r) / 2, which is free of
+cancellation.
 D is the identity, or J^T J's own diagonal, which makes the damping independent of the parameters' scales.
 """
 

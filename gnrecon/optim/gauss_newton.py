@@ -68,7 +68,8 @@ class GaussNewton:
                 history.append(record)
                 if callback is not None:
                     callback(record)
-                idle = idle + 1 if record.loss > (1 - stop.tolerance) * record.before else 0
+                # Not strictly greater, so that a problem without any loss left is idle too.
+                idle = idle + 1 if record.loss >= (1 - stop.tolerance) * record.before else 0
                 if idle >= stop.patience:
                     return Solution(theta, f"Converged after {number} steps.", tuple(history))
         except KeyboardInterrupt:

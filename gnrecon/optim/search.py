@@ -89,7 +89,8 @@ class LogLineSearch:
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
         """Try all lengths along one direction, each from the same start."""
         step = system.solve(damping)
-        if step is None:
+        # At a stationary point nothing is predicted, and what the loss falls by is rounding.
+        if step is None or step.predicted <= 0.0:
             return Move(free, system.loss, damping, 0.0, 0.0, damping * 10)
         best = Move(free, system.loss, damping, 0.0, 0.0, self.initial_damping)
         for trial in range(self.trials):

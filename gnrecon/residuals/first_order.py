@@ -76,4 +76,5 @@ def eikonal(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearise
 
 def _length(gradient: Tensor) -> Tensor:
     """|grad f| of shape (N, 1), bounded below so that a critical point of f has a finite direction."""
-    return torch.linalg.vector_norm(gradient, dim=1, keepdim=True).clamp_min(1e-12)
+    length: Tensor = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
+    return length.clamp_min(1e-12)

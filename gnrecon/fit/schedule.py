@@ -3,7 +3,7 @@
 The loss, in the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
 
     interface   f = 0                  at the points        1
-    normal      grad f = n             at the points        (0.2 h)^2     an angle, as a height over a fifth of a spacing
+    normal      grad f = n             at the points        (0.4 h)^2     an angle, as a height over 0.4 h
     distance    f = coarse distance    in the box           1e-4 M / N    a row of it weighs 1e-2 of a row of data
     eikonal     |grad f| = 1           near the surface     (0.1 h)^2
                                        and in the box
@@ -37,18 +37,19 @@ from gnrecon.optim.solution import Callback, Solution
 from gnrecon.residuals.first_order import eikonal, interface, signed_distance
 from gnrecon.sampling import near_surface
 
-NORMAL_REACH = 0.2
+NORMAL_REACH = 0.4
 EIKONAL_REACH = 0.1
 DISTANCE_ROW = 1e-4
 SUBSPACE_UNITS = 400
 EIKONAL_COUNT = 3000
 MAX_STEP_POINTS = 4000
-WIDE_STEPS, DEEP_STEPS = 6, 120
 DEEP_STAGES = ((0.25, 1.0), (0.5, 30.0), (1.0, 1000.0))
 """Up to this share of the steps, the interface's weight is this."""
 
 
-def fit(samples: Samples, options: FitOptions | None = None, callback: Callback | None = None) -> tuple[NeuralSDF, Solution]:
+def fit(
+    samples: Samples, options: FitOptions | None = None, callback: Callback | None = None
+) -> tuple[NeuralSDF, Solution]:
     """Fit a sine network to the signed distance of oriented points.
 
     An interrupt (Ctrl-C) during the steps keeps the best field so far; `Solution.interrupted` then says so.
@@ -67,11 +68,11 @@ def fit(samples: Samples, options: FitOptions | None = None, callback: Callback 
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
     scene = Scene.of(samples, options.device, rng)
-    field = Siren(options.widths)
-    fitted = (_fit_wide if len(options.widths) == 1 else _fit_deep)(field, scene, options, rng, callback)
+    field = Siren(options.widths_for(len(samples)))
+    fitted = (_fit_wide if len(field.widths) == 1 else _fit_deep)(field, scene, options, rng, callback)
     if not bool(torch.isfinite(fitted.theta).all()):
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
-    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box)
+    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
     return sdf, fitted
 
 
@@ -79,7 +80,6 @@ def _fit_wide(
     field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
 ) -> Solution:
     theta = wide_start(field, scene, lambda x, d: [*_data_terms(scene, options), _distance_term(scene, x, d)], rng)
-    steps = WIDE_STEPS if options.steps is None else options.steps
     search: Search = LogLineSearch() if options.search == "line" else GainRatioDamping(initial_damping=1.0)
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
@@ -87,14 +87,14 @@ def _fit_wide(
         units = torch.as_tensor(np.sort(rng.permutation(field.widths[0])[:SUBSPACE_UNITS])).to(theta.device)
         return FieldProblem(field, _step_terms(scene, options, rng, 1.0), theta, (units, None))
 
-    return GaussNewton(search).run(problem_at, theta, StopRule(steps), callback)
+    return GaussNewton(search).run(problem_at, theta, StopRule(options.step_limit), callback)
 
 
 def _fit_deep(
     field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
 ) -> Solution:
     theta = smooth_start(field, scene, lambda x, d: [_distance_term(scene, x, d)], rng)
-    steps = DEEP_STEPS if options.steps is None else options.steps
+    steps = options.step_limit
     search: Search = GainRatioDamping() if options.search == "damping" else LogLineSearch()
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
@@ -126,13 +126,13 @@ def _step_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, dat
     rows = None
     if len(scene.points) > MAX_STEP_POINTS:
         rows = torch.as_tensor(np.sort(rng.permutation(len(scene.points))[:MAX_STEP_POINTS])).to(scene.points.device)
-    x = scene.box.sample(scene.volume_count, rng)
+    x, distance = scene.volume(scene.volume_count, rng)
     spacing = scene.coarse.spacing
     near = near_surface(scene.samples.points, 2 * spacing, EIKONAL_COUNT, rng)
-    around = np.concatenate([near, x[: EIKONAL_COUNT // 3]])
+    around = np.concatenate([near, scene.box.sample(EIKONAL_COUNT // 3, rng)])
     eikonal_weight = (EIKONAL_REACH * spacing) ** 2
     return [
         *(replace(term, weight=term.weight * data_weight) for term in _data_terms(scene, options, rows)),
-        _distance_term(scene, scene.tensor(x), scene.tensor(scene.coarse(x))),
+        _distance_term(scene, scene.tensor(x), scene.tensor(distance)),
         Term("eikonal", eikonal, scene.tensor(around), None, eikonal_weight * data_weight**0.5),
     ]

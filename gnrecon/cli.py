@@ -1,0 +1,258 @@
+"""The command line: ``gnrecon scan.ply -o mesh.obj``, ``gnrecon batch``, ``gnrecon doctor``.
+
+A first word that names no command is a scan. Results go to files, figures that were asked for to stdout, everything
+else to stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon.errors`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from gnrecon.errors import ExitCode, GnreconError
+from gnrecon.version import __version__
+
+# Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
+_CommandLineError: Any = typer.BadParameter.__mro__[2]
+
+COMMANDS = ("reconstruct", "batch", "doctor")
+DEFAULT_COMMAND = "reconstruct"
+
+app = typer.Typer(
+    name="gnrecon",
+    help="Watertight, verified meshes from point clouds: gnrecon SCAN -o MESH",
+    epilog="Exit codes: 0 ok, 2 usage, 3 input, 4 fit, 5 mesh not sound, 6 could not write, 7 memory, "
+    "8 some of a batch failed, 130 interrupted.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+POINTS, FIT, MESH, OUTPUT = "Points", "Fit", "Mesh", "Output"
+
+Fraction = Annotated[
+    float | None, typer.Option(help="Share of the points to keep, above 0 and up to 1.", rich_help_panel=POINTS)
+]
+MaxPoints = Annotated[int | None, typer.Option(help="Most points to keep.", rich_help_panel=POINTS)]
+Subsample = Annotated[str, typer.Option(help="How they are chosen: random, voxel or poisson.", rich_help_panel=POINTS)]
+Outliers = Annotated[
+    str,
+    typer.Option(
+        help="Remove scattered points: auto (unless more than 5 % would go), on or off.", rich_help_panel=POINTS
+    ),
+]
+Widths = Annotated[
+    str | None,
+    typer.Option(
+        help="Hidden layers of the sine network, such as 2000 or 32,32,32; chosen from the points when not given.",
+        rich_help_panel=FIT,
+    ),
+]
+Steps = Annotated[
+    int | None,
+    typer.Option(
+        help="Gauss-Newton steps after the linear start; 6 for one layer and 120 for several when not given.",
+        rich_help_panel=FIT,
+    ),
+]
+NormalResidual = Annotated[
+    str,
+    typer.Option(help="Residual of the normals: vector, projection or cosine.", rich_help_panel=FIT),
+]
+SearchOption = Annotated[
+    str,
+    typer.Option(
+        "--search", help="Step control: damping (gain ratio), line (log-spaced) or auto.", rich_help_panel=FIT
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.", rich_help_panel=FIT)]
+Device = Annotated[str, typer.Option(help="cpu or cuda.", rich_help_panel=FIT)]
+Threads = Annotated[int | None, typer.Option(help="CPU threads; torch's choice when not given.", rich_help_panel=FIT)]
+Resolution = Annotated[
+    int, typer.Option(help="Cells along the longest side of the box; at least 16.", rich_help_panel=MESH)
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
+]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but failures.", rich_help_panel=OUTPUT)]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print a line for each step.", rich_help_panel=OUTPUT)]
+Debug = Annotated[bool, typer.Option("--debug", help="Show a traceback on failure.", rich_help_panel=OUTPUT)]
+
+
+@app.command(DEFAULT_COMMAND)
+def reconstruct_command(
+    scan: Annotated[Path, typer.Argument(help="PLY, PCD, XYZ, PTS, TXT, CSV, OBJ, OFF or STL file.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Mesh to write: .obj, .ply, .stl, .off or .glb.", rich_help_panel=OUTPUT),
+    ],
+    fraction: Fraction = None,
+    max_points: MaxPoints = None,
+    subsample: Subsample = "random",
+    outliers: Outliers = "auto",
+    widths: Widths = None,
+    steps: Steps = None,
+    normal_residual: NormalResidual = "vector",
+    search: SearchOption = "auto",
+    seed: Seed = 0,
+    device: Device = "cpu",
+    threads: Threads = None,
+    resolution: Resolution = 256,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=OUTPUT)] = None,
+    preview: Annotated[
+        Path | None, typer.Option(help="PNG picture of scan and mesh to write.", rich_help_panel=OUTPUT)
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""
+    from gnrecon.run import Files, run
+
+    options = {
+        "fraction": fraction,
+        "max_points": max_points,
+        "subsample": subsample,
+        "outliers": outliers,
+        "widths": None if widths is None else parse_widths(widths),
+        "steps": steps,
+        "normal_residual": normal_residual,
+        "search": search,
+        "seed": seed,
+        "device": device,
+        "threads": threads,
+        "resolution": resolution,
+    }
+    del debug  # read from the arguments by `main`, which handles failures
+    files = Files(scan, output, reference, report, preview, overwrite)
+    raise SystemExit(run(files, options, quiet=quiet, verbose=verbose))
+
+
+@app.command("batch")
+def batch_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of scans.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the meshes.", rich_help_panel=OUTPUT)],
+    mesh_format: Annotated[
+        str, typer.Option("--format", help="Format of the meshes: obj, ply, stl, off or glb.", rich_help_panel=OUTPUT)
+    ] = "obj",
+    fraction: Fraction = None,
+    max_points: MaxPoints = None,
+    subsample: Subsample = "random",
+    outliers: Outliers = "auto",
+    widths: Widths = None,
+    steps: Steps = None,
+    normal_residual: NormalResidual = "vector",
+    search: SearchOption = "auto",
+    seed: Seed = 0,
+    device: Device = "cpu",
+    threads: Threads = None,
+    resolution: Resolution = 256,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Reconstruct every scan of a folder, each in a process of its own; one failure stops nothing."""
+    from gnrecon.batch import run_batch
+
+    arguments = {
+        "--fraction": fraction,
+        "--max-points": max_points,
+        "--subsample": subsample,
+        "--outliers": outliers,
+        "--widths": widths,
+        "--steps": steps,
+        "--normal-residual": normal_residual,
+        "--search": search,
+        "--seed": seed,
+        "--device": device,
+        "--threads": threads,
+        "--resolution": resolution,
+    }
+    passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
+    passed += ["--overwrite"] * overwrite + ["--debug"] * debug
+    raise SystemExit(run_batch(folder, output, mesh_format, passed, quiet=quiet))
+
+
+@app.command("doctor")
+def doctor_command() -> None:
+    """Check the installation; name what is missing and the command that mends it."""
+    from rich.console import Console
+
+    from gnrecon.doctor import diagnose, render
+
+    checks = diagnose()
+    render(checks, Console())
+    raise SystemExit(0 if all(check.ok for check in checks) else ExitCode.INPUT)
+
+
+def parse_widths(text: str) -> tuple[int, ...]:
+    """Return layer widths from text such as ``2000`` or ``32,32,32``.
+
+    Raises
+    ------
+    typer.BadParameter
+        When a part is no whole number.
+    """
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a list of whole numbers such as 2000 or 32,32,32.") from None
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and exit."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"gnrecon {__version__}")
+        sys.exit(0)
+    if words and words[0] not in (*COMMANDS, "-h", "--help"):
+        words.insert(0, DEFAULT_COMMAND)
+    # On a busy machine, threads that spin while they wait cost several times what they gain.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # A polite kill must unwind, so that temporary files are removed.
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.exit(_guarded(words))
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:
+    del frame
+    raise SystemExit(128 + number)
+
+
+def _guarded(words: list[str]) -> int:
+    """Run the words and turn every failure into a sentence and an exit code."""
+    try:
+        result: Any = app(words, standalone_mode=False)
+        return int(result or 0)
+    except typer.Exit as request:
+        return request.exit_code
+    except _CommandLineError as error:
+        return _fail(error.format_message(), ExitCode.USAGE, words)
+    except GnreconError as error:
+        return _fail(str(error), error.exit_code, words)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("Interrupted; nothing was written.", ExitCode.INTERRUPTED, words)
+    except MemoryError as error:
+        return _fail(f"There is not enough memory. {error}".strip(), ExitCode.MEMORY, words)
+
+
+def _fail(sentence: str, code: ExitCode, words: list[str]) -> int:
+    if "--debug" in words:
+        import traceback
+
+        traceback.print_exc()
+    print(f"gnrecon: {sentence}", file=sys.stderr)
+    return int(code)

@@ -1,0 +1,7 @@
+"""From samples to a fitted signed distance field."""
+
+from gnrecon.fit.options import FitOptions
+from gnrecon.fit.schedule import fit
+from gnrecon.fit.sdf import NeuralSDF
+
+__all__ = ["FitOptions", "NeuralSDF", "fit"]

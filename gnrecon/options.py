@@ -1,0 +1,94 @@
+"""Everything a reconstruction can be asked for, checked once at the door."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from gnrecon.errors import UsageError
+from gnrecon.fit.options import FitOptions
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `gnrecon.reconstruct` and of the command line.
+
+    Parameters
+    ----------
+    fraction : float in (0, 1], optional
+        Share of the points to keep.
+    max_points : int, optional
+        Most points to keep.
+    subsample : ``"random"``, ``"voxel"`` or ``"poisson"``
+        How the kept points are chosen.
+    outliers : ``"auto"``, ``"on"`` or ``"off"``
+        Whether scattered points are removed; ``"auto"`` leaves them when they are more than 5 % of all.
+    resolution : int
+        Cells of the extraction along the longest side of the shape's box.
+    widths, steps, normal_residual, search, seed, device
+        Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
+    threads : int, optional
+        CPU threads of the fit; by default what torch chooses.
+
+    Raises
+    ------
+    UsageError
+        When a name is unknown or a value out of its range.
+    """
+
+    fraction: float | None = None
+    max_points: int | None = None
+    subsample: str = "random"
+    outliers: str = "auto"
+    resolution: int = 256
+    widths: tuple[int, ...] | None = None
+    steps: int | None = None
+    normal_residual: str = FitOptions.normals
+    search: str = FitOptions.search
+    seed: int = 0
+    device: str = "cpu"
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.resolution < 16:
+            raise UsageError(f"The resolution must be at least 16 cells, not {self.resolution}.")
+        if self.threads is not None and self.threads < 1:
+            raise UsageError(f"The number of threads must be positive, not {self.threads}.")
+        if self.seed < 0:
+            raise UsageError(f"The seed must not be negative, not {self.seed}.")
+        self.fit()
+
+    @classmethod
+    def of(cls, **values: Any) -> Options:
+        """Return options from names and values.
+
+        Raises
+        ------
+        UsageError
+            When a name is unknown.
+        """
+        known = [option.name for option in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise UsageError(f"There is no option {name!r}; the options are {', '.join(known)}.")
+        return cls(**values)
+
+    def ingest(self) -> dict[str, Any]:
+        """Return the arguments of `gnrecon.ingest.prepare`."""
+        names = ("outliers", "fraction", "max_points", "subsample", "seed")
+        return {name: getattr(self, name) for name in names}
+
+    def fit(self) -> FitOptions:
+        """Return the options of the fit."""
+        return FitOptions(
+            widths=None if self.widths is None else tuple(self.widths),
+            steps=self.steps,
+            normals=self.normal_residual,
+            search=self.search,
+            seed=self.seed,
+            device=self.device,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the options as plain values."""
+        return asdict(self)

@@ -1,0 +1,226 @@
+"""The main job: a scan in, a verified watertight mesh out.
+
+The way of the data: file -> cloud -> samples -> fitted field -> mesh -> report. Every stage is a function of its own in
+`gnrecon.io`, `gnrecon.ingest`, `gnrecon.fit` and `gnrecon.export`; here they are called in order, timed, and reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+import torch
+
+from gnrecon.cloud import PointCloud, Samples
+from gnrecon.errors import MemoryLimitError
+from gnrecon.export import (
+    MeshFacts,
+    Metrics,
+    extract,
+    measure,
+    project,
+    remove_stray,
+    repair,
+    require_sound,
+    verify_file,
+)
+from gnrecon.fit import NeuralSDF, fit
+from gnrecon.ingest import IngestCounts, prepare
+from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
+from gnrecon.mesh import Mesh
+from gnrecon.optim import Record, Solution
+from gnrecon.options import Options
+from gnrecon.report import Stages, versions
+
+
+class Progress:
+    """What a caller may want to know while a reconstruction runs; this one ignores everything."""
+
+    def stage(self, name: str) -> None:
+        """Called when a stage begins."""
+
+    def step(self, record: Record, total: int) -> None:
+        """Called after each Gauss-Newton step, of `total` at most."""
+
+    def remark(self, sentence: str) -> None:
+        """Called with what a user should know, such as what was dropped."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A verified mesh, the field it was extracted from, and the report.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Closed, oriented 2-manifold, in file units.
+    sdf : NeuralSDF
+    report : dict
+        Options, versions, stages, counts, fit history, mesh facts and metrics as plain values, ready for JSON.
+    metrics : Metrics, optional
+        Distances to the reference, where one was given.
+    interrupted : bool
+        Whether the fit was stopped early by Ctrl-C; the mesh then shows the best field until then.
+    """
+
+    mesh: Mesh
+    sdf: NeuralSDF
+    report: dict[str, Any]
+    metrics: Metrics | None = None
+    interrupted: bool = False
+
+    def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
+        """Write the mesh atomically, reading it back and verifying it first; return sentences about what was lost.
+
+        Raises
+        ------
+        MeshError
+            When the mesh as read back is no closed, oriented 2-manifold.
+        OutputError
+            When the file cannot be written.
+        """
+        return write_mesh(self.mesh, path, overwrite, verify=_verify)
+
+    def to_trimesh(self) -> Any:
+        """Return the mesh as a `trimesh.Trimesh`."""
+        return to_trimesh(self.mesh)
+
+    def to_open3d(self) -> Any:
+        """Return the mesh as an `open3d.geometry.TriangleMesh`."""
+        return to_open3d(self.mesh)
+
+
+def reconstruct(
+    source: Any,
+    normals: npt.ArrayLike | None = None,
+    *,
+    reference: Any = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Reconstruction:
+    """Reconstruct a closed surface from a scan.
+
+    Parameters
+    ----------
+    source : path, array of shape (N, 3) or (N, 6), PointCloud, open3d or trimesh point cloud
+        Points, in any unit, with or without normals.
+    normals : array of shape (N, 3), optional
+        Outward normals that go with an array of points.
+    reference : path, Mesh or PointCloud, optional
+        Truth to measure the mesh against.
+    progress : Progress, optional
+        Told of stages, steps and remarks.
+    **options
+        The fields of `Options`, by name.
+
+    Raises
+    ------
+    UsageError, InputError, FitError, MeshError, MemoryLimitError
+        See `gnrecon.errors`; each says in one sentence what is wrong.
+    """
+    chosen = Options.of(**options)
+    progress = progress or Progress()
+    threads = torch.get_num_threads()
+    try:
+        if chosen.threads is not None:
+            torch.set_num_threads(chosen.threads)
+        return _run(source, normals, reference, progress, chosen)
+    except MemoryError as error:
+        raise _out_of_memory(error) from error
+    except RuntimeError as error:
+        # torch reports a failed allocation as a RuntimeError, on the CPU by its text alone.
+        if isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error):
+            raise _out_of_memory(error) from error
+        raise
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(source: Any, normals: Any, reference: Any, progress: Progress, options: Options) -> Reconstruction:
+    stages = Stages(progress.stage)
+    with stages("read"):
+        cloud = _cloud(source, normals)
+        truth = _reference(reference)
+    with stages("ingest"):
+        samples, counts = prepare(cloud, **options.ingest())
+    for sentence in counts.remarks():
+        progress.remark(sentence)
+    with stages("fit"):
+        total = options.fit().step_limit
+        sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total))
+    progress.remark(solution.status)
+    with stages("mesh"):
+        mesh, actions = _mesh(sdf, samples, options)
+    for sentence in actions:
+        progress.remark(sentence)
+    with stages("verify"):
+        facts = require_sound(mesh)
+    metrics = None
+    if truth is not None:
+        with stages("measure"):
+            metrics = measure(mesh, truth, seed=options.seed)
+    report = _report(source, options, stages, counts, solution, sdf, facts, actions, metrics)
+    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
+
+
+def _cloud(source: Any, normals: Any) -> PointCloud:
+    if isinstance(source, str | Path):
+        return read_cloud(source)
+    return as_cloud(source, normals)
+
+
+def _reference(reference: Any) -> Mesh | PointCloud | None:
+    return read_reference(reference) if isinstance(reference, str | Path) else reference
+
+
+def _mesh(sdf: NeuralSDF, samples: Samples, options: Options) -> tuple[Mesh, list[str]]:
+    """Extract, drop components that no data supports, project and repair."""
+    data = samples.frame.to_world(samples.points)
+    mesh = extract(sdf, resolution=options.resolution, data=data)
+    mesh, dropped = remove_stray(mesh, data)
+    mesh = project(mesh, sdf)
+    mesh, repaired = repair(mesh)
+    return mesh, [*dropped, *repaired]
+
+
+def _verify(path: Path) -> None:
+    verify_file(path)
+
+
+def _out_of_memory(error: Exception) -> MemoryLimitError:
+    return MemoryLimitError(
+        f"There is not enough memory ({str(error).splitlines()[0] if str(error) else 'allocation failed'}); "
+        f"use fewer points (--max-points) or a coarser mesh (--resolution)."
+    )
+
+
+def _report(
+    source: Any,
+    options: Options,
+    stages: Stages,
+    counts: IngestCounts,
+    solution: Solution,
+    sdf: NeuralSDF,
+    facts: MeshFacts,
+    actions: list[str],
+    metrics: Metrics | None,
+) -> dict[str, Any]:
+    return {
+        "input": str(source) if isinstance(source, str | Path) else type(source).__name__,
+        "options": options.as_dict(),
+        "versions": versions(),
+        "ingest": counts.as_dict(),
+        "frame": {"center": sdf.frame.center.tolist(), "scale": sdf.frame.scale},
+        "fit": {
+            "status": solution.status,
+            "interrupted": solution.interrupted,
+            "parameters": len(sdf.theta),
+            "history": [vars(record) for record in solution.history],
+        },
+        "mesh": facts.as_dict(),
+        "actions": actions,
+        "metrics": None if metrics is None else metrics.as_dict(),
+        "stages": stages.as_list(),
+    }

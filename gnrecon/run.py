@@ -1,0 +1,163 @@
+"""One scan for the command line: refuse early, reconstruct with a progress bar, write everything or nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from gnrecon.atomic import atomic_write
+from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
+from gnrecon.export import render
+from gnrecon.io import check_writable, read_cloud
+from gnrecon.optim import Record
+from gnrecon.pipeline import Progress as PipelineProgress
+from gnrecon.pipeline import Reconstruction, reconstruct
+
+STAGES = {
+    "read": "Reading",
+    "ingest": "Cleaning",
+    "fit": "Fitting",
+    "mesh": "Meshing",
+    "verify": "Verifying",
+    "measure": "Measuring",
+}
+
+
+@dataclass(frozen=True)
+class Files:
+    """What one run reads and writes."""
+
+    scan: Path
+    output: Path
+    reference: Path | None = None
+    report: Path | None = None
+    preview: Path | None = None
+    overwrite: bool = False
+
+    def check(self) -> None:
+        """Refuse before any work what would fail after it.
+
+        Raises
+        ------
+        UsageError
+            When an extension is unknown, or two files are one.
+        InputError
+            When an input is missing.
+        OutputError
+            When a target exists and may not be overwritten, or its folder is missing.
+        """
+        check_writable(self.output)
+        if self.preview is not None and self.preview.suffix.lower() != ".png":
+            raise UsageError(f"The preview is a PNG picture, so it cannot be called {self.preview}.")
+        inputs = [path for path in (self.scan, self.reference) if path is not None]
+        for path in inputs:
+            if not path.exists():
+                raise InputError(f"There is no file {path}.")
+        targets = [path for path in (self.output, self.report, self.preview) if path is not None]
+        for index, target in enumerate(targets):
+            if any(_same(target, other) for other in [*inputs, *targets[:index]]):
+                raise UsageError(f"{target} is named twice; an input or another output is never overwritten.")
+            if not target.parent.is_dir():
+                raise OutputError(f"{target} cannot be written: the folder {target.parent} does not exist.")
+            if target.exists() and not self.overwrite:
+                raise OutputError(f"{target} exists already; choose another name or add --overwrite.")
+
+
+def _same(one: Path, other: Path) -> bool:
+    if one.exists() and other.exists():
+        return one.samefile(other)
+    return one.resolve() == other.resolve()
+
+
+def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: bool = False) -> int:
+    """Reconstruct one scan and return the exit code.
+
+    Raises
+    ------
+    GnreconError
+        Whatever the stages raise; nothing is written then.
+    """
+    files.check()
+    console = Console(stderr=True, quiet=quiet)
+    with _shown(console, verbose) as progress:
+        result = reconstruct(files.scan, reference=files.reference, progress=progress, **options)
+    warnings = _write(files, result)
+    for sentence in warnings:
+        console.print(sentence, highlight=False)
+    console.print(_summary(files, result), highlight=False)
+    if result.metrics is not None:
+        print("\n".join(result.metrics.describe()))
+    if result.interrupted:
+        print(f"gnrecon: Interrupted; {files.output} shows the best field until then.", file=console.file)
+        return ExitCode.INTERRUPTED
+    return ExitCode.OK
+
+
+def _write(files: Files, result: Reconstruction) -> list[str]:
+    """Write the mesh, and with it what was asked for besides; all of them or none."""
+    with ExitStack() as stack:
+        # The side files are complete under their temporary names before the mesh receives its own.
+        if files.report is not None:
+            report = stack.enter_context(atomic_write(files.report, files.overwrite))
+            report.write_text(json.dumps(result.report, indent=2) + "\n", encoding="utf-8")
+        if files.preview is not None:
+            picture = stack.enter_context(atomic_write(files.preview, files.overwrite))
+            render(result.mesh, picture, size=(1200, 600), points=read_cloud(files.scan))
+        return result.save(files.output, files.overwrite)
+
+
+def _summary(files: Files, result: Reconstruction) -> str:
+    facts, stages = result.report["mesh"], result.report["stages"]
+    seconds = sum(stage["seconds"] for stage in stages)
+    return (
+        f"{files.output}: {facts['vertices']} vertices, {facts['faces']} faces, {facts['components']} component"
+        f"{'s' if facts['components'] != 1 else ''}, genus {facts['genus']}, closed and manifold, volume "
+        f"{facts['volume']:.6g}; {seconds:.1f} s, {stages[-1]['peak_memory_mb']:.0f} MB."
+    )
+
+
+class Shown(PipelineProgress):
+    """Stages, steps and remarks on a console."""
+
+    def __init__(self, console: Console, bar: Progress, verbose: bool) -> None:
+        self._console, self._bar, self._verbose = console, bar, verbose
+        self._task: TaskID | None = None
+
+    def stage(self, name: str) -> None:
+        """Start a bar for a stage."""
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+        self._task = self._bar.add_task(STAGES[name], total=None, detail="")
+
+    def step(self, record: Record, total: int) -> None:
+        """Show a step's loss, damping and gain ratio, and the time left."""
+        detail = f"loss {record.loss:.3e}  damping {record.damping:.1e}  gain {record.gain_ratio:.2f}"
+        if self._task is not None:
+            self._bar.update(self._task, completed=record.step, total=total, detail=detail)
+        if self._verbose:
+            self._console.print(f"step {record.step:4d}/{total}  {detail}", highlight=False)
+
+    def remark(self, sentence: str) -> None:
+        """Print a sentence above the bar."""
+        self._console.print(sentence, highlight=False)
+
+
+@contextmanager
+def _shown(console: Console, verbose: bool) -> Iterator[Shown]:
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description:10}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[detail]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield Shown(console, bar, verbose)
