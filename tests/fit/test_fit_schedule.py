@@ -1,0 +1,152 @@
+"""Whole fits of an analytic sphere, wide and deep, small enough for seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from gnrecon.cloud import Frame, Samples
+from gnrecon.errors import FitError, UsageError
+from gnrecon.fit import FitOptions, NeuralSDF, fit
+from gnrecon.fit.options import NORMAL_RESIDUALS, SEARCHES
+from gnrecon.fit.schedule import MAX_STEP_POINTS
+from gnrecon.optim import Record
+
+Float = NDArray[np.float64]
+
+RADIUS = 0.9
+FRAME = Frame(np.array([500_000.0, 4_500_000.0, 100.0]), 20.0)
+
+
+def directions(count: int, seed: int) -> Float:
+    rows = np.random.default_rng(seed).standard_normal((count, 3))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def sphere(count: int = 600) -> Samples:
+    normals = directions(count, 0)
+    return Samples(RADIUS * normals, normals, FRAME)
+
+
+def radii(sdf: NeuralSDF, rays: Float) -> Float:
+    """Where the rays from the centre, of shape (N, 3), leave the surface, in unit coordinates, by bisection."""
+    inner, outer = np.full(len(rays), 0.85 * RADIUS), np.full(len(rays), 1.1 * RADIUS)
+    for inside, ends in ((True, inner), (False, outer)):
+        assert np.all((sdf.sdf(FRAME.to_world(ends[:, None] * rays)) < 0) == inside)
+    for _ in range(30):
+        middle = (inner + outer) / 2
+        within = sdf.sdf(FRAME.to_world(middle[:, None] * rays)) < 0
+        inner, outer = np.where(within, middle, inner), np.where(within, outer, middle)
+    return (inner + outer) / 2
+
+
+def mean_angle(sdf: NeuralSDF, rays: Float) -> float:
+    """Mean angle between the field's normals and the sphere's, in degrees."""
+    cosines = np.einsum("ij,ij->i", sdf.normals(FRAME.to_world(RADIUS * rays)), rays)
+    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean())
+
+
+def test_wide_fit_of_a_sphere() -> None:
+    samples = sphere()
+    sdf, solution = fit(samples, FitOptions(widths=(400,), steps=1))
+    rays = directions(500, 1)
+    error = np.abs(radii(sdf, rays) / RADIUS - 1)
+    assert error.mean() < 0.01
+    assert np.quantile(error, 0.95) < 0.02
+    assert mean_angle(sdf, rays) < 6
+    deep = np.linspace(0.1, 0.8, 500)[:, None] * rays
+    assert np.all(sdf.sdf(FRAME.to_world(deep)) < 0), "no second sheet within"
+    at_data = FRAME.to_world(samples.points)
+    assert np.abs(sdf.sdf(at_data)).mean() < 0.01 * RADIUS * FRAME.scale
+    assert np.linalg.norm(sdf.gradient(at_data), axis=1).mean() == pytest.approx(1.0, abs=0.1)
+    assert len(solution.history) == 1
+    assert not solution.interrupted
+    assert sdf.theta.dtype == torch.float64
+    assert sdf.frame is samples.frame
+
+
+@pytest.mark.parametrize("normals", NORMAL_RESIDUALS)
+def test_deep_fit_of_a_sphere(normals: str) -> None:
+    records: list[Record] = []
+    sdf, solution = fit(sphere(), FitOptions(widths=(24, 24), steps=6, normals=normals), records.append)
+    rays = directions(500, 1)
+    assert np.abs(radii(sdf, rays) / RADIUS - 1).mean() < 0.025
+    assert mean_angle(sdf, rays) < 6
+    assert tuple(records) == solution.history
+    assert len(records) == 6
+    assert all(record.loss < record.before for record in records)
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize("widths", [(40,), (8, 8)], ids=str)
+def test_every_search_lowers_the_loss(search: str, widths: tuple[int, ...]) -> None:
+    sdf, solution = fit(sphere(150), FitOptions(widths=widths, steps=2, search=search))
+    assert all(record.loss < record.before for record in solution.history)
+    assert np.all(np.isfinite(sdf.sdf(FRAME.to_world(directions(50, 2)))))
+
+
+@pytest.mark.parametrize("widths", [(40,), (8, 8)], ids=str)
+def test_same_seed_same_bits(widths: tuple[int, ...]) -> None:
+    first, again, other = (fit(sphere(150), FitOptions(widths=widths, steps=2, seed=seed))[0] for seed in (3, 3, 4))
+    assert torch.equal(first.theta, again.theta)
+    assert not torch.equal(first.theta, other.theta)
+
+
+def test_more_points_than_a_step_takes() -> None:
+    assert MAX_STEP_POINTS < 4500
+    sdf, solution = fit(sphere(4500), FitOptions(widths=(40,), steps=1))
+    assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(50, 2)))).mean() < 0.03 * FRAME.scale
+    assert solution.history[0].loss < solution.history[0].before
+
+
+def test_no_steps_leave_the_start() -> None:
+    sdf, solution = fit(sphere(150), FitOptions(widths=(40,), steps=0))
+    assert solution.history == ()
+    assert float(sdf.theta.abs().max()) > 0
+
+
+def test_an_interrupt_keeps_the_field_so_far() -> None:
+    def callback(record: Record) -> None:
+        if record.step == 2:
+            raise KeyboardInterrupt
+
+    options = FitOptions(widths=(40,), steps=50)
+    sdf, solution = fit(sphere(150), options, callback)
+    assert solution.interrupted
+    assert len(solution.history) == 2
+    assert torch.equal(sdf.theta, solution.theta)
+    assert np.all(np.isfinite(sdf.sdf(FRAME.to_world(directions(50, 2)))))
+
+
+def test_normals_that_are_not_finite_end_with_a_sentence() -> None:
+    samples = sphere(150)
+    broken = samples.normals.copy()
+    broken[7] = np.nan
+    with pytest.raises(FitError, match="not finite"):
+        fit(Samples(samples.points, broken, FRAME), FitOptions(widths=(40,), steps=1))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"widths": ()}, r"\(\)"),
+        ({"widths": (20, 0)}, "20, 0"),
+        ({"steps": -1}, "-1"),
+        ({"normals": "sideways"}, "sideways"),
+        ({"search": "blind"}, "blind"),
+    ],
+)
+def test_options_out_of_range(wrong: dict[str, object], named: str) -> None:
+    with pytest.raises(UsageError, match=named):
+        FitOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_every_choice_of_the_options_is_accepted() -> None:
+    for search in SEARCHES:
+        for normals in NORMAL_RESIDUALS:
+            options = FitOptions(search=search, normals=normals)
+            assert FitOptions(**options.as_dict()) == options
+    assert FitOptions(steps=7).step_limit == 7
+    assert FitOptions(widths=(32, 32)).step_limit > FitOptions(widths=(500,)).step_limit > 0

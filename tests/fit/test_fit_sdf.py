@@ -1,0 +1,168 @@
+"""A fitted field answers in the file's frame, and survives its file bit by bit."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from gnrecon.cloud import Frame
+from gnrecon.errors import InputError, OutputError
+from gnrecon.field import Siren
+from gnrecon.fit import FitOptions, NeuralSDF
+from gnrecon.sampling import Box
+
+UNIT = Frame(np.zeros(3), 1.0)
+UTM = Frame(np.array([431_234.567, 5_412_345.678, 312.1]), 23.7)
+BOX = Box(np.array([-1.1, -0.9, -1.0]), np.array([1.0, 1.1, 0.8]))
+
+
+def random_field(widths: tuple[int, ...] = (9, 7), frame: Frame = UTM, dtype: torch.dtype = torch.float64) -> NeuralSDF:
+    field = Siren(widths)
+    theta = torch.randn(field.layout.count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return NeuralSDF(field, theta.to(dtype), frame, BOX, FitOptions(widths=widths, seed=5).as_dict())
+
+
+def points(count: int) -> np.ndarray:
+    return np.random.default_rng(1).uniform(-1, 1, (count, 3))
+
+
+def test_answers_are_the_unit_fields_mapped() -> None:
+    u = points(40)
+    world, unit = random_field(), random_field(frame=UNIT)
+    x = UTM.to_world(u)
+    # A double holds UTM coordinates to a nanometre.
+    assert np.allclose(world.sdf(x), UTM.scale * unit.sdf(u), rtol=0, atol=1e-7)
+    assert np.allclose(world.gradient(x), unit.gradient(u), rtol=0, atol=1e-7)
+    assert np.allclose(world.normals(x), unit.normals(u), rtol=0, atol=1e-7)
+    value, gradient = unit.field.value_and_gradient(unit.theta, torch.as_tensor(u))
+    assert np.allclose(unit.sdf(u), value.numpy(), rtol=0, atol=1e-14)
+    assert np.allclose(unit.gradient(u), gradient.numpy(), rtol=0, atol=1e-14)
+    assert np.array_equal(world.bounds, UTM.to_world(np.stack([BOX.lower, BOX.upper])))
+
+
+@pytest.mark.parametrize("frame", [UNIT, UTM], ids=["unit", "UTM"])
+def test_gradient_agrees_with_finite_differences(frame: Frame) -> None:
+    sdf = random_field(frame=frame)
+    x = frame.to_world(points(30))
+    steps = 1e-4 * frame.scale * np.eye(3)
+    slopes = np.stack([(sdf.sdf(x + step) - sdf.sdf(x - step)) / (2 * 1e-4 * frame.scale) for step in steps], axis=1)
+    assert np.allclose(sdf.gradient(x), slopes, rtol=0, atol=1e-4)
+
+
+def test_normals_are_unit_gradients_and_finite_where_the_gradient_vanishes() -> None:
+    sdf = random_field()
+    x = UTM.to_world(points(30))
+    gradient, normals = sdf.gradient(x), sdf.normals(x)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert np.allclose(normals * np.linalg.norm(gradient, axis=1, keepdims=True), gradient)
+    flat = NeuralSDF(sdf.field, torch.zeros_like(sdf.theta), UTM, BOX)
+    assert np.array_equal(flat.normals(x), np.zeros((30, 3)))
+
+
+def test_many_points_are_answered_in_batches() -> None:
+    sdf = random_field((2000,), UNIT)
+    u = points(1300)
+    value, gradient = sdf.field.value_and_gradient(sdf.theta, torch.as_tensor(u))
+    assert np.allclose(sdf.sdf(u), value.numpy(), rtol=0, atol=1e-10)
+    assert np.allclose(sdf.gradient(u), gradient.numpy(), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_answers_are_doubles_of_the_right_shape(dtype: torch.dtype) -> None:
+    sdf = random_field(dtype=dtype)
+    for count in (0, 1, 5):
+        x = UTM.to_world(points(count))
+        answers = {(): sdf.sdf(x), (3,): sdf.gradient(x)}
+        for shape, answer in answers.items():
+            assert answer.shape == (count, *shape)
+            assert answer.dtype == np.float64
+    assert sdf.sdf([[431_234.0, 5_412_345.0, 312.0]]).shape == (1,)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("widths", [(11,), (9, 7)], ids=str)
+def test_a_file_brings_back_every_bit(tmp_path: Path, widths: tuple[int, ...], dtype: torch.dtype) -> None:
+    sdf = random_field(widths, dtype=dtype)
+    path = tmp_path / "model.gnr"
+    sdf.save(path)
+    loaded = NeuralSDF.load(path)
+    assert loaded.field == sdf.field
+    assert loaded.theta.dtype == dtype
+    assert torch.equal(loaded.theta, sdf.theta)
+    assert np.array_equal(loaded.frame.center, UTM.center)
+    assert loaded.frame.center.dtype == np.float64
+    assert loaded.frame.scale == UTM.scale
+    assert np.array_equal(loaded.box.lower, BOX.lower)
+    assert np.array_equal(loaded.box.upper, BOX.upper)
+    # A file knows lists, not tuples.
+    assert json.dumps(loaded.options) == json.dumps(sdf.options)
+    x = UTM.to_world(points(20))
+    assert np.array_equal(loaded.sdf(x), sdf.sdf(x))
+    assert np.array_equal(loaded.gradient(x), sdf.gradient(x))
+    again = tmp_path / "again.gnr"
+    loaded.save(again)
+    assert NeuralSDF.load(again).options == loaded.options
+
+
+@pytest.mark.xfail(strict=True, reason="safetensors writes several metadata entries in no fixed order")
+def test_the_same_field_makes_the_same_file(tmp_path: Path) -> None:
+    # More than two files, because two may agree by luck.
+    for copy in range(12):
+        random_field().save(str(tmp_path / f"{copy}.gnr"))
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+
+
+def test_saving_overwrites_only_when_told(tmp_path: Path) -> None:
+    path = tmp_path / "model.gnr"
+    path.write_bytes(b"somebody's work")
+    with pytest.raises(OutputError, match="exists"):
+        random_field().save(path)
+    assert path.read_bytes() == b"somebody's work"
+    random_field().save(path, overwrite=True)
+    assert NeuralSDF.load(path).theta.shape == random_field().theta.shape
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model.gnr"], "nothing temporary is left"
+    with pytest.raises(OutputError, match="folder"):
+        random_field().save(tmp_path / "missing" / "model.gnr")
+
+
+@pytest.mark.xfail(strict=True, reason="safetensors puts a private file of its own in the temporary one's place")
+def test_the_users_umask_decides_who_may_read_a_model(tmp_path: Path) -> None:
+    path, plain = tmp_path / "model.gnr", tmp_path / "plain"
+    old = os.umask(0o027)
+    try:
+        random_field().save(path)
+        plain.touch()
+    finally:
+        os.umask(old)
+    assert path.stat().st_mode == plain.stat().st_mode
+
+
+def test_files_that_are_no_models(tmp_path: Path) -> None:
+    random_field().save(tmp_path / "model.gnr")
+    whole = (tmp_path / "model.gnr").read_bytes()
+    contents = {
+        "empty": b"",
+        "garbage": bytes(range(256)) * 8,
+        "text": b"ply\nformat ascii 1.0\nend_header\n",
+        "cut off": whole[: len(whole) // 2],
+        "cut off in the header": whole[:20],
+    }
+    for name, content in contents.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            NeuralSDF.load(path)
+    theta = {"theta": torch.zeros(3)}
+    for name, metadata in (("foreign", None), ("tagged", {"format": "pt"}), ("future", {"format": "gnrecon-sdf-99"})):
+        save_file(theta, tmp_path / name, metadata)
+        with pytest.raises(InputError, match=name):
+            NeuralSDF.load(tmp_path / name)
+    for path in (tmp_path / "nothing.gnr", tmp_path):
+        with pytest.raises(InputError, match="no file"):
+            NeuralSDF.load(path)

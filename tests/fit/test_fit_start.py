@@ -1,0 +1,95 @@
+"""The start's linear solve is optimal, and its random features have the spectrum that they claim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import kv
+from torch import Tensor
+
+from gnrecon.errors import FitError
+from gnrecon.field import Siren
+from gnrecon.fit.problem import FieldProblem
+from gnrecon.fit.start import DEGREES_OF_FREEDOM, LENGTH, random_features, solve_last_layer
+from gnrecon.fit.terms import Term
+from gnrecon.residuals import interface, normal_vector, signed_distance
+
+each_field = pytest.mark.parametrize("widths", [(20,), (12, 15)], ids=str)
+
+
+def draw(widths: tuple[int, ...]) -> tuple[Siren, list[Term], Tensor]:
+    generator = torch.Generator().manual_seed(4)
+    field = Siren(widths)
+    x, volume = (torch.randn(count, 3, generator=generator, dtype=torch.float64) for count in (60, 80))
+    normals = x / x.norm(dim=1, keepdim=True)
+    terms = [
+        Term("interface", interface, normals),
+        Term("normal", normal_vector, normals, normals, 0.3),
+        Term("distance", signed_distance, volume, volume.norm(dim=1) - 1, 0.1),
+    ]
+    return field, terms, torch.randn(field.layout.count, generator=generator, dtype=torch.float64)
+
+
+def loss_gradient(field: Siren, terms: list[Term], theta: Tensor) -> tuple[float, Tensor]:
+    """The loss and its gradient by the last layer's parameters."""
+    problem = FieldProblem(field, terms, theta)
+    loss, gradient = 0.0, torch.zeros_like(theta)
+    for rows, residual in problem.chunks(theta):
+        loss += 0.5 * float(residual @ residual)
+        gradient += rows.T @ residual
+    return loss, gradient[field.layout.offsets[-1] :]
+
+
+@each_field
+def test_solve_is_optimal_in_the_last_layer(widths: tuple[int, ...]) -> None:
+    field, terms, theta = draw(widths)
+    solved = solve_last_layer(field, terms, theta)
+    before, slope = loss_gradient(field, terms, theta)
+    after, flat = loss_gradient(field, terms, solved)
+    last = field.layout.offsets[-1]
+    assert torch.equal(solved[:last], theta[:last])
+    assert after < before
+    # The ridge leaves a gradient of its own size.
+    assert float(flat.norm()) < 1e-7 * float(slope.norm())
+    generator = torch.Generator().manual_seed(5)
+    for _ in range(5):
+        other = solved.clone()
+        other[last:] += 1e-2 * torch.randn(len(other) - last, generator=generator, dtype=other.dtype)
+        assert loss_gradient(field, terms, other)[0] > after
+
+
+@each_field
+def test_solve_finds_a_field_that_the_features_can_express(widths: tuple[int, ...]) -> None:
+    field, _, theta = draw(widths)
+    x = torch.randn(200, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    value, gradient = field.value_and_gradient(theta, x)
+    terms = [Term("distance", signed_distance, x, value), Term("normal", normal_vector, x, gradient)]
+    blank = theta.clone()
+    blank[field.layout.offsets[-1] :] = 0.0
+    torch.testing.assert_close(solve_last_layer(field, terms, blank), theta, rtol=0, atol=1e-4)
+
+
+def test_values_that_are_not_finite_end_with_a_sentence() -> None:
+    field, terms, theta = draw((20,))
+    broken = [*terms, Term("distance", signed_distance, terms[0].points, terms[0].points[:, 0] * torch.nan)]
+    with pytest.raises(FitError, match="not finite"):
+        solve_last_layer(field, broken, theta)
+
+
+def test_features_have_a_maternlike_spectrum() -> None:
+    """The kernel E[2 sin(w.x + b) sin(w.y + b)] = E[cos w.(x - y)] is Matern's, of smoothness nu / 2 = 2."""
+    like = torch.zeros(1, dtype=torch.float64)
+    frequencies, phases = random_features(200_000, np.random.default_rng(0), like)
+    assert frequencies.shape == (200_000, 3)
+    assert float(phases.min()) >= 0.0
+    assert float(phases.max()) <= 2 * np.pi
+    for distance in (0.05, 0.12, 0.3):
+        smoothness = DEGREES_OF_FREEDOM / 2
+        s = np.sqrt(2 * smoothness) * distance / LENGTH
+        matern = 2 ** (1 - smoothness) / np.prod(np.arange(1, smoothness)) * s**smoothness * kv(smoothness, s)
+        offset = distance * torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64)
+        kernel = float(torch.cos(frequencies @ offset).mean())
+        assert kernel == pytest.approx(matern, abs=4 / np.sqrt(200_000))
+        sines = 2 * torch.sin(phases) * torch.sin(phases + frequencies @ offset)
+        assert float(sines.mean()) == pytest.approx(matern, abs=6 / np.sqrt(200_000))
