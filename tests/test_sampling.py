@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gnrecon.sampling import Box, CoarseDistance, near_surface
 
@@ -94,6 +95,22 @@ def test_coarse_distance_of_a_sphere(count: int) -> None:
     assert np.median(np.abs(distance / truth - 1)[far]) < 0.02
     # A gap between random points can be several spacings wide, and there the nearest point is far off the foot.
     assert np.abs(distance - truth).max() < 4 * coarse.spacing
+
+
+@pytest.mark.parametrize(
+    ("shape", "exact", "count"),
+    [(sphere, sphere_distance, 600), (sphere, sphere_distance, 3000), (torus, torus_distance, 5000)],
+)
+def test_coarse_distance_is_not_biased_by_the_gaps(shape: Shape, exact: Distance, count: int) -> None:
+    """Near the data the nearest point is a quarter of a spacing farther than the surface; the distance must not be."""
+    points, normals = shape(count)
+    coarse = CoarseDistance(points, normals, np.random.default_rng(0))
+    known, distance = coarse.sample(np.random.default_rng(1).uniform(-1.2, 1.2, (20_000, 3)))
+    truth = np.abs(exact(known))
+    near = truth < 5 * coarse.spacing
+    nearest = cKDTree(points).query(known[near])[0]
+    assert (nearest - truth[near]).mean() > 0.2 * coarse.spacing
+    assert abs((np.abs(distance) - truth)[near].mean()) < 0.08 * coarse.spacing
 
 
 def test_coarse_distance_answers_all_but_the_shell_around_the_data() -> None:
