@@ -28,7 +28,7 @@ DEFAULT_COMMAND = "reconstruct"
 app = typer.Typer(
     name="gnrecon",
     help="Watertight, verified meshes from point clouds: gnrecon SCAN -o MESH",
-    epilog="Exit codes: 0 ok, 2 usage, 3 input, 4 fit, 5 mesh not sound, 6 could not write, 7 memory, "
+    epilog="Exit codes: 0 ok, 1 unforeseen, 2 usage, 3 input, 4 fit, 5 mesh not sound, 6 could not write, 7 memory, "
     "8 some of a batch failed, 130 interrupted.",
     add_completion=False,
     no_args_is_help=True,
@@ -247,6 +247,11 @@ def _guarded(words: list[str]) -> int:
         return _fail("Interrupted; nothing was written.", ExitCode.INTERRUPTED, words)
     except MemoryError as error:
         return _fail(f"There is not enough memory. {error}".strip(), ExitCode.MEMORY, words)
+    except Exception as error:  # A fault of gnrecon itself: the user still gets one sentence, and a way to report it.
+        name = type(error).__name__
+        return _fail(
+            f"Unforeseen {name}: {error} Please report it with the output of --debug.", ExitCode.UNFORESEEN, words
+        )
 
 
 def _fail(sentence: str, code: ExitCode, words: list[str]) -> int:

@@ -12,6 +12,7 @@ class ExitCode(enum.IntEnum):
     """Exit codes of the command line."""
 
     OK = 0
+    UNFORESEEN = 1
     USAGE = 2
     INPUT = 3
     FIT = 4

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 
 from gnrecon.cloud import PointCloud, Samples
-from gnrecon.errors import MemoryLimitError
+from gnrecon.errors import MemoryLimitError, UsageError
 from gnrecon.export import (
     MeshFacts,
     Metrics,
@@ -121,6 +121,7 @@ def reconstruct(
         See `gnrecon.errors`; each says in one sentence what is wrong.
     """
     chosen = Options.of(**options)
+    _require_device(chosen.device)
     progress = progress or Progress()
     threads = torch.get_num_threads()
     try:
@@ -163,6 +164,21 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
             metrics = measure(mesh, truth, seed=options.seed)
     report = _report(source, options, stages, counts, solution, sdf, facts, actions, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
+
+
+def _require_device(device: str) -> None:
+    """Refuse a device that torch does not have.
+
+    Raises
+    ------
+    UsageError
+        When the device is unknown or not there.
+    """
+    kind = device.partition(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise UsageError(f"The device is {device!r}, but must be cpu or cuda.")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise UsageError("The device is 'cuda', but torch sees no CUDA GPU; `gnrecon doctor` tells what it sees.")
 
 
 def _cloud(source: Any, normals: Any) -> PointCloud:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from gnrecon.errors import MeshError, OutputError
 from gnrecon.atomic import atomic_write, write_text
+from gnrecon.errors import MeshError, OutputError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
