@@ -59,7 +59,7 @@ Widths = Annotated[
 Steps = Annotated[
     int | None,
     typer.Option(
-        help="Gauss-Newton steps after the linear start; 6 for one layer and 120 for several when not given.",
+        help="Gauss-Newton steps after the linear start; 4 for one layer and 120 for several when not given.",
         rich_help_panel=FIT,
     ),
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from gnrecon.atomic import atomic_write
@@ -26,22 +27,19 @@ def save_sdf(sdf: NeuralSDF, path: str | Path, overwrite: bool = False) -> None:
     OutputError
         When the file exists and may not be overwritten, or cannot be written.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     tensors = {
         "theta": sdf.theta.detach().cpu().contiguous(),
         "frame.center": torch.as_tensor(sdf.frame.center),
         "frame.scale": torch.tensor(sdf.frame.scale, dtype=torch.float64),
-        "box": torch.as_tensor([sdf.box.lower.tolist(), sdf.box.upper.tolist()], dtype=torch.float64),
+        "box": torch.as_tensor(np.stack([sdf.box.lower, sdf.box.upper])),
     }
-    metadata = {
-        "format": FORMAT,
-        "gnrecon": __version__,
-        "widths": json.dumps(sdf.field.widths),
-        "options": json.dumps(dict(sdf.options)),
-    }
+    facts = {"format": FORMAT, "gnrecon": __version__, "widths": sdf.field.widths, "options": dict(sdf.options)}
+    # One entry, because safetensors writes several in an order that differs from run to run.
+    metadata = {"gnrecon": json.dumps(facts)}
     with atomic_write(path, overwrite) as temporary:
-        save_file(tensors, temporary, metadata)
+        temporary.write_bytes(save(tensors, metadata))
 
 
 def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
@@ -58,17 +56,17 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
         raise InputError(f"There is no file {path}.")
     try:
         with safe_open(str(path), framework="pt", device=device) as file:
-            metadata = file.metadata() or {}
+            facts = json.loads((file.metadata() or {}).get("gnrecon", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    except SafetensorError as error:
+        if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+            raise InputError(f"{path} is not a gnrecon model of the format {FORMAT!r}.")
+        field = Siren(tuple(int(width) for width in facts["widths"]))
+        if tensors["theta"].shape != (field.layout.count,):
+            raise InputError(f"{path} holds {tuple(tensors['theta'].shape)} parameters for widths {field.widths}.")
+        frame = Frame(tensors["frame.center"].cpu().numpy(), float(tensors["frame.scale"]))
+        lower, upper = tensors["box"].cpu().numpy()
+        return NeuralSDF(field, tensors["theta"], frame, Box(lower, upper), dict(facts["options"]))
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is not a gnrecon model ({error}).") from error
-    if metadata.get("format") != FORMAT:
-        raise InputError(f"{path} is not a gnrecon model: its format is {metadata.get('format')!r}, not {FORMAT!r}.")
-    lower, upper = tensors["box"].cpu().numpy()
-    return NeuralSDF(
-        Siren(tuple(json.loads(metadata["widths"]))),
-        tensors["theta"],
-        Frame(tensors["frame.center"].cpu().numpy(), float(tensors["frame.scale"])),
-        Box(lower, upper),
-        json.loads(metadata["options"]),
-    )

@@ -13,7 +13,7 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
     "projection": normal_projection,
     "cosine": normal_cosine,
 }
-WIDE_STEPS, DEEP_STEPS = 6, 120
+WIDE_STEPS, DEEP_STEPS = 4, 120
 UNITS_PER_POINT, LEAST_UNITS, MOST_UNITS = 3, 1000, 2000
 SEARCHES = ("auto", "damping", "line")
 
@@ -28,7 +28,7 @@ class FitOptions:
         Hidden layers of the network; by default one of three units a point, from 1,000 to 2,000. One wide layer starts
         from random sine features and an exact linear solve; several layers start smooth, as in the paper.
     steps : int, optional
-        Gauss-Newton steps after the start; by default 6 for one wide layer, 120 for several layers.
+        Gauss-Newton steps after the start; by default 4 for one wide layer, 120 for several layers.
     normals : ``"vector"``, ``"projection"`` or ``"cosine"``
         Residual of the given normals, see `gnrecon.residuals.first_order`.
     search : ``"auto"``, ``"damping"`` or ``"line"``

@@ -5,7 +5,7 @@ The loss, in the paper's Monte Carlo form (weights on mean squares, unit coordin
     interface   f = 0                  at the points        1
     normal      grad f = n             at the points        (0.4 h)^2     an angle, as a height over 0.4 h
     distance    f = coarse distance    in the box           1e-4 M / N    a row of it weighs 1e-2 of a row of data
-    eikonal     |grad f| = 1           near the surface     (0.1 h)^2
+    eikonal     |grad f| = 1           near the surface     (0.05 h)^2
                                        and in the box
 
 One wide layer is started by a linear solve and refined by Gauss-Newton steps in random subspaces: all output weights
@@ -38,7 +38,7 @@ from gnrecon.residuals.first_order import eikonal, interface, signed_distance
 from gnrecon.sampling import near_surface
 
 NORMAL_REACH = 0.4
-EIKONAL_REACH = 0.1
+EIKONAL_REACH = 0.05
 DISTANCE_ROW = 1e-4
 SUBSPACE_UNITS = 400
 EIKONAL_COUNT = 3000

@@ -71,7 +71,9 @@ class GaussNewton:
                 # Not strictly greater, so that a problem without any loss left is idle too.
                 idle = idle + 1 if record.loss >= (1 - stop.tolerance) * record.before else 0
                 if idle >= stop.patience:
-                    return Solution(theta, f"Converged after {number} steps.", tuple(history))
+                    taken = any(past.length > 0 for past in history) or record.loss == 0.0
+                    status = f"Converged after {number} steps." if taken else "No step lowered the loss."
+                    return Solution(theta, status, tuple(history))
         except KeyboardInterrupt:
             return Solution(theta, f"Interrupted after {len(history)} steps.", tuple(history), interrupted=True)
         return Solution(theta, f"Stopped at the limit of {stop.steps} steps.", tuple(history))

@@ -62,7 +62,7 @@ class GainRatioDamping:
 
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
         """Raise the damping until a step improves the loss."""
-        growth, gain = 2.0, 0.0
+        start, growth, gain = damping, 2.0, 0.0
         for _ in range(self.trials):
             step = system.solve(damping)
             if step is not None and step.predicted > 0.0:
@@ -74,7 +74,8 @@ class GainRatioDamping:
                     return Move(trial, loss, damping, gain, 1.0, max(damping * easing, self.smallest))
             damping *= growth
             growth *= 2.0
-        return Move(free, system.loss, damping, gain, 0.0, damping)
+        # Nothing helped here; the next step, with points of its own, begins not much above where this one did.
+        return Move(free, system.loss, damping, gain, 0.0, start * 10)
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,6 @@ def test_a_file_brings_back_every_bit(tmp_path: Path, widths: tuple[int, ...], d
     assert NeuralSDF.load(again).options == loaded.options
 
 
-@pytest.mark.xfail(strict=True, reason="safetensors writes several metadata entries in no fixed order")
 def test_the_same_field_makes_the_same_file(tmp_path: Path) -> None:
     # More than two files, because two may agree by luck.
     for copy in range(12):
@@ -131,7 +130,6 @@ def test_saving_overwrites_only_when_told(tmp_path: Path) -> None:
         random_field().save(tmp_path / "missing" / "model.gnr")
 
 
-@pytest.mark.xfail(strict=True, reason="safetensors puts a private file of its own in the temporary one's place")
 def test_the_users_umask_decides_who_may_read_a_model(tmp_path: Path) -> None:
     path, plain = tmp_path / "model.gnr", tmp_path / "plain"
     old = os.umask(0o027)
