@@ -59,7 +59,7 @@ Widths = Annotated[
 Steps = Annotated[
     int | None,
     typer.Option(
-        help="Gauss-Newton steps after the linear start; 4 for one layer and 120 for several when not given.",
+        help="Gauss-Newton steps after the start; by default 4 (0 below 1,000 points; 120 for several layers).",
         rich_help_panel=FIT,
     ),
 ]

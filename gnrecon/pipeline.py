@@ -150,7 +150,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     for sentence in counts.remarks():
         progress.remark(sentence)
     with stages("fit"):
-        total = options.fit().step_limit
+        total = options.fit().steps_for(len(samples))
         sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total))
     progress.remark(solution.status)
     with stages("mesh"):

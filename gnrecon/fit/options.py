@@ -13,8 +13,9 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
     "projection": normal_projection,
     "cosine": normal_cosine,
 }
-WIDE_STEPS, DEEP_STEPS = 4, 120
-UNITS_PER_POINT, LEAST_UNITS, MOST_UNITS = 3, 1000, 2000
+WIDE_STEPS, DEEP_STEPS, LEAST_POINTS_TO_REFINE = 4, 120, 1000
+UNITS_PER_POINT, LEAST_UNITS = 3, 1000
+POINTS_PER_UNIT, SPARSE_UNITS, DENSE_UNITS = 4, 2000, 3000
 SEARCHES = ("auto", "damping", "line")
 
 
@@ -25,10 +26,11 @@ class FitOptions:
     Parameters
     ----------
     widths : tuple of int, optional
-        Hidden layers of the network; by default one of three units a point, from 1,000 to 2,000. One wide layer starts
-        from random sine features and an exact linear solve; several layers start smooth, as in the paper.
+        Hidden layers of the network; by default one of three units a point from 1,000 to 2,000, and of one for four
+        points from there to 3,000. One wide layer starts from random sine features and an exact linear solve; several layers start smooth, as in the paper.
     steps : int, optional
-        Gauss-Newton steps after the start; by default 4 for one wide layer, 120 for several layers.
+        Gauss-Newton steps after the start; by default 4 for one wide layer and 1,000 points or more, none
+        for fewer points, 120 for several layers.
     normals : ``"vector"``, ``"projection"`` or ``"cosine"``
         Residual of the given normals, see `gnrecon.residuals.first_order`.
     search : ``"auto"``, ``"damping"`` or ``"line"``
@@ -62,19 +64,27 @@ class FitOptions:
         if self.search not in SEARCHES:
             raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
 
-    @property
-    def step_limit(self) -> int:
-        """Most Gauss-Newton steps after the start."""
+    def steps_for(self, points: int) -> int:
+        """Return the most Gauss-Newton steps after the start, for a number of points.
+
+        Below 1,000 points frequencies that follow the data fit it better and what lies between it worse (measured, see
+        docs/accuracy.md), so that by default the exact linear solve is left as it is.
+        """
         if self.steps is not None:
             return self.steps
-        return WIDE_STEPS if self.widths is None or len(self.widths) == 1 else DEEP_STEPS
+        if len(self.widths_for(points)) > 1:
+            return DEEP_STEPS
+        return WIDE_STEPS if points >= LEAST_POINTS_TO_REFINE else 0
 
     def widths_for(self, points: int) -> tuple[int, ...]:
         """Return the hidden layers for a number of points.
 
         Fewer units than data rows smooth dense clouds; more of them only make sparse ones slower and less smooth.
         """
-        return self.widths or (min(max(UNITS_PER_POINT * points, LEAST_UNITS), MOST_UNITS),)
+        if self.widths is not None:
+            return self.widths
+        most = min(max(points // POINTS_PER_UNIT, SPARSE_UNITS), DENSE_UNITS)
+        return (min(max(UNITS_PER_POINT * points, LEAST_UNITS), most),)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as plain values."""

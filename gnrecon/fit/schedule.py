@@ -4,7 +4,7 @@ The loss, in the paper's Monte Carlo form (weights on mean squares, unit coordin
 
     interface   f = 0                  at the points        1
     normal      grad f = n             at the points        (0.4 h)^2     an angle, as a height over 0.4 h
-    distance    f = coarse distance    in the box           1e-4 M / N    a row of it weighs 1e-2 of a row of data
+    distance    f = coarse distance    in the box           max(1e-4 M / N, 4e-4), M samples and N points
     eikonal     |grad f| = 1           near the surface     (0.05 h)^2
                                        and in the box
 
@@ -39,7 +39,7 @@ from gnrecon.sampling import near_surface
 
 NORMAL_REACH = 0.4
 EIKONAL_REACH = 0.05
-DISTANCE_ROW = 1e-4
+DISTANCE_ROW, DISTANCE_WEIGHT = 1e-4, 4e-4
 SUBSPACE_UNITS = 400
 EIKONAL_COUNT = 3000
 MAX_STEP_POINTS = 4000
@@ -79,7 +79,7 @@ def fit(
 def _fit_wide(
     field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
 ) -> Solution:
-    theta = wide_start(field, scene, lambda x, d: [*_data_terms(scene, options), _distance_term(scene, x, d)], rng)
+    theta = wide_start(field, scene, lambda x, d, n: _start_terms(scene, options, rng, x, d, n), rng)
     search: Search = LogLineSearch() if options.search == "line" else GainRatioDamping(initial_damping=1.0)
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
@@ -87,14 +87,14 @@ def _fit_wide(
         units = torch.as_tensor(np.sort(rng.permutation(field.widths[0])[:SUBSPACE_UNITS])).to(theta.device)
         return FieldProblem(field, _step_terms(scene, options, rng, 1.0), theta, (units, None))
 
-    return GaussNewton(search).run(problem_at, theta, StopRule(options.step_limit), callback)
+    return GaussNewton(search).run(problem_at, theta, StopRule(options.steps_for(len(scene.points))), callback)
 
 
 def _fit_deep(
     field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
 ) -> Solution:
-    theta = smooth_start(field, scene, lambda x, d: [_distance_term(scene, x, d)], rng)
-    steps = options.step_limit
+    theta = smooth_start(field, scene, lambda x, d, n: [_distance_term(scene, x, d)], rng)
+    steps = options.steps_for(len(scene.points))
     search: Search = GainRatioDamping() if options.search == "damping" else LogLineSearch()
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
@@ -105,9 +105,17 @@ def _fit_deep(
     return GaussNewton(search).run(problem_at, theta, StopRule(steps, tolerance=0.0, patience=steps + 1), callback)
 
 
-def _data_terms(scene: Scene, options: FitOptions, rows: Tensor | None = None) -> list[Term]:
+def _start_terms(
+    scene: Scene, options: FitOptions, rng: np.random.Generator, x: Tensor, distance: Tensor, most: int
+) -> list[Term]:
+    return [*_data_terms(scene, options, rng, most), _distance_term(scene, x, distance)]
+
+
+def _data_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, most: int) -> list[Term]:
+    """Interface and normals at the data points, or at `most` of them drawn afresh."""
     points, normals = scene.points, scene.normals
-    if rows is not None:
+    if len(points) > most:
+        rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
         points, normals = points[rows], normals[rows]
     normal_weight = (NORMAL_REACH * scene.coarse.spacing) ** 2
     return [
@@ -117,22 +125,23 @@ def _data_terms(scene: Scene, options: FitOptions, rows: Tensor | None = None) -
 
 
 def _distance_term(scene: Scene, x: Tensor, distance: Tensor) -> Term:
-    """Each row weighs DISTANCE_ROW of a row of the data, however many there are of either."""
-    return Term("distance", signed_distance, x, distance, DISTANCE_ROW * len(x) / len(scene.points))
+    """The sparser the data, the more the free space must be told; the denser, the steeper a fit can turn in it."""
+    weight = max(DISTANCE_ROW * len(x) / len(scene.points), DISTANCE_WEIGHT)
+    return Term("distance", signed_distance, x, distance, weight)
 
 
 def _step_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, data_weight: float) -> Sequence[Term]:
     """Draw the terms of one step afresh."""
-    rows = None
-    if len(scene.points) > MAX_STEP_POINTS:
-        rows = torch.as_tensor(np.sort(rng.permutation(len(scene.points))[:MAX_STEP_POINTS])).to(scene.points.device)
     x, distance = scene.volume(scene.volume_count, rng)
     spacing = scene.coarse.spacing
     near = near_surface(scene.samples.points, 2 * spacing, EIKONAL_COUNT, rng)
     around = np.concatenate([near, scene.box.sample(EIKONAL_COUNT // 3, rng)])
     eikonal_weight = (EIKONAL_REACH * spacing) ** 2
     return [
-        *(replace(term, weight=term.weight * data_weight) for term in _data_terms(scene, options, rows)),
+        *(
+            replace(term, weight=term.weight * data_weight)
+            for term in _data_terms(scene, options, rng, MAX_STEP_POINTS)
+        ),
         _distance_term(scene, scene.tensor(x), scene.tensor(distance)),
         Term("eikonal", eikonal, scene.tensor(around), None, eikonal_weight * data_weight**0.5),
     ]

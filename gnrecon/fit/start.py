@@ -31,8 +31,13 @@ LENGTH = 0.12
 DEGREES_OF_FREEDOM = 4.0
 RIDGE = 1e-8
 ROUNDS = 3
+ATTEMPTS = 6
 
-TermsOf = Callable[[Tensor, Tensor], Sequence[Term]]
+SEARCH_POINTS, FINAL_POINTS = 5000, 20000
+"""Most data points of the rounds that look for ghosts, and of the last round."""
+
+TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
+"""Terms of volume samples x, their coarse distances, and at most so many data points."""
 
 
 def random_features(width: int, rng: np.random.Generator, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -57,8 +62,10 @@ def wide_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Gen
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
     for round_number in range(ROUNDS):
-        theta = solve_last_layer(field, terms_of(scene.tensor(x), scene.tensor(distance)), theta)
-        if round_number + 1 < ROUNDS:
+        last = round_number + 1 == ROUNDS
+        terms = terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS if last else SEARCH_POINTS)
+        theta = solve_last_layer(field, terms, theta)
+        if not last:
             trial, expected = scene.volume(3 * scene.volume_count, rng)
             value = field.value(theta, scene.tensor(trial)).cpu().numpy()
             wrong = np.flatnonzero(value * np.sign(expected) <= 0)[: scene.volume_count // 2]
@@ -71,7 +78,7 @@ def smooth_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.G
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     theta = field.initial(generator).to(scene.points)
     x, distance = scene.volume(scene.volume_count, rng)
-    return solve_last_layer(field, terms_of(scene.tensor(x), scene.tensor(distance)), theta)
+    return solve_last_layer(field, terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS), theta)
 
 
 def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tensor:
@@ -86,8 +93,12 @@ def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tens
     units = (*(none for _ in field.widths), None)
     problem = FieldProblem(field, terms, theta, units)
     free = problem.free()
+    system = normal_equations(problem.chunks(free), len(free), free)
     ridge = RIDGE / max(len(term) for term in terms)
-    step = normal_equations(problem.chunks(free), len(free), free).solve(ridge)
-    if step is None:
-        raise FitError("The linear start could not be solved: the system holds values that are not finite.")
-    return problem.whole(free + step.direction)
+    for _ in range(ATTEMPTS):
+        step = system.solve(ridge)
+        if step is not None:
+            return problem.whole(free + step.direction)
+        # Features that nearly depend on each other: what rounding takes from the smallest eigenvalue, the ridge gives.
+        ridge *= 10
+    raise FitError("The linear start could not be solved: the system holds values that are not finite.")

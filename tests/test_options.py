@@ -1,0 +1,74 @@
+"""Options are checked at the door, and the command line offers all of them with the same defaults."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from dataclasses import fields
+from typing import Any
+
+import pytest
+
+from gnrecon.cli import batch_command, parse_widths, reconstruct_command
+from gnrecon.errors import UsageError
+from gnrecon.fit import FitOptions
+from gnrecon.ingest import prepare
+from gnrecon.options import Options
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"resolution": 15}, "resolution must be at least 16 cells, not 15"),
+        ({"threads": 0}, "threads must be positive, not 0"),
+        ({"seed": -1}, "seed must not be negative, not -1"),
+        ({"steps": -1}, "steps must not be negative, not -1"),
+        ({"widths": ()}, "widths must be positive numbers"),
+        ({"widths": (300, 0)}, r"widths must be positive numbers, not \(300, 0\)"),
+        ({"normal_residual": "cross"}, "one of vector, projection, cosine, not 'cross'"),
+        ({"search": "golden"}, "one of auto, damping, line, not 'golden'"),
+        ({"detail": 3}, "no option 'detail'; the options are fraction, max_points"),
+    ],
+)
+def test_values_out_of_range_and_unknown_names(values: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(UsageError, match=sentence) as caught:
+        Options.of(**values)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_least_values_are_allowed() -> None:
+    options = Options.of(resolution=16, threads=1, seed=0, steps=0, widths=(1,))
+    assert options.fit().step_limit == 0
+    assert options.fit().widths_for(10_000) == (1,)
+
+
+def test_the_fit_receives_its_options() -> None:
+    options = Options(widths=(7, 5), steps=3, normal_residual="cosine", search="line", seed=11)
+    assert options.fit() == FitOptions((7, 5), 3, "cosine", "line", 11, "cpu")
+    assert Options().fit() == FitOptions()
+
+
+def test_ingest_receives_its_options() -> None:
+    chosen = {"outliers": "off", "fraction": 0.5, "max_points": 100, "subsample": "voxel", "seed": 4}
+    assert Options(**chosen).ingest() == chosen
+    parameters = inspect.signature(prepare).parameters
+    for name, value in Options().ingest().items():
+        assert parameters[name].default == value, name
+
+
+def test_options_are_plain_values() -> None:
+    values = Options(widths=(7, 5)).as_dict()
+    assert set(values) == {option.name for option in fields(Options)}
+    assert json.loads(json.dumps(values))["widths"] == [7, 5]
+
+
+@pytest.mark.parametrize("command", [reconstruct_command, batch_command])
+def test_the_command_line_has_every_option_with_the_same_default(command: Any) -> None:
+    parameters = inspect.signature(command).parameters
+    for option in fields(Options):
+        assert parameters[option.name].default == option.default, option.name
+
+
+def test_widths_are_read_from_text() -> None:
+    assert parse_widths("2000") == (2000,)
+    assert parse_widths("32,32,32") == (32, 32, 32)
