@@ -27,7 +27,8 @@ class FitOptions:
     ----------
     widths : tuple of int, optional
         Hidden layers of the network; by default one of three units a point from 1,000 to 2,000, and of one for four
-        points from there to 3,000. One wide layer starts from random sine features and an exact linear solve; several layers start smooth, as in the paper.
+        points from there to 3,000. One wide layer starts from random sine features and an exact linear solve; several
+        layers start smooth, as in the paper.
     steps : int, optional
         Gauss-Newton steps after the start; by default 4 for one wide layer and 1,000 points or more, none
         for fewer points, 120 for several layers.

@@ -93,7 +93,7 @@ def _fit_wide(
 def _fit_deep(
     field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
 ) -> Solution:
-    theta = smooth_start(field, scene, lambda x, d, n: [_distance_term(scene, x, d)], rng)
+    theta = smooth_start(field, scene, lambda x, d, _: [_distance_term(scene, x, d)], rng)
     steps = options.steps_for(len(scene.points))
     search: Search = GainRatioDamping() if options.search == "damping" else LogLineSearch()
 
