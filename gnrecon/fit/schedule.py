@@ -3,7 +3,7 @@
 The loss, in the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
 
     interface   f = 0                  at the points        1
-    normal      grad f = n             at the points        (0.4 h)^2     an angle, as a height over 0.4 h
+    normal      grad f = n             at the points        max(0.4 h, 0.012)^2, an angle as a height over that length
     distance    f = coarse distance    in the box           max(1e-4 M / N, 4e-4), M samples and N points
     eikonal     |grad f| = 1           near the surface     (0.05 h)^2
                                        and in the box
@@ -37,7 +37,7 @@ from gnrecon.optim.solution import Callback, Solution
 from gnrecon.residuals.first_order import eikonal, interface, signed_distance
 from gnrecon.sampling import near_surface
 
-NORMAL_REACH = 0.4
+NORMAL_REACH, LEAST_REACH = 0.4, 0.012
 EIKONAL_REACH = 0.05
 DISTANCE_ROW, DISTANCE_WEIGHT = 1e-4, 4e-4
 SUBSPACE_UNITS = 400
@@ -117,7 +117,7 @@ def _data_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, mos
     if len(points) > most:
         rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
         points, normals = points[rows], normals[rows]
-    normal_weight = (NORMAL_REACH * scene.coarse.spacing) ** 2
+    normal_weight = max(NORMAL_REACH * scene.coarse.spacing, LEAST_REACH) ** 2
     return [
         Term("interface", interface, points),
         Term("normal", NORMAL_RESIDUALS[options.normals], points, normals, normal_weight),
