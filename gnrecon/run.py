@@ -90,8 +90,8 @@ def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: 
         result = reconstruct(files.scan, reference=files.reference, progress=progress, **options)
     warnings = _write(files, result)
     for sentence in warnings:
-        console.print(sentence, highlight=False, soft_wrap=True)
-    console.print(_summary(files, result), highlight=False, soft_wrap=True)
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    console.print(_summary(files, result), highlight=False, markup=False, soft_wrap=True)
     if result.metrics is not None:
         print("\n".join(result.metrics.describe()))
     if result.interrupted:
@@ -142,11 +142,13 @@ class Shown(PipelineProgress):
         if self._task is not None:
             self._bar.update(self._task, completed=record.step, total=total, detail=detail)
         if self._verbose:
-            self._console.print(f"step {record.step:4d}/{total}  {detail}", highlight=False, soft_wrap=True)
+            self._console.print(
+                f"step {record.step:4d}/{total}  {detail}", highlight=False, markup=False, soft_wrap=True
+            )
 
     def remark(self, sentence: str) -> None:
         """Print a sentence above the bar."""
-        self._console.print(sentence, highlight=False, soft_wrap=True)
+        self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
 
 @contextmanager

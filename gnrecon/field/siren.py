@@ -56,13 +56,6 @@ class Siren:
             activation = torch.addmm(layer_bias, activation, layer_weights.T).sin_()
         return (activation @ weights[0]).add_(bias)
 
-    def features(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return the last hidden layer's activations a_L, of shape (N, width)."""
-        activation = x
-        for weights, bias in self.layout.layers(theta)[:-1]:
-            activation = torch.addmm(bias, activation, weights.T).sin_()
-        return activation
-
     def value_and_gradient(self, theta: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return f, of shape (N,), and its gradient in x, of shape (N, 3), at points x, of shape (N, 3)."""
         jet = self.jet(theta, x)

@@ -54,14 +54,10 @@ class FieldProblem:
 
     def residual(self, theta: Tensor) -> Tensor:
         """Return the weighted residuals, of shape (M,)."""
-        return torch.cat([residual for residual, _ in self.by_term(theta)])
+        return torch.cat(list(self._by_term(theta)))
 
-    def losses(self, theta: Tensor) -> dict[str, float]:
-        """Return each term's unweighted mean square residual by name."""
-        return {term.name: float(r.square().sum()) for r, term in self.by_term(theta, weighted=False)}
-
-    def by_term(self, theta: Tensor, weighted: bool = True) -> Iterator[tuple[Tensor, Term]]:
-        """Yield residual rows, scaled by sqrt(weight / N) or by sqrt(1 / N), with the term that they belong to."""
+    def _by_term(self, theta: Tensor) -> Iterator[Tensor]:
+        """Yield each term's residual rows, scaled by sqrt(weight / N)."""
         whole = self.whole(theta)
         for group in groups(self.terms):
             needs_gradient = any(not _is_value_only(term) for term in group)
@@ -69,8 +65,7 @@ class FieldProblem:
             value, gradient = (torch.cat(part) for part in zip(*parts, strict=True))
             for term in group:
                 residual = term.residual(value, gradient, term.target).residual
-                weight = term.weight if weighted else 1.0
-                yield (residual * _row_scale(weight, len(term), residual)).flatten(), term
+                yield (residual * _row_scale(term.weight, len(term), residual)).flatten()
 
     def _evaluate(self, whole: Tensor, points: Tensor, needs_gradient: bool) -> Iterator[tuple[Tensor, Tensor]]:
         for rows in batches(len(points), 4096):

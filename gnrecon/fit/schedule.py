@@ -108,7 +108,9 @@ def _fit_deep(
 def _start_terms(
     scene: Scene, options: FitOptions, rng: np.random.Generator, x: Tensor, distance: Tensor, most: int
 ) -> list[Term]:
-    return [*_data_terms(scene, options, rng, most), _distance_term(scene, x, distance)]
+    # The start is a linear solve, and the cosine is not linear in f.
+    linear = replace(options, normals="vector") if options.normals == "cosine" else options
+    return [*_data_terms(scene, linear, rng, most), _distance_term(scene, x, distance)]
 
 
 def _data_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, most: int) -> list[Term]:

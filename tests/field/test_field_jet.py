@@ -80,7 +80,7 @@ def test_value_and_gradient(widths: tuple[int, ...], seed: int) -> None:
 def test_features_are_what_the_last_layer_sees(widths: tuple[int, ...], seed: int) -> None:
     field, theta, x, _ = draw(seed, widths)
     weights, bias = field.layout.layers(theta)[-1]
-    features = field.features(theta, x)
+    features = field.jet(theta, x).activations[-1]
     assert features.shape == (len(x), widths[-1])
     torch.testing.assert_close((features @ weights.T + bias)[:, 0], field.value(theta, x), **EXACT)
 
@@ -154,7 +154,7 @@ def test_precision_is_kept(widths: tuple[int, ...], dtype: torch.dtype) -> None:
     theta, x = theta.to(dtype), x.to(dtype)
     jet = field.jet(theta, x)
     rows = dense(jet.rows(x[:, 0], x))
-    for tensor in (field.value(theta, x), field.features(theta, x), jet.value, jet.gradient, rows):
+    for tensor in (field.value(theta, x), field.jet(theta, x).activations[-1], jet.value, jet.gradient, rows):
         assert tensor.dtype == dtype
     oracle = autodiff_rows(widths, theta.double(), x.double(), x[:, 0].double(), x.double())
     torch.testing.assert_close(

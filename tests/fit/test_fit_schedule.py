@@ -148,5 +148,19 @@ def test_every_choice_of_the_options_is_accepted() -> None:
         for normals in NORMAL_RESIDUALS:
             options = FitOptions(search=search, normals=normals)
             assert FitOptions(**options.as_dict()) == options
-    assert FitOptions(steps=7).step_limit == 7
-    assert FitOptions(widths=(32, 32)).step_limit > FitOptions(widths=(500,)).step_limit > 0
+    assert FitOptions(steps=7).steps_for(10) == 7
+    assert FitOptions(widths=(32, 32)).steps_for(500) > FitOptions().steps_for(1000) > FitOptions().steps_for(999) == 0
+
+
+def test_the_network_grows_with_the_points() -> None:
+    widths = [FitOptions().widths_for(points) for points in (100, 500, 5000, 10_000, 100_000)]
+    assert widths == [(1000,), (1500,), (2000,), (2500,), (3000,)]
+    assert FitOptions(widths=(8, 9)).widths_for(100_000) == (8, 9)
+
+
+def test_normals_as_cosines_start_from_a_linear_solve(rng: np.random.Generator) -> None:
+    points = rng.standard_normal((400, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    samples = Samples(points, points, Frame(np.zeros(3), 1.0))
+    sdf, _ = fit(samples, FitOptions(widths=(300,), steps=1, normals="cosine"))
+    assert np.abs(sdf.sdf(points)).mean() < 0.01
