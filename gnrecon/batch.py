@@ -59,15 +59,23 @@ def run_batch(folder: Path, output: Path, mesh_format: str, arguments: Sequence[
     targets = _targets(scans, output, mesh_format)
     _make(output)
     console = Console(stderr=True, quiet=quiet)
-    outcomes = []
-    for number, (scan, target) in enumerate(zip(scans, targets, strict=True), 1):
-        console.print(f"[{number}/{len(scans)}] {scan}", highlight=False, markup=False)
-        outcomes.append(_one(scan, target, arguments))
-        if outcomes[-1].exit_code == ExitCode.INTERRUPTED:
-            raise KeyboardInterrupt
+    outcomes: list[Outcome] = []
+    interrupted = False
+    try:
+        for number, (scan, target) in enumerate(zip(scans, targets, strict=True), 1):
+            console.print(f"[{number}/{len(scans)}] {scan}", highlight=False, markup=False)
+            outcomes.append(_one(scan, target, arguments))
+            interrupted = outcomes[-1].exit_code == ExitCode.INTERRUPTED
+            if interrupted:
+                break
+    except KeyboardInterrupt:  # What was done until now is still worth its summary.
+        interrupted = True
     summary = {"failed": sum(o.exit_code != 0 for o in outcomes), "scans": [asdict(o) for o in outcomes]}
     write_text(output / SUMMARY, json.dumps(summary, indent=2) + "\n", overwrite=True)
     console.print(_table(outcomes))
+    if interrupted:
+        print(f"gnrecon: Interrupted; {output / SUMMARY} tells what was done until then.", file=sys.stderr)
+        return ExitCode.INTERRUPTED
     return ExitCode.BATCH if summary["failed"] else ExitCode.OK
 
 

@@ -236,6 +236,9 @@ def _guarded(words: list[str]) -> int:
     """Run the words and turn every failure into a sentence and an exit code."""
     try:
         result: Any = app(words, standalone_mode=False)
+        # Newer versions of typer turn Ctrl-C into this value and say nothing; `run` and `run_batch` raise theirs.
+        if result == ExitCode.INTERRUPTED:
+            raise KeyboardInterrupt
         return int(result or 0)
     except typer.Exit as request:
         return request.exit_code

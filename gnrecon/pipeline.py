@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 
 from gnrecon.cloud import Float, PointCloud, Samples
-from gnrecon.errors import MemoryLimitError, UsageError
+from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.export import (
     MeshFacts,
     Metrics,
@@ -129,6 +129,8 @@ def reconstruct(
         if chosen.threads is not None:
             torch.set_num_threads(chosen.threads)
         return _run(source, normals, reference, progress, chosen)
+    except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
+        raise
     except MemoryError as error:
         raise _out_of_memory(error) from error
     except RuntimeError as error:

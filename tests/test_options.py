@@ -38,7 +38,7 @@ def test_values_out_of_range_and_unknown_names(values: dict[str, Any], sentence:
 
 def test_the_least_values_are_allowed() -> None:
     options = Options.of(resolution=16, threads=1, seed=0, steps=0, widths=(1,))
-    assert options.fit().step_limit == 0
+    assert options.fit().steps_for(10_000) == 0
     assert options.fit().widths_for(10_000) == (1,)
 
 

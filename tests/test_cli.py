@@ -1,0 +1,291 @@
+"""The command line as a user meets it: exit codes, one sentence for each failure, files that are whole or absent."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
+
+from gnrecon.errors import ExitCode
+from gnrecon.export import verify_file
+from gnrecon.version import __version__
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A torus of 1,200 points in a file."""
+    return write_scan(tmp_path_factory.mktemp("scans") / "ring.ply", *torus(1200, np.random.default_rng(3)))
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """An empty folder for results."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    return folder
+
+
+def names(folder: Path) -> list[str]:
+    """All files, hidden ones too."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], code: ExitCode, words: str) -> None:
+    """One sentence on stderr that holds `words`, nothing on stdout."""
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("gnrecon: ")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.endswith("\n")
+    assert words in done.stderr
+
+
+def rows(points: np.ndarray) -> str:
+    return "\n".join(" ".join(map(str, row)) for row in points)
+
+
+SQUARE = np.random.default_rng(0).uniform(size=(50, 3)) * [1, 1, 0]
+BAD_SCANS = {
+    "two.xyz": ("0 0 0\n1 1 1\n", "Only 2 of 2 points are usable"),
+    "nan.xyz": ("nan nan nan\n" * 50, "Only 0 of 50 points are usable"),
+    "flat.xyz": (rows(SQUARE), "in one plane"),
+    "line.xyz": (rows(SQUARE * [1, 0, 0]), "on one line"),
+    "one_place.xyz": ("1 2 3\n" * 50, "Only 1 of 50"),
+    "empty.ply": ("", "is empty"),
+    "picture.ply": (PNG + bytes(100), "PNG image"),
+    "scan.docx": ("0 0 0\n", "extension '.docx' is not supported"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SCANS)
+def test_scans_that_cannot_be_reconstructed(tmp_path: Path, out: Path, name: str) -> None:
+    content, words = BAD_SCANS[name]
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert_refused(gnrecon(tmp_path / name, "-o", out / "mesh.obj", "--report", out / "r.json"), ExitCode.INPUT, words)
+    assert names(out) == []
+
+
+def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -> None:
+    missing = tmp_path / "missing.ply"
+    assert_refused(gnrecon(missing, "-o", out / "a.obj"), ExitCode.INPUT, f"There is no file {missing}.")
+    torn = tmp_path / "torn.ply"
+    torn.write_bytes(scan.read_bytes()[:-10])
+    assert_refused(gnrecon(torn, "-o", out / "a.obj"), ExitCode.INPUT, "declares 1200 vertex rows")
+    assert_refused(
+        gnrecon(scan, "-o", out / "a.obj", "--reference", missing), ExitCode.INPUT, f"There is no file {missing}."
+    )
+    assert names(out) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("-o", "{out}/mesh.docx"), "cannot be written as '.docx'; use obj, ply"),
+        (("-o", "{out}/mesh"), "a file without an extension"),
+        ((), "Missing option '-o'"),
+        (("-o", "{out}/mesh.obj", "--fraction", "1.5"), "fraction of points is 1.5"),
+        (("-o", "{out}/mesh.obj", "--fraction", "half"), "Invalid value for '--fraction'"),
+        (("-o", "{out}/mesh.obj", "--resolution", "3"), "at least 16 cells, not 3"),
+        (("-o", "{out}/mesh.obj", "--widths", "32;32"), "'32;32' is not a list of whole numbers"),
+        (("-o", "{out}/mesh.obj", "--smoothness", "1"), "No such option: --smoothness"),
+        (("-o", "{out}/mesh.obj", "--preview", "{out}/picture.jpg"), "picture.jpg"),
+        (("-o", "{out}/mesh.obj", "--report", "{out}/mesh.obj"), "named twice"),
+        (("-o", "{scan}", "--overwrite"), "named twice"),
+    ],
+    ids=lambda value: " ".join(value[2:] or value) if isinstance(value, tuple) else "",
+)
+def test_usage(out: Path, scan: Path, words: tuple[str, ...], sentence: str) -> None:
+    before = scan.read_bytes()
+    assert_refused(gnrecon(scan, *(w.format(out=out, scan=scan) for w in words)), ExitCode.USAGE, sentence)
+    assert names(out) == []
+    assert scan.read_bytes() == before
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_a_gpu_that_is_not_there(out: Path, scan: Path) -> None:
+    assert_refused(gnrecon(scan, "-o", out / "a.obj", "--device", "cuda"), ExitCode.USAGE, "no CUDA GPU")
+    assert names(out) == []
+
+
+def test_targets_that_cannot_be_written(out: Path, scan: Path) -> None:
+    (out / "taken.obj").write_text("somebody's work")
+    assert_refused(gnrecon(scan, "-o", out / "taken.obj"), ExitCode.OUTPUT, "--overwrite")
+    done = gnrecon(scan, "-o", out / "mesh.obj", "--report", out / "taken.obj")
+    assert_refused(done, ExitCode.OUTPUT, "taken.obj exists already")
+    assert_refused(gnrecon(scan, "-o", out / "no" / "mesh.obj"), ExitCode.OUTPUT, "does not exist")
+    assert names(out) == ["taken.obj"]
+    assert (out / "taken.obj").read_text() == "somebody's work"
+
+
+def assert_torus(path: Path) -> None:
+    """The file holds a sound torus, for us and for trimesh."""
+    import trimesh
+
+    facts = verify_file(path)
+    assert (facts.components, facts.genus) == (1, 1)
+    assert facts.volume == pytest.approx(TORUS_VOLUME, rel=0.02)
+    mesh = trimesh.load(path, force="mesh")
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(facts.volume, rel=1e-5)
+
+
+def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> None:
+    from PIL import Image
+
+    files = ("--report", out / "report.json", "--preview", out / "picture.png")
+    done = gnrecon(scan, "-o", out / "mesh.ply", "--reference", scan, *files, *FAST_WORDS)
+    assert done.returncode == 0, done.stderr
+    assert_torus(out / "mesh.ply")
+    report = json.loads((out / "report.json").read_text())
+    assert report["input"] == str(scan)
+    assert report["mesh"]["genus"] == 1
+    printed = dict(line.split()[:2] for line in done.stdout.splitlines())
+    for name in ("chamfer_mean", "hausdorff", "f_score"):
+        assert float(printed[name]) == pytest.approx(report["metrics"][name], rel=1e-4)
+    assert 0 < report["metrics"]["chamfer_mean"] < 0.1
+    with Image.open(out / "picture.png") as picture:
+        assert picture.format == "PNG"
+        assert picture.size == (1200, 600)
+    assert "genus 1, closed and manifold" in done.stderr
+    assert names(out) == ["mesh.ply", "picture.png", "report.json"]
+
+
+@pytest.mark.parametrize("suffix", ["obj", "off", "stl", "glb"])
+def test_formats(out: Path, scan: Path, suffix: str) -> None:
+    mesh = out / f"mesh.{suffix}"
+    mesh.write_text("an older mesh")
+    done = gnrecon("reconstruct", scan, "-o", mesh, "--overwrite", *FAST_WORDS)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    assert_torus(mesh)
+    assert names(out) == [mesh.name]
+
+
+def test_quiet_is_silent(out: Path, scan: Path) -> None:
+    done = gnrecon(scan, "-o", out / "mesh.obj", "-q", *FAST_WORDS)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@contextmanager
+def started(*words: object, before: str = "") -> Iterator[subprocess.Popen[str]]:
+    """A running command line that is gone afterwards, whatever happens."""
+    process = start(*words, before=before)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """The exit code, and what is left on stderr."""
+    _, stderr = process.communicate(timeout=60)
+    return process.returncode, stderr
+
+
+def pause_at(place: str) -> str:
+    """Code that makes a function of the pipeline say so and wait instead of doing anything."""
+    say = "print('paused', file=sys.stderr, flush=True)"
+    return f"import gnrecon.pipeline\n{place} = lambda *_, **__: ({say}, time.sleep(60))"
+
+
+def test_an_interrupt_during_the_fit_keeps_the_best_mesh(out: Path, scan: Path) -> None:
+    words = ("--widths", "300", "--steps", "5000", "--resolution", "48")
+    with started(scan, "-o", out / "mesh.obj", "-v", "--report", out / "report.json", *words) as process:
+        wait_for(process, "step")
+        process.send_signal(signal.SIGINT)
+        code, stderr = end(process)
+    assert code == ExitCode.INTERRUPTED, stderr
+    assert stderr.endswith(f"gnrecon: Interrupted; {out / 'mesh.obj'} shows the best field until then.\n")
+    assert_torus(out / "mesh.obj")
+    assert json.loads((out / "report.json").read_text())["fit"]["interrupted"]
+
+
+@pytest.mark.parametrize("stage", ["read_cloud", "prepare"])
+def test_an_interrupt_before_the_fit_writes_nothing(out: Path, scan: Path, stage: str) -> None:
+    with started(scan, "-o", out / "mesh.obj", before=pause_at(f"gnrecon.pipeline.{stage}")) as process:
+        wait_for(process, "paused")
+        process.send_signal(signal.SIGINT)
+        code, stderr = end(process)
+    assert (code, stderr) == (ExitCode.INTERRUPTED, "gnrecon: Interrupted; nothing was written.\n")
+    assert names(out) == []
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_a_polite_end_while_writing_leaves_nothing(out: Path, scan: Path, signal_number: signal.Signals) -> None:
+    files = ("-o", out / "mesh.obj", "--report", out / "report.json")
+    with started(scan, *files, *FAST_WORDS, before=pause_at("gnrecon.pipeline._verify")) as process:
+        wait_for(process, "paused")
+        process.send_signal(signal_number)
+        assert end(process)[0] == 128 + signal_number
+    assert names(out) == []
+
+
+@pytest.mark.parametrize("place", ["fit", "_verify"])
+def test_a_kill_leaves_nothing_under_the_targets_name(out: Path, scan: Path, place: str) -> None:
+    with started(scan, "-o", out / "mesh.obj", *FAST_WORDS, before=pause_at(f"gnrecon.pipeline.{place}")) as process:
+        wait_for(process, "paused")
+        process.kill()
+        assert end(process)[0] == -signal.SIGKILL
+    assert not (out / "mesh.obj").exists()
+
+
+TORN_BY_REPAIR = """
+import gnrecon.pipeline
+from gnrecon.mesh import Mesh
+gnrecon.pipeline.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
+"""
+TORN_BY_WRITING = """
+import gnrecon.io.formats
+from gnrecon.mesh import Mesh
+write = gnrecon.io.formats.WRITERS[".obj"]
+gnrecon.io.formats.WRITERS[".obj"] = lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path)
+"""
+
+
+@pytest.mark.parametrize("torn", [TORN_BY_REPAIR, TORN_BY_WRITING], ids=["by repair", "by writing"])
+def test_an_open_mesh_is_not_written(out: Path, scan: Path, torn: str) -> None:
+    with started(scan, "-o", out / "mesh.obj", "--report", out / "report.json", *FAST_WORDS, before=torn) as process:
+        code, stderr = end(process)
+    assert code == ExitCode.MESH
+    assert "is open: 3 edges have only one face." in stderr.splitlines()[-1]
+    assert names(out) == []
+
+
+def test_debug_shows_a_traceback(out: Path, scan: Path) -> None:
+    done = gnrecon(scan, "-o", out / "mesh.obj", "--resolution", "3", "--debug")
+    assert done.returncode == ExitCode.USAGE
+    assert done.stderr.startswith("Traceback (most recent call last)")
+    assert done.stderr.splitlines()[-1].startswith("gnrecon: The resolution must be")
+
+
+def test_a_fault_of_our_own_still_ends_in_one_sentence(out: Path, scan: Path) -> None:
+    fault = "import gnrecon.pipeline\ngnrecon.pipeline.prepare = None"
+    with started(scan, "-o", out / "mesh.obj", before=fault) as process:
+        code, stderr = end(process)
+    assert code == ExitCode.UNFORESEEN
+    assert stderr.count("\n") == 1
+    assert "Unforeseen TypeError" in stderr
+    assert "--debug" in stderr
+
+
+def test_version_and_help() -> None:
+    version = gnrecon("--version")
+    assert (version.returncode, version.stdout, version.stderr) == (0, f"gnrecon {__version__}\n", "")
+    top = gnrecon("--help")
+    assert top.returncode == 0
+    for word in ("reconstruct", "batch", "doctor", "Exit codes"):
+        assert word in top.stdout
+    details = gnrecon("reconstruct", "--help")
+    assert details.returncode == 0
+    for option in ("--output", "--fraction", "--widths", "--resolution", "--reference", "--overwrite", "--debug"):
+        assert option in details.stdout
