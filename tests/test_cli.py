@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,9 +14,12 @@ import pytest
 import torch
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
 
+from gnrecon.cli import main
 from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
 from gnrecon.version import __version__
+
+Here = Callable[..., subprocess.CompletedProcess[str]]
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -50,6 +53,22 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: ExitCode, words
     assert words in done.stderr
 
 
+@pytest.fixture
+def here(capfd: pytest.CaptureFixture[str]) -> Iterator[Here]:
+    """The command line within this process, for the many failures that come before any work."""
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        arguments = [str(word) for word in words]
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        stdout, stderr = capfd.readouterr()
+        return subprocess.CompletedProcess(arguments, int(end.value.code or 0), stdout, stderr)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
 def rows(points: np.ndarray) -> str:
     return "\n".join(" ".join(map(str, row)) for row in points)
 
@@ -68,10 +87,10 @@ BAD_SCANS = {
 
 
 @pytest.mark.parametrize("name", BAD_SCANS)
-def test_scans_that_cannot_be_reconstructed(tmp_path: Path, out: Path, name: str) -> None:
+def test_scans_that_cannot_be_reconstructed(tmp_path: Path, out: Path, here: Here, name: str) -> None:
     content, words = BAD_SCANS[name]
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    assert_refused(gnrecon(tmp_path / name, "-o", out / "mesh.obj", "--report", out / "r.json"), ExitCode.INPUT, words)
+    assert_refused(here(tmp_path / name, "-o", out / "mesh.obj", "--report", out / "r.json"), ExitCode.INPUT, words)
     assert names(out) == []
 
 
@@ -104,9 +123,9 @@ def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -
     ],
     ids=lambda value: " ".join(value[2:] or value) if isinstance(value, tuple) else "",
 )
-def test_usage(out: Path, scan: Path, words: tuple[str, ...], sentence: str) -> None:
+def test_usage(out: Path, scan: Path, here: Here, words: tuple[str, ...], sentence: str) -> None:
     before = scan.read_bytes()
-    assert_refused(gnrecon(scan, *(w.format(out=out, scan=scan) for w in words)), ExitCode.USAGE, sentence)
+    assert_refused(here(scan, *(w.format(out=out, scan=scan) for w in words)), ExitCode.USAGE, sentence)
     assert names(out) == []
     assert scan.read_bytes() == before
 
@@ -161,18 +180,13 @@ def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> No
 
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "stl", "glb"])
-def test_formats(out: Path, scan: Path, suffix: str) -> None:
+def test_formats_written_quietly_over_older_files(out: Path, scan: Path, suffix: str) -> None:
     mesh = out / f"mesh.{suffix}"
     mesh.write_text("an older mesh")
-    done = gnrecon("reconstruct", scan, "-o", mesh, "--overwrite", *FAST_WORDS)
-    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    done = gnrecon("reconstruct", scan, "-o", mesh, "--overwrite", "--quiet", *FAST_WORDS)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert_torus(mesh)
     assert names(out) == [mesh.name]
-
-
-def test_quiet_is_silent(out: Path, scan: Path) -> None:
-    done = gnrecon(scan, "-o", out / "mesh.obj", "-q", *FAST_WORDS)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @contextmanager

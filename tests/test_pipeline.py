@@ -23,7 +23,7 @@ from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 
 RADIUS = 1 + TUBE
 # Enough to reach every stage, where the mesh itself does not matter.
-TINY = {"widths": (200,), "steps": 0, "resolution": 32}
+TINY = {"widths": (200,), "steps": 0, "resolution": 24}
 
 Cloud = tuple[np.ndarray, np.ndarray]
 
@@ -78,7 +78,7 @@ def test_topology_and_volume(
     width: int,
     rng: np.random.Generator,
 ) -> None:
-    mesh = reconstruct(*shape(rng), widths=(width,), steps=1, resolution=64).mesh
+    mesh = reconstruct(*shape(rng), widths=(width,), steps=1, resolution=48).mesh
     assert mesh.euler_characteristic == euler_characteristic
     assert mesh.volume == pytest.approx(volume, rel=0.01)
 
@@ -122,7 +122,7 @@ def test_all_carriers_of_points_give_the_same_mesh(tmp_path: Path, scan: Cloud) 
     import open3d
     import trimesh
 
-    points, normals = scan
+    points, normals = (rows[:300] for rows in scan)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.normals = open3d.utility.Vector3dVector(normals)
     path = write_scan(tmp_path / "scan.ply", points, normals)
@@ -206,16 +206,16 @@ def test_progress_is_told_of_stages_steps_and_remarks(scan: Cloud) -> None:
 
 def test_a_reference_gives_metrics(tmp_path: Path, scan: Cloud, result: Reconstruction) -> None:
     result.save(tmp_path / "truth.ply")
-    for reference in (result.mesh, tmp_path / "truth.ply"):
-        told = Recorder()
-        again = reconstruct(*scan, reference=reference, progress=told, **FAST)
-        assert told.stages[-1] == "measure"
-        assert again.metrics is not None
-        # The same scan again makes the same mesh.
-        # The distances are cast in single precision.
-        assert again.metrics.hausdorff < 1e-4 * RADIUS
-        assert again.metrics.f_score == 1.0
-        assert json.loads(json.dumps(again.report["metrics"]))["f_score"] == 1.0
+    told = Recorder()
+    again = reconstruct(*scan, reference=tmp_path / "truth.ply", progress=told, **FAST)
+    assert told.stages[-1] == "measure"
+    assert again.metrics is not None
+    # The same scan again makes the same mesh; distances to it are cast in single precision.
+    assert again.metrics.hausdorff < 1e-4 * RADIUS
+    assert again.metrics.f_score == 1.0
+    assert json.loads(json.dumps(again.report["metrics"]))["f_score"] == 1.0
+    of_mesh = reconstruct(*scan, reference=result.mesh, **TINY)
+    assert of_mesh.metrics == measure(of_mesh.mesh, result.mesh)
 
 
 @pytest.mark.parametrize(("options", "kept"), [({"fraction": 0.5}, 600), ({"max_points": 500}, 500)])
@@ -250,7 +250,7 @@ def test_threads_are_those_asked_for_and_restored(scan: Cloud) -> None:
 
 
 def test_an_interrupt_keeps_the_best_field(scan: Cloud) -> None:
-    result = reconstruct(*scan, progress=Recorder(interrupt_after=2), widths=(300,), steps=50, resolution=48)
+    result = reconstruct(*scan, progress=Recorder(interrupt_after=2), widths=(300,), steps=50, resolution=32)
     assert result.interrupted
     assert result.report["fit"]["interrupted"]
     assert result.report["fit"]["status"] == "Interrupted after 2 steps."
