@@ -22,7 +22,7 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCUMENTS = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("**/*.md"))]
-LIMIT = 300.0  # seconds a block
+LIMIT = 600.0  # seconds a block
 
 RUNNERS = {
     "bash": ["bash", "-euo", "pipefail", "-c"],
