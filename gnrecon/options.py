@@ -56,6 +56,8 @@ class Options:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
         if self.seed < 0:
             raise UsageError(f"The seed must not be negative, not {self.seed}.")
+        if self.widths is not None and not isinstance(self.widths, list | tuple):
+            raise UsageError(f"The widths must be a sequence such as (2000,), not {self.widths!r}.")
         self.fit()
 
     @classmethod

@@ -68,7 +68,8 @@ class CoarseDistance:
 
     def sample(self, x: Float) -> tuple[Float, Float]:
         """Return those of the points x, of shape (Q, 3), where the distance is known, and the distances there."""
-        distances, nearest = self._tree.query(x, workers=-1)
+        # One worker: with several, Ctrl-C unwinds while scipy's threads still use the arrays, and the process crashes.
+        distances, nearest = self._tree.query(x)
         known = distances > 2 * self._disks[nearest]
         x, distances, disks = x[known], distances[known], self._disks[nearest[known]]
         sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)

@@ -152,7 +152,6 @@ def test_open3d_finds_the_mesh_watertight(scan: Cloud) -> None:
     assert reconstruct(*scan, **FAST).to_open3d().is_watertight()
 
 
-@pytest.mark.xfail(strict=True, reason="trimesh makes the array of normals that it is given read-only")
 def test_a_mesh_given_away_once_can_be_given_away_again(result: Reconstruction) -> None:
     assert result.mesh.normals is not None
     own = replace(result, mesh=replace(result.mesh, normals=result.mesh.normals.copy()))

@@ -135,7 +135,7 @@ def narrow_band(lattice: Lattice, data: Float | None = None) -> Band:
         if tree is not None:
             # A block at the box's border also holds nodes beyond it, which are outside whatever its centre is.
             inner = near & ((blocks > 0) & ((blocks + 1) * size < lattice.cells)).all(axis=1)
-            near[inner] = tree.query(blocks[inner] * size + size / 2, workers=-1)[0] <= half_diagonal + REACH
+            near[inner] = tree.query(blocks[inner] * size + size / 2)[0] <= half_diagonal + REACH
         _mark_inside(rows, blocks[~near & (values < 0)], size // LEAF)
         if size == LEAF:
             break

@@ -81,7 +81,8 @@ def to_trimesh(mesh: Mesh) -> Any:
     """Return a ``trimesh.Trimesh`` with the same vertices, faces and vertex normals, unprocessed."""
     import trimesh
 
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals(), process=False)
+    # A copy of the normals, because trimesh makes the array that it is given read-only.
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals().copy(), process=False)
 
 
 def to_open3d(mesh: Mesh) -> Any:
