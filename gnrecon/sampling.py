@@ -16,9 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.cloud import Float
 
 _SOURCES = 4000
 _NEIGHBOURS = 8
@@ -47,7 +46,7 @@ def near_surface(points: Float, spread: float, count: int, rng: np.random.Genera
 
 
 class CoarseDistance:
-    """Signed distance to a cloud, coarse but never wrong in sign by much; negative inside.
+    """Signed distance to a cloud, coarse, its sign reliable beyond the spacing of the points; negative inside.
 
     Parameters
     ----------

@@ -13,11 +13,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Frame
+from gnrecon.cloud import Float, Frame
 from gnrecon.field.siren import Siren, batches
 from gnrecon.sampling import Box
-
-Float = npt.NDArray[np.float64]
 
 _BATCH_BYTES = 4_000_000
 # What stays in the processor's cache is twice as fast as what does not.
