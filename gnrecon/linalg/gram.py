@@ -14,22 +14,23 @@ from torch import Tensor
 BLOCK = 512
 
 
-def gram(chunks: Iterable[tuple[Tensor, Tensor]], size: int, like: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Return J^T J (lower triangle valid), J^T r, and r^T r, summed in `like`'s precision and on its device.
+def gram(chunks: Iterable[Tensor], size: int, like: Tensor) -> Tensor:
+    """Return J^T J, of shape (size, size), its lower triangle valid, summed in `like`'s precision and on its device.
 
     Parameters
     ----------
-    chunks : pairs of J's rows, of shape (m, size), and their residuals, of shape (m,)
+    chunks : J's rows, of shape (m, size); products of chunks in a lower precision are made in theirs, which is faster,
+        and only their sums are kept in `like`'s
     size : number of columns of J
     like : tensor whose dtype and device are used
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
-    projected = torch.zeros(size, dtype=like.dtype, device=like.device)
-    square = torch.zeros((), dtype=like.dtype, device=like.device)
-    for rows, residual in chunks:
+    for rows in chunks:
         for start in range(0, size, BLOCK):
             stop = min(start + BLOCK, size)
-            product[start:stop, :stop].addmm_(rows[:, start:stop].T, rows[:, :stop])
-        projected.addmv_(rows.T, residual)
-        square += residual @ residual
-    return product, projected, float(square)
+            place = product[start:stop, :stop]
+            if rows.dtype == like.dtype:
+                place.addmm_(rows[:, start:stop].T, rows[:, :stop])
+            else:
+                place += rows[:, start:stop].T @ rows[:, :stop]
+    return product

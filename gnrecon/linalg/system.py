@@ -1,0 +1,109 @@
+"""What every linear solver offers: linearise once, then solve for as many dampings as a search asks for.
+
+A Gauss-Newton step minimises |r + J s|^2 + damping |s|_D^2, so that  (J^T J + damping D) s = -g  with g = J^T r. Its
+predicted decrease of the loss |r|^2 / 2 is  -s.g - |J s|^2 / 2. With the residual of the solve, rho = -g - (J^T J +
+damping D) s, it equals (damping |s|_D^2 - s.g + s.rho) / 2, which is free of cancellation and needs no product with J.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gnrecon.linalg.jacobian import Jacobian
+from gnrecon.linalg.metric import Metric
+
+
+@dataclass(frozen=True)
+class Step:
+    """A damped step, of shape (p,), and the decrease of the loss that the linear model predicts for it.
+
+    Where there is none, `failure` says why in a sentence, and the direction is zero.
+    """
+
+    direction: Tensor
+    predicted: float
+    iterations: int = 0
+    failure: str | None = None
+
+
+class DampedSystem(Protocol):
+    """One linearisation."""
+
+    @property
+    def loss(self) -> float:
+        """|r|^2 / 2."""
+        ...
+
+    @property
+    def gradient(self) -> Tensor:
+        """g = J^T r, of shape (p,)."""
+        ...
+
+    def solve(self, damping: float) -> Step:
+        """Return the step for a damping; never raises for want of a solution."""
+        ...
+
+
+class LinearSolver(Protocol):
+    """A way of solving damped systems."""
+
+    def linearise(self, jacobian: Jacobian, residual: Tensor, metric: Metric) -> DampedSystem:
+        """Return the system of J and r, of shape (M,), damped in a metric."""
+        ...
+
+    def describe(self) -> str:
+        """Return what this solver does, and if it chose, why, in a sentence."""
+        ...
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What the solvers have in common: g, D and the loss, and how a solution becomes a step."""
+
+    gradient: Tensor
+    metric: Tensor
+    loss: float
+    rows: int
+
+    @classmethod
+    def of(cls, jacobian: Jacobian, residual: Tensor, metric: Metric) -> Equations:
+        """Return the common part of a system.
+
+        Raises
+        ------
+        ValueError
+            When J and r have different numbers of rows.
+        """
+        if residual.shape != (jacobian.rows,):
+            raise ValueError(f"There are {jacobian.rows} rows, but residuals of shape {tuple(residual.shape)}.")
+        residual = residual.to(jacobian.dtype)
+        return cls(jacobian.tmv(residual), metric(jacobian), 0.5 * float(residual @ residual), jacobian.rows)
+
+    def obstacle(self, damping: float) -> str | None:
+        """Return why no step can be had whatever the solver, or None."""
+        if self.rows == 0:
+            return "There are no residuals to lower."
+        if self.gradient.numel() == 0:
+            return "There are no free parameters."
+        if not bool(torch.isfinite(self.gradient).all()) or not bool(torch.isfinite(self.metric).all()):
+            return "The Jacobian or the residuals are not finite."
+        if not damping >= 0.0:
+            return f"The damping must not be negative, not {damping}."
+        return None
+
+    def step(self, solution: Tensor, damping: float, rest: Tensor | None = None, iterations: int = 0) -> Step:
+        """Return the step of a solution, of shape (p,), whose equations are left with `rest` (rho, by default 0)."""
+        if not bool(torch.isfinite(solution).all()):
+            return self.failed("The solution is not finite.")
+        twice = damping * (self.metric * solution) @ solution - solution @ self.gradient
+        if rest is not None:
+            twice = twice + solution @ rest
+        return Step(solution, 0.5 * float(twice), iterations)
+
+    def failed(self, sentence: str, iterations: int = 0) -> Step:
+        """Return no step, and why."""
+        return Step(torch.zeros_like(self.gradient), 0.0, iterations, sentence)

@@ -1,0 +1,151 @@
+"""What the iterative solver keeps from one linearisation to the next, and what it does at its limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from damped_problems import F64, PROBLEMS, layered, randn
+from torch import Tensor
+
+from gnrecon.linalg import DenseJacobian, Iterative, Jacobi, Jacobian, Prepared, SampledGram, identity
+from gnrecon.linalg.krylov import Apply
+
+
+@dataclass
+class Counting:
+    """A preconditioner that remembers how often it was set up and adapted."""
+
+    inner: SampledGram = field(default_factory=lambda: SampledGram(1000))
+    prepared: int = 0
+    dampings: list[float] = field(default_factory=list)
+
+    def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> Prepared:
+        """Count a set-up."""
+        self.prepared += 1
+        made = self.inner.prepare(jacobian, metric, generator)
+        counts = self.dampings
+
+        class Adapted:
+            def at(self, damping: float) -> Apply:
+                counts.append(damping)
+                return made.at(damping)
+
+        return Adapted()
+
+    def describe(self) -> str:
+        """Name it."""
+        return "a counted one"
+
+
+def system(seed: int, columns: int = 20) -> tuple[DenseJacobian, Tensor]:
+    """J and r."""
+    generator = torch.Generator().manual_seed(seed)
+    return DenseJacobian(randn(generator, 60, columns)), randn(generator, 60)
+
+
+def test_a_preconditioner_serves_while_the_jacobian_changes_little() -> None:
+    counting = Counting()
+    solver = Iterative("cg", counting)
+    jacobian, r = system(0)
+    for step in range(4):
+        nearby = DenseJacobian(jacobian.matrix + 1e-3 * step * system(1)[0].matrix)
+        made = solver.linearise(nearby, r, identity)
+        assert made.solve(1e-2).failure is None
+        assert made.solve(1e-3).failure is None
+    assert counting.prepared == 1
+
+
+def test_without_reuse_every_linearisation_prepares() -> None:
+    counting = Counting()
+    solver = Iterative("cg", counting, reuse=False)
+    for _ in range(3):
+        solver.linearise(*system(0), identity).solve(1e-2)
+    assert counting.prepared == 3
+
+
+def test_an_old_preconditioner_is_made_anew_when_it_serves_badly() -> None:
+    counting = Counting()
+    solver = Iterative("cg", counting, patience=3)
+    first = solver.linearise(*system(0), identity).solve(1e-2)
+    slow = solver.linearise(*system(1), identity).solve(1e-2)
+    assert counting.prepared == 1
+    assert slow.iterations > first.iterations + 3
+    assert slow.failure is None, "it is slow, not wrong"
+    assert solver.linearise(*system(1), identity).solve(1e-2).iterations <= first.iterations + 3
+    assert counting.prepared == 2
+
+
+def test_other_columns_need_another_preconditioner() -> None:
+    counting = Counting()
+    solver = Iterative("cg", counting)
+    solver.linearise(*system(0), identity).solve(1e-2)
+    solver.linearise(*system(0, 15), identity).solve(1e-2)
+    jacobian, r = system(0, 15)
+    solver.linearise(DenseJacobian(jacobian.matrix.float()), r, identity).solve(1e-2)
+    assert counting.prepared == 3
+
+
+def test_a_solve_that_reached_its_limit_is_used_and_its_preconditioner_is_not_used_again() -> None:
+    counting = Counting()
+    jacobian, r = system(0)
+    solver = Iterative("cg", counting, limit=2)
+    solver.linearise(jacobian, r, identity).solve(1e-2)
+    step = solver.linearise(*system(1), identity).solve(1e-2)
+    assert step.iterations == 2
+    assert step.failure is None
+    assert step.predicted > 0.0
+    solver.linearise(*system(1), identity)
+    assert counting.prepared == 2
+
+
+def test_the_factor_of_a_damping_is_kept() -> None:
+    counting = Counting()
+    solver = Iterative("cg", counting)
+    for _ in range(3):
+        made = solver.linearise(*system(0), identity)
+        made.solve(1e-2)
+        made.solve(1e-2)
+    made.solve(1e-1)
+    assert counting.dampings == [1e-2, 1e-1]
+
+
+@pytest.mark.parametrize("method", ["cg", "minres", "gmres"])
+def test_truncated_steps_lower_the_loss_as_predicted(method: str) -> None:
+    problem = PROBLEMS["network"](3, F64)
+    last = 0.0
+    for limit in range(1, 8):
+        solver = Iterative(method, Jacobi(), limit=limit)  # type: ignore[arg-type]
+        step = solver.linearise(problem.jacobian, problem.r, identity).solve(1e-3)
+        assert step.failure is None
+        assert step.iterations == limit
+        linear = problem.r + problem.J @ step.direction
+        decrease = float(problem.r @ problem.r - linear @ linear) / 2
+        assert step.predicted == pytest.approx(decrease, rel=1e-9)
+        assert method != "cg" or decrease > last
+        last = decrease
+
+
+def test_an_empty_system_does_not_disturb_what_is_kept() -> None:
+    counting = Counting()
+    solver = Iterative("cg", counting)
+    solver.linearise(*system(0), identity).solve(1e-2)
+    assert (
+        solver.linearise(DenseJacobian(torch.zeros(0, 20, dtype=F64)), torch.zeros(0, dtype=F64), identity)
+        .solve(1.0)
+        .failure
+    )
+    solver.linearise(*system(0), identity).solve(1e-2)
+    assert counting.prepared == 1
+
+
+def test_the_seed_decides() -> None:
+    jacobian, J = layered(4, [(300, True), (200, False)])
+    r = randn(torch.Generator().manual_seed(5), len(J))
+    steps = [
+        Iterative("cg", SampledGram(60), seed=seed, tolerance=1e-3).linearise(jacobian, r, identity).solve(1e-3)
+        for seed in (0, 0, 1)
+    ]
+    assert torch.equal(steps[0].direction, steps[1].direction)
+    assert not torch.equal(steps[0].direction, steps[2].direction)
