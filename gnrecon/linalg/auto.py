@@ -9,11 +9,11 @@ product:
     by layers     2 * 200 * 8 M p                          little
 
 The first two are exact. w is what one entry of the kernel J J^T costs: 4 (in + out) for each layer, p for a dense J.
-The sampled rows are multiplied in float32, at twice the rate. An iteration of conjugate gradients takes 2 M p, in
-products so thin that they run at a quarter of the rate; with a sampled Gram matrix about 20 are needed (measured: 2
-to 8, and more when the preconditioner is an old one), with Kronecker factors of the layers, or the diagonal where
-there are no layers, often all 200, which count twice because such a step is only approximate. The least work wins
-among those that fit the memory; the last one always does.
+The product of the sampled rows counts half, because it serves for more than one step. An iteration of conjugate
+gradients takes 2 M p, in products so thin that they run at a quarter of the rate; with a sampled Gram matrix about 20
+are needed (measured: 5 to 20, and more when the preconditioner is an old one), with Kronecker factors of the layers,
+or the diagonal where there are no layers, often all 200, which count twice because such a step is only approximate.
+The least work wins among those that fit the memory; the last one always does.
 """
 
 from __future__ import annotations

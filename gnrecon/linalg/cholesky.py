@@ -9,37 +9,27 @@ from torch import Tensor
 
 from gnrecon.linalg.jacobian import Jacobian
 from gnrecon.linalg.metric import Metric
-from gnrecon.linalg.system import Equations, Step
+from gnrecon.linalg.system import Equations, Linearisation, Step
 
 INDEFINITE = "The damped matrix is not positive definite; a larger damping may help."
 
 
 @dataclass(frozen=True)
-class NormalSystem:
+class NormalSystem(Linearisation):
     """J^T J, in its lower triangle, which is left unchanged by `solve`."""
 
     product: Tensor
-    equations: Equations
 
-    @property
-    def loss(self) -> float:
-        """|r|^2 / 2."""
-        return self.equations.loss
-
-    @property
-    def gradient(self) -> Tensor:
-        """g = J^T r."""
-        return self.equations.gradient
-
-    def solve(self, damping: float) -> Step:
+    def solve(self, damping: float, residual: Tensor | None = None) -> Step:
         """Return the exact step."""
-        obstacle = self.equations.obstacle(damping)
+        equations = self.equations.at(residual)
+        obstacle = equations.obstacle(damping)
         if obstacle:
-            return self.equations.failed(obstacle)
-        factor = damped_factor(self.product, damping * self.equations.metric)
+            return equations.failed(obstacle)
+        factor = self._factor(damping, lambda: damped_factor(self.product, damping * equations.metric))
         if factor is None:
-            return self.equations.failed(INDEFINITE)
-        return self.equations.step(solve_factored(factor, -self.gradient), damping)
+            return equations.failed(INDEFINITE)
+        return equations.step(solve_factored(factor, -equations.gradient), damping)
 
 
 @dataclass(frozen=True)
@@ -52,7 +42,7 @@ class Cholesky:
 
     def linearise(self, jacobian: Jacobian, residual: Tensor, metric: Metric) -> NormalSystem:
         """Assemble J^T J."""
-        return NormalSystem(jacobian.gram(), Equations.of(jacobian, residual, metric))
+        return NormalSystem(Equations.of(jacobian, residual, metric), jacobian.gram())
 
     def describe(self) -> str:
         """Name the solver."""

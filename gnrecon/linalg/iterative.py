@@ -19,7 +19,7 @@ from gnrecon.linalg.krylov import Apply, KrylovResult, conjugate_gradients
 from gnrecon.linalg.metric import Metric
 from gnrecon.linalg.minres import minres
 from gnrecon.linalg.preconditioner import Jacobi, Preconditioner, Prepared
-from gnrecon.linalg.system import Equations, Step
+from gnrecon.linalg.system import Equations, Linearisation, Step
 
 METHODS = {"cg": conjugate_gradients, "minres": minres, "gmres": gmres}
 NAMES = {"cg": "Conjugate gradients", "minres": "MINRES", "gmres": "GMRES"}
@@ -62,40 +62,30 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class IterativeSystem:
+class IterativeSystem(Linearisation):
     """J, never multiplied out, and a preconditioner (None where there is nothing to solve)."""
 
-    jacobian: Jacobian
-    equations: Equations
     solver: Iterative
     kept: Kept | None
 
-    @property
-    def loss(self) -> float:
-        """|r|^2 / 2."""
-        return self.equations.loss
-
-    @property
-    def gradient(self) -> Tensor:
-        """g = J^T r."""
-        return self.equations.gradient
-
-    def solve(self, damping: float) -> Step:
+    def solve(self, damping: float, residual: Tensor | None = None) -> Step:
         """Return the step as far as the tolerance or the limit of iterations lets it come."""
-        obstacle = self.equations.obstacle(damping)
+        equations = self.equations.at(residual)
+        obstacle = equations.obstacle(damping)
         if obstacle or self.kept is None:
-            return self.equations.failed(obstacle or NO_DESCENT)
-        diagonal = damping * self.equations.metric
+            return equations.failed(obstacle or NO_DESCENT)
+        jacobian, diagonal = equations.jacobian, damping * equations.metric
 
         def apply(v: Tensor) -> Tensor:
-            return self.jacobian.tmv(self.jacobian.mv(v)).addcmul_(diagonal, v)
+            return jacobian.tmv(jacobian.mv(v)).addcmul_(diagonal, v)
 
         method = METHODS[self.solver.method]
-        result = method(apply, -self.gradient, self.kept.at(damping), self.solver.tolerance, self.solver.limit)
-        self.kept.note(result, self.solver.patience)
-        if not result.converged and not float(result.solution @ self.gradient) < 0.0:
-            return self.equations.failed(result.failure or NO_DESCENT, result.iterations)
-        return self.equations.step(result.solution, damping, result.rest, result.iterations)
+        result = method(apply, -equations.gradient, self.kept.at(damping), self.solver.tolerance, self.solver.limit)
+        if residual is None:
+            self.kept.note(result, self.solver.patience)
+        if not result.converged and not float(result.solution @ equations.gradient) < 0.0:
+            return equations.failed(result.failure or NO_DESCENT, result.iterations)
+        return equations.step(result.solution, damping, result.rest, result.iterations)
 
 
 @dataclass
@@ -131,12 +121,12 @@ class Iterative:
         equations = Equations.of(jacobian, residual, metric)
         # What cannot be solved with a damping that stands for all, cannot be with any.
         if equations.obstacle(1.0):
-            return IterativeSystem(jacobian, equations, self, None)
+            return IterativeSystem(equations, self, None)
         kept = self.kept
         if kept is None or not self.reuse or kept.stale or not kept.fits(equations.gradient):
             prepared = self.preconditioner.prepare(jacobian, equations.metric, self.generator)
             kept = self.kept = Kept(prepared, equations.gradient)
-        return IterativeSystem(jacobian, equations, self, kept)
+        return IterativeSystem(equations, self, kept)
 
     def describe(self) -> str:
         """Name the method and the preconditioner."""

@@ -16,41 +16,42 @@ from torch import Tensor
 
 from gnrecon.linalg.jacobian import Jacobian
 from gnrecon.linalg.metric import Metric
-from gnrecon.linalg.system import Equations, Step
+from gnrecon.linalg.system import Equations, Linearisation, Step
 
 
 @dataclass(frozen=True)
-class ReducedSystem:
+class ReducedSystem(Linearisation):
     """R and Q^T r beside each other, of shape (min(M, p + 1), p + 1)."""
 
     reduced: Tensor
-    equations: Equations
 
-    @property
-    def loss(self) -> float:
-        """|r|^2 / 2."""
-        return self.equations.loss
-
-    @property
-    def gradient(self) -> Tensor:
-        """g = J^T r."""
-        return self.equations.gradient
-
-    def solve(self, damping: float) -> Step:
-        """Return the exact step."""
-        obstacle = self.equations.obstacle(damping)
+    def solve(self, damping: float, residual: Tensor | None = None) -> Step:
+        """Return the exact step; for other residuals, by R'^T R' alone, which squares the condition number."""
+        equations = self.equations.at(residual)
+        obstacle = equations.obstacle(damping)
         if obstacle:
-            return self.equations.failed(obstacle)
-        p = len(self.gradient)
-        below = torch.cat([torch.diag((damping * self.equations.metric).sqrt()), self.reduced.new_zeros(p, 1)], 1)
+            return equations.failed(obstacle)
+        full = self._factor(damping, lambda: self._damped(damping))
+        if full is None:
+            return equations.failed("The damped matrix is singular; a larger damping may help.")
+        p = len(equations.gradient)
+        if residual is None:
+            half = -full[:p, p:]
+        else:
+            half = torch.linalg.solve_triangular(full[:p, :p].T, -equations.gradient[:, None], upper=False)
+        step = torch.linalg.solve_triangular(full[:p, :p], half, upper=True)[:, 0]
+        return equations.step(step, damping)
+
+    def _damped(self, damping: float) -> Tensor | None:
+        """Return [R', Q'^T (Q^T r, 0)], or None where R' is singular."""
+        metric = self.equations.metric
+        p = len(metric)
+        below = torch.cat([torch.diag((damping * metric).sqrt()), self.reduced.new_zeros(p, 1)], 1)
         full = torch.linalg.qr(torch.cat([self.reduced, below]), mode="r").R
         diagonal = full.diagonal()[:p].abs()
         # A column that depends on those before it leaves a zero, or what rounding made of it, on the diagonal.
         lengths = torch.linalg.vector_norm(full[:, :p], dim=0)
-        if not bool((diagonal > torch.finfo(full.dtype).eps * lengths).all()):
-            return self.equations.failed("The damped matrix is singular; a larger damping may help.")
-        step = torch.linalg.solve_triangular(full[:p, :p], -full[:p, p:], upper=True)[:, 0]
-        return self.equations.step(step, damping)
+        return full if bool((diagonal > torch.finfo(full.dtype).eps * lengths).all()) else None
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class QR:
             # Reductions of fewer rows than columns would cost as much as those of many.
             if sum(len(part) for part in pending) > 2 * width:
                 pending = [_reduce(pending)]
-        return ReducedSystem(_reduce(pending), equations)
+        return ReducedSystem(equations, _reduce(pending))
 
     def describe(self) -> str:
         """Name the solver."""

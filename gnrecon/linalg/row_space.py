@@ -18,38 +18,27 @@ from torch import Tensor
 from gnrecon.linalg.cholesky import INDEFINITE, damped_factor, solve_factored
 from gnrecon.linalg.jacobian import Jacobian
 from gnrecon.linalg.metric import Metric
-from gnrecon.linalg.system import Equations, Step
+from gnrecon.linalg.system import Equations, Linearisation, Step
 
 
 @dataclass(frozen=True)
-class RowSystem:
-    """K = J D^-1 J^T, in its lower triangle, and r."""
+class RowSystem(Linearisation):
+    """K = J D^-1 J^T, in its lower triangle."""
 
     kernel: Tensor
-    residual: Tensor
-    jacobian: Jacobian
-    equations: Equations
 
-    @property
-    def loss(self) -> float:
-        """|r|^2 / 2."""
-        return self.equations.loss
-
-    @property
-    def gradient(self) -> Tensor:
-        """g = J^T r."""
-        return self.equations.gradient
-
-    def solve(self, damping: float) -> Step:
+    def solve(self, damping: float, residual: Tensor | None = None) -> Step:
         """Return the exact step; a damping of zero needs rows that do not depend on each other."""
-        obstacle = self.equations.obstacle(damping)
+        equations = self.equations.at(residual)
+        obstacle = equations.obstacle(damping)
         if obstacle:
-            return self.equations.failed(obstacle)
-        factor = damped_factor(self.kernel, torch.full_like(self.residual, damping))
+            return equations.failed(obstacle)
+        right = equations.residual
+        factor = self._factor(damping, lambda: damped_factor(self.kernel, torch.full_like(right, damping)))
         if factor is None:
-            return self.equations.failed(INDEFINITE)
-        dual = solve_factored(factor, -self.residual)
-        return self.equations.step(self.jacobian.tmv(dual) / self.equations.metric, damping)
+            return equations.failed(INDEFINITE)
+        dual = solve_factored(factor, -right)
+        return equations.step(equations.jacobian.tmv(dual) / equations.metric, damping)
 
 
 @dataclass(frozen=True)
@@ -69,7 +58,7 @@ class RowSpace:
             raise ValueError("The kernel form needs a metric that is constant within each group of columns.")
         firsts = [equations.metric[group.start] if group.stop > group.start else 1.0 for group in jacobian.groups]
         scales = [1.0 / float(first) for first in firsts]
-        return RowSystem(jacobian.kernel(scales), residual.to(jacobian.dtype), jacobian, equations)
+        return RowSystem(equations, jacobian.kernel(scales))
 
     def describe(self) -> str:
         """Name the solver."""

@@ -3,12 +3,15 @@
 Where M is several times p, J^T J = sum_n j_n j_n^T is a sum of many more terms than it has dimensions. The average
 over m rows drawn without replacement,  (M / m) sum_sampled j_n j_n^T,  is near it once m is a small multiple of p,
 unless a few rows hold what the others do not. A count sketch is proof against such rows: S adds every row, with a
-random sign, to one of m sums, and J^T S^T S J is near J^T J whatever J is. The products may run in float32, which is
-twice as fast, because a preconditioner only has to be near: what is lost is below about 1e-7 of J^T J's largest
-eigenvalue. Its factorisation is in the precision of the vectors. Sources: Avron, Maymounkov, Toledo, Blendenpik
-(2010), and Meng, Saunders, Mahoney, LSRN (2014), for least squares preconditioned by a sketch; Clarkson and Woodruff,
-Low-rank approximation and regression in input sparsity time (2013), for the count sketch; Roosta-Khorasani and
-Mahoney, Sub-sampled Newton methods (2016), for sampled rows.
+random sign, to one of m sums, and J^T S^T S J is near J^T J whatever J is.
+The products are made in the precision of the vectors, also where the rows are stored in float32: float32 products
+lose what is below 1e-7 of J^T J's largest eigenvalue, and of a network's eigenvalues most are. Measured on a network
+of 2,273 parameters and 19,400 rows, with a damping of 2e-9 of the largest eigenvalue: 146 iterations of conjugate
+gradients instead of 17 with 4,546 sampled rows, for a set-up of 0.4 instead of 0.6 s; a sketch of 9,092 takes 9
+iterations and 1.7 s.
+Sources: Avron, Maymounkov, Toledo, Blendenpik (2010), and Meng, Saunders, Mahoney, LSRN (2014), for least squares
+preconditioned by a sketch; Clarkson and Woodruff, Low-rank approximation and regression in input sparsity time
+(2013), for the count sketch; Roosta-Khorasani and Mahoney, Sub-sampled Newton methods (2016), for sampled rows.
 """
 
 from __future__ import annotations
@@ -40,16 +43,9 @@ class PreparedGram:
 
 @dataclass(frozen=True)
 class SampledGram:
-    """J^T J from `rows` of the M rows: O(rows p^2) to set up, O(p^3) a damping, O(p^2) an application.
-
-    Parameters
-    ----------
-    rows : how many, at least a small multiple of p
-    products : precision in which the rows are multiplied
-    """
+    """J^T J from `rows` of the M rows, at least a small multiple of p: O(rows p^2) to set up, O(p^3) a damping."""
 
     rows: int
-    products: torch.dtype = torch.float32
 
     def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> PreparedGram:
         """Draw rows and assemble their Gram matrix."""
@@ -58,7 +54,7 @@ class SampledGram:
             # In ascending order and with the same chance for all, so that blocks of rows are drawn from in proportion.
             drawn = torch.randperm(jacobian.rows, generator=generator)[: self.rows].sort().values
             chosen, scale = jacobian.sample(drawn.to(jacobian.device)), jacobian.rows / self.rows
-        chunks = (chunk.to(self.products) for chunk in chosen.dense())
+        chunks = (chunk.to(metric) for chunk in chosen.dense())
         return PreparedGram(gram(chunks, jacobian.columns, metric).mul_(scale), metric)
 
     def describe(self) -> str:

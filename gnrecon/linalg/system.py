@@ -7,7 +7,9 @@ damping D) s, it equals (damping |s|_D^2 - s.g + s.rho) / 2, which is free of ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -34,17 +36,20 @@ class DampedSystem(Protocol):
     """One linearisation."""
 
     @property
+    def equations(self) -> Equations:
+        """J, r, g = J^T r and D."""
+        ...
+
+    @property
     def loss(self) -> float:
         """|r|^2 / 2."""
         ...
 
-    @property
-    def gradient(self) -> Tensor:
-        """g = J^T r, of shape (p,)."""
-        ...
+    def solve(self, damping: float, residual: Tensor | None = None) -> Step:
+        """Return the step for a damping, or that of other residuals, of shape (M,), in the place of r.
 
-    def solve(self, damping: float) -> Step:
-        """Return the step for a damping; never raises for want of a solution."""
+        It never raises for want of a solution.
+        """
         ...
 
 
@@ -62,12 +67,12 @@ class LinearSolver(Protocol):
 
 @dataclass(frozen=True)
 class Equations:
-    """What the solvers have in common: g, D and the loss, and how a solution becomes a step."""
+    """What the solvers have in common: J, r, g and D, and how a solution becomes a step."""
 
+    jacobian: Jacobian
+    residual: Tensor
     gradient: Tensor
     metric: Tensor
-    loss: float
-    rows: int
 
     @classmethod
     def of(cls, jacobian: Jacobian, residual: Tensor, metric: Metric) -> Equations:
@@ -81,11 +86,18 @@ class Equations:
         if residual.shape != (jacobian.rows,):
             raise ValueError(f"There are {jacobian.rows} rows, but residuals of shape {tuple(residual.shape)}.")
         residual = residual.to(jacobian.dtype)
-        return cls(jacobian.tmv(residual), metric(jacobian), 0.5 * float(residual @ residual), jacobian.rows)
+        return cls(jacobian, residual, jacobian.tmv(residual), metric(jacobian))
+
+    def at(self, residual: Tensor | None) -> Equations:
+        """Return the same equations for other residuals, of shape (M,), or as they are."""
+        if residual is None:
+            return self
+        residual = residual.to(self.residual)
+        return replace(self, residual=residual, gradient=self.jacobian.tmv(residual))
 
     def obstacle(self, damping: float) -> str | None:
         """Return why no step can be had whatever the solver, or None."""
-        if self.rows == 0:
+        if self.jacobian.rows == 0:
             return "There are no residuals to lower."
         if self.gradient.numel() == 0:
             return "There are no free parameters."
@@ -107,3 +119,25 @@ class Equations:
     def failed(self, sentence: str, iterations: int = 0) -> Step:
         """Return no step, and why."""
         return Step(torch.zeros_like(self.gradient), 0.0, iterations, sentence)
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A system as its equations; the solvers add what they made of J.
+
+    The factor of the last damping is kept, for other residuals at the same damping.
+    """
+
+    equations: Equations
+    _last: dict[float, Tensor | None] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @cached_property
+    def loss(self) -> float:
+        """|r|^2 / 2."""
+        return 0.5 * float(self.equations.residual @ self.equations.residual)
+
+    def _factor(self, damping: float, make: Callable[[], Tensor | None]) -> Tensor | None:
+        if damping not in self._last:
+            self._last.clear()
+            self._last[damping] = make()
+        return self._last[damping]

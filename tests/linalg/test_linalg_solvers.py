@@ -85,7 +85,7 @@ def test_step_is_the_least_squares_solution(
     system = SOLVERS[solver]().linearise(problem.jacobian, problem.r, metric)
     assert system.loss == pytest.approx(0.5 * float(problem.r @ problem.r), rel=1e-6)
     atol = 1e2 * torch.finfo(stored).eps * float(problem.J.norm() * problem.r.norm())
-    torch.testing.assert_close(system.gradient.double(), problem.J.T @ problem.r, rtol=0.0, atol=atol)
+    torch.testing.assert_close(system.equations.gradient.double(), problem.J.T @ problem.r, rtol=0.0, atol=atol)
     check(problem, system.solve(damping), D.double(), damping, stored)
 
 
