@@ -19,38 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class LayerRows:
-    """One layer's share of M Jacobian rows: ``left (inputs, 1)^T + right (tangents, 0)^T``, never multiplied out.
-
-    `left` and `right` have shape (M, out), `inputs` and `tangents` (M, in); `right` and `tangents` are None for rows
-    that hold no derivative in space.
-    """
-
-    left: Tensor
-    inputs: Tensor
-    right: Tensor | None
-    tangents: Tensor | None
-
-    @property
-    def size(self) -> int:
-        """Number of columns."""
-        return self.left.shape[1] * (self.inputs.shape[1] + 1)
-
-    def into(self, units: Tensor) -> LayerRows:
-        """Return the columns of the parameters that lead into the given output units, of shape (k,)."""
-        right = None if self.right is None else self.right[:, units]
-        return LayerRows(self.left[:, units], self.inputs, right, self.tangents)
-
-    def write(self, block: Tensor) -> None:
-        """Write the rows into `block`, of shape (M, out * (in + 1)), in theta's order."""
-        out, into = self.left.shape[1], self.inputs.shape[1]
-        weights = block[:, : out * into].view(len(block), out, into)
-        torch.mul(self.left[:, :, None], self.inputs[:, None, :], out=weights)
-        if self.right is not None and self.tangents is not None:
-            weights.addcmul_(self.right[:, :, None], self.tangents[:, None, :])
-        block[:, out * into :] = self.left
+from gnrecon.linalg.rows import LayerRows
 
 
 @dataclass(frozen=True)

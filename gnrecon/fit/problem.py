@@ -1,23 +1,27 @@
 """A field's residuals under a list of terms, as the least-squares problem that the optimisers solve.
 
 Row i of a term with weight w and N points is sqrt(w / N) r_i, so that |r|^2 / 2 is the paper's loss (its equations for
-the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is made a chunk of points at a
-time and is never held whole.
+the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is an operator made of the factors of its
+rows (`linalg.jacobian`); it is never held whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from gnrecon.field.jet import LayerRows
 from gnrecon.field.siren import Siren, batches
 from gnrecon.fit.terms import Term, groups
+from gnrecon.linalg.jacobian import Block, LayeredJacobian
+from gnrecon.linalg.rows import LayerRows
 from gnrecon.residuals.first_order import Linearised
+
+CHUNK_POINTS, CHUNK_BYTES = 4096, 64_000_000
+"""Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +34,16 @@ class FieldProblem:
     terms : the constraints, each on frozen points
     theta : all parameters, of shape (p,), where the problem was posed
     units : for each layer the units whose incoming parameters are free (None: all of them), or None for all layers
-    chunk_bytes : memory that one chunk of Jacobian rows may take
+    precision : in which the factors of J's rows are made and stored, by default that of theta; residuals keep theta's
+    keep_bytes : memory that the factors of J's rows may take; above it they are made afresh for each product
     """
 
     field: Siren
     terms: Sequence[Term]
     theta: Tensor
     units: tuple[Tensor | None, ...] | None = None
-    chunk_bytes: int = 64_000_000
+    precision: torch.dtype | None = None
+    keep_bytes: int = 1_500_000_000
 
     @cached_property
     def columns(self) -> Tensor | None:
@@ -53,58 +59,70 @@ class FieldProblem:
         return free if self.columns is None else self.theta.index_copy(0, self.columns, free)
 
     def residual(self, theta: Tensor) -> Tensor:
-        """Return the weighted residuals, of shape (M,)."""
-        return torch.cat(list(self._by_term(theta)))
-
-    def _by_term(self, theta: Tensor) -> Iterator[Tensor]:
-        """Yield each term's residual rows, scaled by sqrt(weight / N)."""
+        """Return the weighted residuals, of shape (M,), in the order of `linearise`'s rows."""
         whole = self.whole(theta)
-        for group in groups(self.terms):
-            needs_gradient = any(not _is_value_only(term) for term in group)
-            parts = list(self._evaluate(whole, group[0].points, needs_gradient))
-            value, gradient = (torch.cat(part) for part in zip(*parts, strict=True))
-            for term in group:
-                residual = term.residual(value, gradient, term.target).residual
-                yield (residual * _row_scale(term.weight, len(term), residual)).flatten()
+        return torch.cat([rows for group in groups(self.terms) for rows in self._residuals(whole, group)])
 
-    def _evaluate(self, whole: Tensor, points: Tensor, needs_gradient: bool) -> Iterator[tuple[Tensor, Tensor]]:
-        for rows in batches(len(points), 4096):
+    def _residuals(self, whole: Tensor, group: list[Term]) -> Iterator[Tensor]:
+        needs_gradient = any(not _is_value_only(term) for term in group)
+        for rows in self._chunks(group):
+            points = group[0].points[rows]
             if needs_gradient:
-                yield self.field.value_and_gradient(whole, points[rows])
+                value, gradient = self.field.value_and_gradient(whole, points)
             else:
-                yield self.field.value(whole, points[rows]), points[rows]
+                value, gradient = self.field.value(whole, points), points
+            for term in group:
+                linear, scale = _evaluate(term, rows, value, gradient)
+                yield (linear.residual * scale).T.flatten()
 
-    def chunks(self, theta: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield dense Jacobian rows, of shape (m, free), and residuals, of shape (m,), chunk by chunk."""
-        whole = self.whole(theta)
-        per_chunk = max(64, self.chunk_bytes // (len(theta) * theta.element_size()))
-        buffer = theta.new_empty(per_chunk, len(theta))
-        for group in groups(self.terms):
-            for rows in batches(len(group[0].points), per_chunk):
-                yield from self._group_chunk(whole, group, rows, buffer)
+    def linearise(self, theta: Tensor) -> tuple[LayeredJacobian, Tensor]:
+        """Return J, of shape (M, free), and r, of shape (M,), at the free parameters `theta`.
 
-    def _group_chunk(
-        self, whole: Tensor, group: list[Term], rows: slice, buffer: Tensor
-    ) -> Iterator[tuple[Tensor, Tensor]]:
-        points = group[0].points[rows]
-        jet = self.field.jet(whole, points)
-        for term in group:
-            target = None if term.target is None else term.target[rows]
-            linear = term.residual(jet.value, jet.gradient, target)
-            weight = term.weight[rows] if isinstance(term.weight, Tensor) else term.weight
-            scale = _row_scale(weight, len(term), linear.residual)
-            for column in range(linear.residual.shape[1]):
-                block = buffer[: len(points)]
-                self._write(jet.rows(*_column(linear, column, scale)), block)
-                yield block, (linear.residual[:, column : column + 1] * scale)[:, 0]
+        The factors of J's rows are kept where they take at most `keep_bytes`, and made afresh for each product otherwise.
+        """
+        whole = self.whole(theta).to(self.precision or theta.dtype)
+        gathered = groups([term for group in groups(self.terms) for term in _in_precision(group, whole.dtype)])
 
-    def _write(self, layers: list[LayerRows], block: Tensor) -> None:
-        """Write the free columns of the rows into `block`, of shape (m, free parameters)."""
-        offset = 0
-        for layer, units in zip(layers, self.units or [None] * len(layers), strict=True):
-            chosen = layer if units is None else layer.into(units)
-            chosen.write(block[:, offset : offset + chosen.size])
-            offset += chosen.size
+        def blocks() -> Iterable[Block]:
+            return self._blocks(whole, gathered)
+
+        kept = list(blocks()) if self._factor_bytes(whole) <= self.keep_bytes else None
+        residual = self.residual(theta)
+        source = blocks if kept is None else lambda: kept
+        return LayeredJacobian(source, len(residual), self._layer_sizes(), theta.device), residual
+
+    def _blocks(self, whole: Tensor, gathered: list[list[Term]]) -> Iterator[Block]:
+        """Yield the factors of J's rows: for each chunk of points, one block for each residual of each term."""
+        for group in gathered:
+            for rows in self._chunks(group):
+                jet = self.field.jet(whole, group[0].points[rows])
+                for term in group:
+                    linear, scale = _evaluate(term, rows, jet.value, jet.gradient)
+                    for column in range(linear.residual.shape[1]):
+                        yield self._free_rows(jet.rows(*_column(linear, column, scale)))
+
+    def _free_rows(self, layers: list[LayerRows]) -> list[LayerRows]:
+        if self.units is None:
+            return layers
+        return [r if units is None else r.into(units) for r, units in zip(layers, self.units, strict=True)]
+
+    def _layer_sizes(self) -> tuple[int, ...]:
+        chosen = self.units or [None] * len(self.field.layout.shapes)
+        shapes = self.field.layout.shapes
+        return tuple(
+            (out if units is None else len(units)) * (into + 1) for (out, into), units in zip(shapes, chosen, strict=True)
+        )
+
+    def _chunks(self, group: list[Term]) -> Iterator[slice]:
+        """Yield slices of the group's points, of which the activations take at most `CHUNK_BYTES` a layer."""
+        size = max(256, min(CHUNK_POINTS, CHUNK_BYTES // (8 * max(self.field.widths))))
+        return batches(len(group[0].points), size)
+
+    def _factor_bytes(self, whole: Tensor) -> int:
+        """Estimate the memory of all rows' factors: activations and adjoints once, two more arrays for each residual."""
+        width = sum(self.field.layout.sizes)
+        arrays = sum(len(group[0]) * (2 + 3 * len(group)) for group in groups(self.terms))
+        return arrays * width * whole.element_size()
 
 
 def _column(linear: Linearised, column: int, scale: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -117,6 +135,22 @@ def _column(linear: Linearised, column: int, scale: Tensor) -> tuple[Tensor | No
 def _row_scale(weight: float | Tensor, count: int, like: Tensor) -> Tensor:
     """Return sqrt(weight / N) with shape (1, 1) or (N, 1)."""
     return torch.as_tensor(weight, dtype=like.dtype, device=like.device).div(count).sqrt().reshape(-1, 1)
+
+
+def _evaluate(term: Term, rows: slice, value: Tensor, gradient: Tensor) -> tuple[Linearised, Tensor]:
+    """Return a term's residuals at some of its points, linearised, and the scale of their rows."""
+    target = None if term.target is None else term.target[rows]
+    linear = term.residual(value, gradient, target)
+    weight = term.weight[rows] if isinstance(term.weight, Tensor) else term.weight
+    return linear, _row_scale(weight, len(term), linear.residual)
+
+
+def _in_precision(group: list[Term], dtype: torch.dtype) -> list[Term]:
+    """Return the terms of a group with points and targets in `dtype`, the points still one tensor for all of them."""
+    points = group[0].points.to(dtype)
+    return [
+        replace(term, points=points, target=None if term.target is None else term.target.to(dtype)) for term in group
+    ]
 
 
 def _is_value_only(term: Term) -> bool:

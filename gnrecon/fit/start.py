@@ -25,7 +25,8 @@ from gnrecon.field.siren import Siren
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.terms import Term
-from gnrecon.linalg.damped import normal_equations
+from gnrecon.linalg.cholesky import Cholesky
+from gnrecon.linalg.metric import identity
 
 LENGTH = 0.12
 DEGREES_OF_FREEDOM = 4.0
@@ -93,11 +94,11 @@ def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tens
     units = (*(none for _ in field.widths), None)
     problem = FieldProblem(field, terms, theta, units)
     free = problem.free()
-    system = normal_equations(problem.chunks(free), len(free), free)
+    system = Cholesky().linearise(*problem.linearise(free), identity)
     ridge = RIDGE / max(len(term) for term in terms)
     for _ in range(ATTEMPTS):
         step = system.solve(ridge)
-        if step is not None:
+        if step.failure is None:
             return problem.whole(free + step.direction)
         # Features that nearly depend on each other: what rounding takes from the smallest eigenvalue, the ridge gives.
         ridge *= 10

@@ -1,7 +1,7 @@
 """The Gauss-Newton loop: sample, linearise, search, repeat until a stop rule holds.
 
-Each outer step k freezes a problem (its points may be fresh), assembles J^T J and J^T r once, and asks the search for
-a move. In function space the undamped step is the natural-gradient direction of the paper (its section on Gauss-Newton
+Each outer step k freezes a problem (its points may be fresh), hands J and r to the linear solver once, and asks the
+search for a move. In function space the undamped step is the natural-gradient direction of the paper (its section on Gauss-Newton
 in function space); damping and length only decide how far along it to go.
 """
 
@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from gnrecon.linalg.damped import normal_equations
+from gnrecon.linalg.cholesky import Cholesky
+from gnrecon.linalg.system import LinearSolver
 from gnrecon.optim.problem import Problem
 from gnrecon.optim.search import Search
 from gnrecon.optim.solution import Callback, Record, Solution
@@ -30,9 +31,10 @@ class StopRule:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Gauss-Newton with a given search."""
+    """Gauss-Newton with a given search and linear solver."""
 
     search: Search
+    solver: LinearSolver = field(default_factory=Cholesky)
 
     def run(
         self,
@@ -59,7 +61,7 @@ class GaussNewton:
             for number in range(1, stop.steps + 1):
                 problem = problem_at(number, theta)
                 free = problem.free()
-                system = normal_equations(problem.chunks(free), len(free), free, self.search.metric)
+                system = self.solver.linearise(*problem.linearise(free), self.search.metric)
                 if not math.isfinite(system.loss):
                     return Solution(theta, f"The loss was not finite at step {number}.", tuple(history))
                 move = self.search.advance(problem, system, free, damping)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Protocol
 
 from torch import Tensor
+
+from gnrecon.linalg.jacobian import Jacobian
 
 
 class Problem(Protocol):
@@ -26,11 +27,8 @@ class Problem(Protocol):
         """Return r, of shape (M,), weights included."""
         ...
 
-    def chunks(self, free: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield J's rows, of shape (m, k), with their residuals, of shape (m,), until all M are done.
-
-        A chunk may be overwritten by the next one.
-        """
+    def linearise(self, free: Tensor) -> tuple[Jacobian, Tensor]:
+        """Return J, of shape (M, k), as an operator, and r, of shape (M,), weights included."""
         ...
 
 
