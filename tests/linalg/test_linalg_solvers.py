@@ -103,6 +103,24 @@ def test_one_system_serves_many_dampings(solver: str, name: str) -> None:
     assert torch.equal(again.direction, steps[1e-1].direction)
 
 
+@each_solver
+@pytest.mark.parametrize("name", ["tall", "network", "wide_network"])
+@few
+@seeds
+def test_one_system_serves_other_residuals(solver: str, name: str, seed: int) -> None:
+    problem = PROBLEMS[name](seed, F64)
+    if not suits(solver, problem.jacobian, layer_scaled):
+        return
+    D = layer_scaled(problem.jacobian)
+    system = SOLVERS[solver]().linearise(problem.jacobian, problem.r, layer_scaled)
+    first = system.solve(1e-2)
+    other = Problem(problem.jacobian, problem.J, randn(torch.Generator().manual_seed(seed + 1), len(problem.r)))
+    for damping in (1e-2, 1e-1):
+        check(other, system.solve(damping, other.r), D, damping, F64)
+    assert torch.equal(system.solve(1e-2).direction, first.direction)
+    assert system.solve(1e-2, torch.full_like(other.r, math.nan)).failure
+
+
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "row-space"])
 @pytest.mark.parametrize("name", ["tall", "network"])
 def test_without_damping(solver: str, name: str) -> None:
