@@ -1,14 +1,14 @@
 """Levenberg-Marquardt: the damping follows the gain ratio, and the step may bend with the residuals.
 
-*Gain ratio.* The loss's true decrease over the one that the linear model predicts. A step is taken when it improves, and
-the damping follows Nielsen's smooth rule, damping *= max(1/3, 1 - (2 gain - 1)^3), rising by growing factors while
+*Gain ratio.* The loss's true decrease over the one that the linear model predicts. A step is taken when it improves,
+and the damping follows Nielsen's smooth rule, damping *= max(1/3, 1 - (2 gain - 1)^3), rising by growing factors while
 trials fail. Source: Madsen, Nielsen, Tingleff, Methods for Non-linear Least Squares Problems (2004), section 3.2.
 
 *Geodesic acceleration.* Along theta + t s the residuals leave their linear model by t^2 r_ss / 2, their second
 derivative along s. The step that undoes this within the model solves the same system for r_ss in the place of r, and
 half of that solution a is added:  s + a / 2. r_ss comes from one more evaluation,
-2 / h ((r(theta + h s) - r(theta)) / h - J s). A trial with |a|_D > 3/4 |s|_D is refused, because the step is then longer
-than the model can follow. In the long, bent valleys of sine networks this halves the steps (docs/solvers.md).
+2 / h ((r(theta + h s) - r(theta)) / h - J s). A trial with |a|_D > 3/4 |s|_D is refused, because the step is then
+longer than the model can follow. In the long, bent valleys of sine networks this halves the steps (docs/solvers.md).
 Source: Transtrum and Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
 minimization (2012).
 """
@@ -18,11 +18,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from gnrecon.linalg.metric import Metric, jacobian_scaled
 from gnrecon.linalg.system import DampedSystem, Step
-from gnrecon.optim.problem import Problem
+from gnrecon.optim.problem import Problem, loss_of
 from gnrecon.optim.search import Move
 
 PROBE = 0.1
@@ -53,13 +54,12 @@ class GainRatioDamping:
         start, growth, gain, iterations, failure = damping, 2.0, 0.0, 0, None
         for _ in range(self.trials):
             step = system.solve(damping)
-            iterations += step.iterations
+            bend = self._bend(problem, system, free, damping, step)
+            iterations += step.iterations + bend.iterations
             failure = step.failure
-            direction = self._direction(problem, system, free, damping, step)
-            if direction is not None:
-                trial = free + direction
-                residual = problem.residual(trial)
-                loss = 0.5 * float(residual @ residual)
+            if step.predicted > 0.0 and _follows(system.equations.metric, step, bend):
+                trial = free + (step.direction + bend.direction / 2).to(free.dtype)
+                loss = loss_of(problem, trial)
                 gain = (system.loss - loss) / step.predicted
                 if math.isfinite(loss) and gain > 0.0:
                     easing = max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3)
@@ -70,20 +70,21 @@ class GainRatioDamping:
         # Nothing helped here; the next step, with points of its own, begins not much above where this one did.
         return Move(free, system.loss, damping, gain, 0.0, start * 10, iterations, failure)
 
-    def _direction(
-        self, problem: Problem, system: DampedSystem, free: Tensor, damping: float, step: Step
-    ) -> Tensor | None:
-        """Return s, or s + a / 2; None where there is no step or it bends too much."""
-        if not step.predicted > 0.0:
-            return None
-        s, equations = step.direction, system.equations
-        if not self.geodesic:
-            return s.to(free.dtype)
-        there = problem.residual(free + PROBE * s.to(free.dtype)).to(s.dtype)
-        bend = 2 / PROBE * ((there - equations.residual) / PROBE - equations.jacobian.mv(s))
-        a = system.solve(damping, bend).direction
-        # |a|_D > 3/4 |s|_D
-        metric = equations.metric
-        if not float(metric @ a.square()) <= BENT**2 * float(metric @ s.square()):
-            return None
-        return (s + a / 2).to(free.dtype)
+    def _bend(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float, step: Step) -> Step:
+        """Return a, or zero where steps do not bend or there is no step."""
+        s = step.direction
+        if not self.geodesic or not step.predicted > 0.0:
+            return Step(torch.zeros_like(s), 0.0)
+        J, r = system.equations.jacobian, system.equations.residual
+        there = problem.residual(free + PROBE * s.to(free.dtype)).to(r)
+        # r_ss from r(theta + h s) = r + h J s + h^2 r_ss / 2
+        return system.solve(damping, 2 / PROBE * ((there - r) / PROBE - J.mv(s)))
+
+    def describe(self) -> str:
+        """Name the search."""
+        return f"Gauss-Newton with gain-ratio damping{' and geodesic acceleration' if self.geodesic else ''}."
+
+
+def _follows(metric: Tensor, step: Step, bend: Step) -> bool:
+    """Whether |a|_D <= 3/4 |s|_D."""
+    return float(metric @ bend.direction.square()) <= BENT**2 * float(metric @ step.direction.square())

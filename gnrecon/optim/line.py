@@ -1,9 +1,9 @@
 """Lengths along one direction: the paper's log-spaced line search, and a fixed multiple.
 
 The direction has a tiny fixed damping, so that it is the natural gradient of the paper's function space. *Log-spaced*:
-lengths spaced evenly in their logarithm are all tried from the same start, and the best one is taken; nothing is kept of
-a trial that lost. *Fixed*: the same multiple each step, as the paper steps on resampled moving surfaces, where losses of
-different samples do not compare.
+lengths spaced evenly in their logarithm are all tried from the same start, and the best one is taken; nothing is kept
+of a trial that lost. *Fixed*: the same multiple each step, as the paper steps on resampled moving surfaces, where
+losses of different samples do not compare.
 """
 
 from __future__ import annotations
@@ -36,13 +36,17 @@ class LogLineSearch:
             return Move(free, system.loss, damping, 0.0, 0.0, damping * 10, step.iterations, step.failure)
         best = Move(free, system.loss, damping, 0.0, 0.0, self.initial_damping, step.iterations)
         for trial in range(self.trials):
-            length = self.shortest ** (trial / (self.trials - 1))
+            length = self.shortest ** (trial / max(self.trials - 1, 1))
             moved = free + length * step.direction.to(free.dtype)
             loss = loss_of(problem, moved)
             if loss < best.loss:
                 gain = (system.loss - loss) / step.predicted
                 best = Move(moved, loss, damping, gain, length, self.initial_damping, step.iterations)
         return best
+
+    def describe(self) -> str:
+        """Name the search."""
+        return f"Gauss-Newton with a log-spaced line search, {self.trials} lengths."
 
 
 @dataclass(frozen=True)
@@ -62,3 +66,7 @@ class FixedStep:
             return Move(free, system.loss, damping, 0.0, 0.0, damping * 10, step.iterations, step.failure)
         gain = (system.loss - loss) / step.predicted
         return Move(moved, loss, damping, gain, self.length, self.initial_damping, step.iterations)
+
+    def describe(self) -> str:
+        """Name the search."""
+        return f"Gauss-Newton with steps of {self.length:g} times the direction."

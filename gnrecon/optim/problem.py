@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from gnrecon.linalg.jacobian import Jacobian
@@ -32,7 +34,29 @@ class Problem(Protocol):
         ...
 
 
+ProblemAt = Callable[[int, Tensor], Problem]
+"""Gives the frozen problem of an outer step from its number, from 1, and all current parameters, of shape (p,)."""
+
+
 def loss_of(problem: Problem, free: Tensor) -> float:
     """Return |r|^2 / 2."""
     residual = problem.residual(free)
     return 0.5 * float(residual @ residual)
+
+
+def loss_and_gradient(problem: Problem, free: Tensor) -> tuple[float, Tensor]:
+    """Return |r|^2 / 2 and its gradient J^T r, of shape (k,), in the precision of the parameters."""
+    jacobian, residual = problem.linearise(free)
+    gradient = jacobian.tmv(residual.to(jacobian.dtype))
+    return 0.5 * float(residual @ residual), gradient.to(free.dtype)
+
+
+def places_of(problem: Problem) -> Tensor:
+    """Return where in theta the free parameters stand, of shape (k,)."""
+    free = problem.free()
+    # Ones less zeros are one where a parameter is free, and numbers tell the free ones apart.
+    chosen = (problem.whole(torch.ones_like(free)) - problem.whole(torch.zeros_like(free)) == 1.0).nonzero()[:, 0]
+    numbers = torch.arange(len(free), dtype=torch.float64, device=free.device).to(free.dtype)
+    places = torch.empty_like(chosen)
+    places[problem.whole(numbers)[chosen].long()] = chosen
+    return places

@@ -45,3 +45,7 @@ class Search(Protocol):
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
         """Return the move from the free parameters, of shape (k,)."""
         ...
+
+    def describe(self) -> str:
+        """Return what this search does, in a sentence."""
+        ...

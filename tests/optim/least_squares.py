@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.func import jacrev
+from torch.autograd.functional import jacobian
+
+from gnrecon.linalg import DenseJacobian
 
 Formula = Callable[[Tensor], Tensor]
 
@@ -29,10 +31,8 @@ class Plain:
     def residual(self, free: Tensor) -> Tensor:
         return self.formula(self.whole(free))
 
-    def chunks(self, free: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        rows, residual = jacrev(self.residual)(free), self.residual(free)
-        for start in range(0, len(residual), 3):
-            yield rows[start : start + 3], residual[start : start + 3]
+    def linearise(self, free: Tensor) -> tuple[DenseJacobian, Tensor]:
+        return DenseJacobian(jacobian(self.residual, free, vectorize=True), chunk=3), self.residual(free)
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,10 @@ class Case:
     @property
     def theta(self) -> Tensor:
         return torch.tensor(self.start, dtype=torch.float64)
+
+    @property
+    def best(self) -> Tensor:
+        return torch.tensor(self.minimum, dtype=torch.float64)
 
 
 def rosenbrock(theta: Tensor) -> Tensor:

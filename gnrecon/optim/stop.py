@@ -1,0 +1,144 @@
+"""When a run ends, and with which sentence.
+
+After each outer step, in this order:
+
+    idle       `patience` steps in a row each lowered their loss by less than `tolerance` of it
+    held-out   residuals that the fit does not see have not fallen by `tolerance` of their least value for
+               `held_out_patience` steps: the fit has begun to follow noise
+    time       `seconds` have passed
+    limit      `steps` are done
+
+Held-out residuals also decide which parameters are returned, whatever ends the run: those of their least value, the
+start's included. Source: Prechelt, Early stopping - but when? (1998), whose criterion of successive failures this is,
+with a threshold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+
+from torch import Tensor
+
+from gnrecon.optim.solution import Callback, Record, Solution
+
+HeldOut = Callable[[Tensor], float]
+"""Gives the held-out residuals' loss from all parameters, of shape (p,)."""
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """When to stop.
+
+    Parameters
+    ----------
+    steps : stop after so many
+    tolerance : relative decrease of a loss below which a step is idle
+    patience : idle steps in a row after which the run has converged
+    seconds : time after which no further step begins, or None
+    held_out_patience : steps in a row without a decrease of the held-out residuals after which the run ends
+    """
+
+    steps: int = 50
+    tolerance: float = 1e-3
+    patience: int = 3
+    seconds: float | None = None
+    held_out_patience: int = 5
+
+
+@dataclass
+class Best:
+    """The parameters of the least held-out value so far.
+
+    Parameters
+    ----------
+    theta, step, value : of the least value
+    bar : value that the next ones are measured against, the last one that was a decrease by the tolerance
+    idle : steps in a row since then
+    """
+
+    theta: Tensor
+    step: int = 0
+    value: float = math.inf
+    bar: float = math.inf
+    idle: int = 0
+
+    def note(self, theta: Tensor, step: int, value: float, tolerance: float) -> None:
+        """Take note of the value at a step; as long as none was a number, the newest parameters are the best."""
+        if value < self.value or math.isinf(self.value):
+            self.theta, self.step = theta, step
+        if value < self.value:
+            self.value = value
+        falls = value < (1 - tolerance) * self.bar
+        self.bar, self.idle = (value, 0) if falls else (self.bar, self.idle + 1)
+
+
+@dataclass
+class Watch:
+    """A run as it goes on: its history, its parameters after the last finished step, and whether it is to end.
+
+    Parameters
+    ----------
+    theta : starting parameters, of shape (p,)
+    stop : the rules
+    callback : called with each step's record
+    held_out : gives the held-out residuals' loss
+    """
+
+    theta: Tensor
+    stop: StopRule
+    callback: Callback | None = None
+    held_out: HeldOut | None = None
+    history: list[Record] = field(default_factory=list, init=False)
+    idle: int = field(default=0, init=False)
+    best: Best | None = field(default=None, init=False)
+    started: float = field(default_factory=perf_counter, init=False)
+
+    def begin(self) -> None:
+        """Take note of the held-out residuals at the start."""
+        if self.held_out is not None:
+            self.best = Best(self.theta)
+            value = self.held_out(self.theta)
+            self.best.note(self.theta, 0, value, self.stop.tolerance)
+            self.best.idle = 0
+
+    def note(self, theta: Tensor, record: Record, failure: str | None = None) -> str | None:
+        """Take note of a finished step; return why the run ends with it, or None.
+
+        Parameters
+        ----------
+        theta : parameters after the step, of shape (p,)
+        record : of the step; its time and held-out value are filled in here
+        failure : why the linear solver found no step, if it did not
+        """
+        value = None if self.held_out is None else self.held_out(theta)
+        record = replace(record, held_out=value, seconds=perf_counter() - self.started)
+        if self.best is not None and value is not None:
+            self.best.note(theta, record.step, value, self.stop.tolerance)
+        # Not strictly greater, so that a problem without any loss left is idle too.
+        self.idle = self.idle + 1 if record.loss >= (1 - self.stop.tolerance) * record.before else 0
+        self.theta = theta
+        self.history.append(record)
+        if self.callback is not None:
+            self.callback(record)
+        sentence = self._sentence(record)
+        return f"{sentence} {failure}" if sentence and failure else sentence
+
+    def _sentence(self, record: Record) -> str | None:
+        if self.idle >= self.stop.patience:
+            taken = any(past.length > 0 for past in self.history) or record.loss == 0.0
+            return f"Converged after {record.step} steps." if taken else "No step lowered the loss."
+        if self.best is not None and self.best.idle >= self.stop.held_out_patience:
+            return f"The held-out residuals stopped falling at step {self.best.step}."
+        if self.stop.seconds is not None and record.seconds >= self.stop.seconds:
+            return f"Stopped after {record.seconds:.1f} seconds, {record.step} steps."
+        if record.step >= self.stop.steps:
+            return f"Stopped at the limit of {self.stop.steps} steps."
+        return None
+
+    def solution(self, status: str, method: str, interrupted: bool = False) -> Solution:
+        """Return the parameters of the least held-out value, or without one the last, and the history."""
+        theta = self.theta if self.best is None else self.best.theta
+        return Solution(theta, status, tuple(self.history), interrupted, method)
