@@ -1,0 +1,69 @@
+"""A measurement in a Python process of its own, so that its peak memory is its own too.
+
+The two sides meet in a folder: the function's name and arguments go in, what it returns and the peak memory come out.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import gnrecon
+from benchmarks.trial import THREAD_VARIABLES
+from gnrecon.report import peak_memory_mb
+
+
+def run_alone(module: str, function: str, folder: Path, **arguments: Any) -> dict[str, Any]:
+    """Call a function with plain arguments, and `folder` as a string, in a new process; return its plain figures.
+
+    Added to them are peak memory, `peak_memory_mb`, and what of it the libraries took, `libraries_memory_mb`. A failure
+    is a result too: the sentence under ``"error"`` then takes the figures' place.
+    """
+    folder.mkdir(parents=True)
+    job = {"module": module, "function": function, "arguments": arguments}
+    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+    here = [Path(__file__).resolve().parents[2], Path(str(gnrecon.__file__)).parents[1]]
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(torch.get_num_threads()))
+    environment["PYTHONPATH"] = os.pathsep.join(map(str, here))
+    command = [sys.executable, "-m", "benchmarks.engine.process", str(folder)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        last = done.stderr.strip().splitlines()[-1:]
+        # What was killed (for want of memory, say) has said nothing about it.
+        said = last[0] if last and done.returncode > 0 else f"The process ended with status {done.returncode}."
+        return {"error": said}
+    figures: dict[str, Any] = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
+    return figures
+
+
+def own_peak_mb() -> float:
+    """Return this program's greatest resident memory so far, in MB."""
+    status = Path("/proc/self/status")
+    # On Linux `getrusage` counts the process that started this one too, as it was then; VmHWM does not.
+    if status.is_file():
+        lines = status.read_text(encoding="utf-8").splitlines()
+        return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:"))
+    return peak_memory_mb()
+
+
+def main(folder: Path) -> None:
+    """Do the job in `folder`, leaving figures.json there."""
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    call = getattr(import_module(job["module"]), job["function"])
+    before = own_peak_mb()
+    figures = call(folder=str(folder), **job["arguments"])
+    memory = {"peak_memory_mb": own_peak_mb(), "libraries_memory_mb": before}
+    if torch.cuda.is_available():
+        memory["peak_device_memory_mb"] = torch.cuda.max_memory_allocated() / 1e6
+    (folder / "figures.json").write_text(json.dumps(figures | memory), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
