@@ -102,7 +102,6 @@ class Watch:
             self.best = Best(self.theta)
             value = self.held_out(self.theta)
             self.best.note(self.theta, 0, value, self.stop.tolerance)
-            self.best.idle = 0
 
     def note(self, theta: Tensor, record: Record, failure: str | None = None) -> str | None:
         """Take note of a finished step; return why the run ends with it, or None.

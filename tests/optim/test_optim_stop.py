@@ -7,7 +7,7 @@ import time
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -149,6 +149,7 @@ def test_held_out_values_that_are_no_numbers_never_win() -> None:
     assert torch.equal(watch.solution("", "").theta, at(3)), "without any number the last parameters are returned"
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.floats(0.01, 100.0), min_size=2, max_size=30),
     st.integers(1, 6),
