@@ -43,7 +43,7 @@ GOAL = Goal("rockerarm-100", 1e-2, 1e-3)
 SMALL = partial(
     Plan,
     kernel=kernel.Setting((8, 8), points=30, volume=20),
-    million=million.Setting((8, 8), points=60, volume=20, iterations=5, keep_bytes=0),
+    million=million.Setting((8, 8), points=60, volume=20, damping=10.0, keep_bytes=0),
     points=(100, 300),
     parameters=(100, 300),
     matmul=64,
@@ -197,7 +197,7 @@ def test_both_kernel_forms_make_the_same_step() -> None:
 
 def test_the_large_step_lowers_the_loss_in_memory_of_its_own(tmp_path: Path) -> None:
     held = np.ones(60_000_000)
-    setting = million.Setting((8, 8), points=60, volume=20, iterations=5, keep_bytes=0)
+    setting = million.Setting((8, 8), points=60, volume=20, damping=10.0, keep_bytes=0)
     result = million.measure_million(setting, tmp_path)
     assert result["losses"][1] < result["losses"][0]
     assert result["rows"] == 140

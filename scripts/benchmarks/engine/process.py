@@ -16,7 +16,6 @@ from typing import Any
 import torch
 
 import gnrecon
-from benchmarks.trial import THREAD_VARIABLES
 from gnrecon.report import peak_memory_mb
 
 
@@ -26,6 +25,9 @@ def run_alone(module: str, function: str, folder: Path, **arguments: Any) -> dic
     Added to them are peak memory, `peak_memory_mb`, and what of it the libraries took, `libraries_memory_mb`. A failure
     is a result too: the sentence under ``"error"`` then takes the figures' place.
     """
+    # Here, so that the new process does not carry its libraries.
+    from benchmarks.trial import THREAD_VARIABLES
+
     folder.mkdir(parents=True)
     job = {"module": module, "function": function, "arguments": arguments}
     (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
