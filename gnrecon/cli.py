@@ -59,7 +59,8 @@ Widths = Annotated[
 Steps = Annotated[
     int | None,
     typer.Option(
-        help="Gauss-Newton steps after the start; by default 4 (0 below 1,000 points; 120 for several layers).",
+        help="Steps after the start; by default, of gn, 4 (0 below 1,000 points; 120 for several layers), of adam "
+        "2,000, of lbfgs 40.",
         rich_help_panel=FIT,
     ),
 ]
@@ -67,10 +68,28 @@ NormalResidual = Annotated[
     str,
     typer.Option(help="Residual of the normals: vector, projection or cosine.", rich_help_panel=FIT),
 ]
+Optimiser = Annotated[
+    str,
+    typer.Option(
+        help="gn (Gauss-Newton), or what the paper compares it with: adam (cosine schedule) or lbfgs.",
+        rich_help_panel=FIT,
+    ),
+]
+Solver = Annotated[
+    str,
+    typer.Option(
+        help="Linear solver of Gauss-Newton's steps: auto (by rows, parameters, memory and device), cholesky, qr, "
+        "row-space, cg-sampled, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, minres, gmres or sketched.",
+        rich_help_panel=FIT,
+    ),
+]
 SearchOption = Annotated[
     str,
     typer.Option(
-        "--search", help="Step control: damping (gain ratio), line (log-spaced) or auto.", rich_help_panel=FIT
+        "--search",
+        help="Step control of Gauss-Newton: damping (gain ratio), geodesic (the same, with steps that bend), line "
+        "(log-spaced lengths) or auto.",
+        rich_help_panel=FIT,
     ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", rich_help_panel=FIT)]
@@ -101,6 +120,8 @@ def reconstruct_command(
     widths: Widths = None,
     steps: Steps = None,
     normal_residual: NormalResidual = "vector",
+    optimiser: Optimiser = "gn",
+    solver: Solver = "auto",
     search: SearchOption = "auto",
     seed: Seed = 0,
     device: Device = "cpu",
@@ -130,6 +151,8 @@ def reconstruct_command(
         "widths": None if widths is None else parse_widths(widths),
         "steps": steps,
         "normal_residual": normal_residual,
+        "optimiser": optimiser,
+        "solver": solver,
         "search": search,
         "seed": seed,
         "device": device,
@@ -155,6 +178,8 @@ def batch_command(
     widths: Widths = None,
     steps: Steps = None,
     normal_residual: NormalResidual = "vector",
+    optimiser: Optimiser = "gn",
+    solver: Solver = "auto",
     search: SearchOption = "auto",
     seed: Seed = 0,
     device: Device = "cpu",
@@ -175,6 +200,8 @@ def batch_command(
         "--widths": widths,
         "--steps": steps,
         "--normal-residual": normal_residual,
+        "--optimiser": optimiser,
+        "--solver": solver,
         "--search": search,
         "--seed": seed,
         "--device": device,

@@ -25,7 +25,7 @@ class Options:
         Whether scattered points are removed; ``"auto"`` leaves them when they are more than 5 % of all.
     resolution : int
         Cells of the extraction along the longest side of the shape's box.
-    widths, steps, normal_residual, search, seed, device
+    widths, steps, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
         CPU threads of the fit; by default what torch chooses.
@@ -44,6 +44,8 @@ class Options:
     widths: tuple[int, ...] | None = None
     steps: int | None = None
     normal_residual: str = FitOptions.normals
+    optimiser: str = FitOptions.optimiser
+    solver: str = FitOptions.solver
     search: str = FitOptions.search
     seed: int = 0
     device: str = "cpu"
@@ -86,6 +88,8 @@ class Options:
             widths=None if self.widths is None else tuple(self.widths),
             steps=self.steps,
             normals=self.normal_residual,
+            optimiser=self.optimiser,
+            solver=self.solver,
             search=self.search,
             seed=self.seed,
             device=self.device,

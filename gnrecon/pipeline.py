@@ -245,6 +245,7 @@ def _report(
         "frame": {"center": sdf.frame.center.tolist(), "scale": sdf.frame.scale},
         "fit": {
             "status": solution.status,
+            "method": solution.method,
             "interrupted": solution.interrupted,
             "parameters": len(sdf.theta),
             "history": [vars(record) for record in solution.history],

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gnrecon.errors import UsageError
+from gnrecon.linalg import SOLVERS
 from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
 
 NORMAL_RESIDUALS: dict[str, Residual] = {
@@ -16,7 +17,9 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
 WIDE_STEPS, DEEP_STEPS, LEAST_POINTS_TO_REFINE = 4, 120, 1000
 UNITS_PER_POINT, LEAST_UNITS = 3, 1000
 POINTS_PER_UNIT, SPARSE_UNITS, DENSE_UNITS = 4, 2000, 3000
-SEARCHES = ("auto", "damping", "line")
+SEARCHES = ("auto", "damping", "geodesic", "line")
+OPTIMISERS = {"gn": "Gauss-Newton", "adam": "Adam", "lbfgs": "L-BFGS"}
+BASELINE_STEPS = {"adam": 2000, "lbfgs": 40}
 
 
 @dataclass(frozen=True)
@@ -30,13 +33,18 @@ class FitOptions:
         points from there to 3,000. One wide layer starts from random sine features and an exact linear solve; several
         layers start smooth, as in the paper.
     steps : int, optional
-        Gauss-Newton steps after the start; by default 4 for one wide layer and 1,000 points or more, none
-        for fewer points, 120 for several layers.
+        Steps after the start; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or more, none for
+        fewer points, 120 for several layers; 2,000 of Adam, and 40 of L-BFGS, each of 20 iterations.
     normals : ``"vector"``, ``"projection"`` or ``"cosine"``
         Residual of the given normals, see `gnrecon.residuals.first_order`.
-    search : ``"auto"``, ``"damping"`` or ``"line"``
-        Gain-ratio damping, or the paper's log-spaced line search with tiny damping; by default the one that suits the
-        network's start.
+    optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
+        Gauss-Newton, or one of the methods that the paper compares with.
+    solver : str
+        Linear solver of Gauss-Newton's steps, a name of `gnrecon.linalg.SOLVERS`; ``"auto"`` picks by rows,
+        parameters, memory and device.
+    search : ``"auto"``, ``"damping"``, ``"geodesic"`` or ``"line"``
+        Step control of Gauss-Newton: gain-ratio damping, the same with geodesic acceleration, or the paper's log-spaced
+        line search with tiny damping; by default the one that suits the network's start.
     seed : int
         Seeds features and samples.
     device : str
@@ -51,6 +59,8 @@ class FitOptions:
     widths: tuple[int, ...] | None = None
     steps: int | None = None
     normals: str = "vector"
+    optimiser: str = "gn"
+    solver: str = "auto"
     search: str = "auto"
     seed: int = 0
     device: str = "cpu"
@@ -62,17 +72,22 @@ class FitOptions:
             raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
         if self.normals not in NORMAL_RESIDUALS:
             raise UsageError(f"The normal residual must be one of {', '.join(NORMAL_RESIDUALS)}, not {self.normals!r}.")
+        for name, known in (("optimiser", OPTIMISERS), ("solver", SOLVERS)):
+            if getattr(self, name) not in known:
+                raise UsageError(f"The {name} must be one of {', '.join(known)}, not {getattr(self, name)!r}.")
         if self.search not in SEARCHES:
             raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
 
     def steps_for(self, points: int) -> int:
-        """Return the most Gauss-Newton steps after the start, for a number of points.
+        """Return the most steps after the start, for a number of points.
 
         Below 1,000 points frequencies that follow the data fit it better and what lies between it worse (measured, see
         docs/accuracy.md), so that by default the exact linear solve is left as it is.
         """
         if self.steps is not None:
             return self.steps
+        if self.optimiser in BASELINE_STEPS:
+            return BASELINE_STEPS[self.optimiser]
         if len(self.widths_for(points)) > 1:
             return DEEP_STEPS
         return WIDE_STEPS if points >= LEAST_POINTS_TO_REFINE else 0

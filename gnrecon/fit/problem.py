@@ -1,8 +1,8 @@
 """A field's residuals under a list of terms, as the least-squares problem that the optimisers solve.
 
 Row i of a term with weight w and N points is sqrt(w / N) r_i, so that |r|^2 / 2 is the paper's loss (its equations for
-the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is an operator made of the factors of its
-rows (`linalg.jacobian`); it is never held whole.
+the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is an operator made of the factors
+of its rows (`linalg.jacobian`); it is never held whole.
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ class FieldProblem:
     def linearise(self, theta: Tensor) -> tuple[LayeredJacobian, Tensor]:
         """Return J, of shape (M, free), and r, of shape (M,), at the free parameters `theta`.
 
-        The factors of J's rows are kept where they take at most `keep_bytes`, and made afresh for each product otherwise.
+        The factors of J's rows are kept where they take at most `keep_bytes`, and made afresh for each
+        product otherwise.
         """
         whole = self.whole(theta).to(self.precision or theta.dtype)
         gathered = groups([term for group in groups(self.terms) for term in _in_precision(group, whole.dtype)])
@@ -110,7 +111,8 @@ class FieldProblem:
         chosen = self.units or [None] * len(self.field.layout.shapes)
         shapes = self.field.layout.shapes
         return tuple(
-            (out if units is None else len(units)) * (into + 1) for (out, into), units in zip(shapes, chosen, strict=True)
+            (out if units is None else len(units)) * (into + 1)
+            for (out, into), units in zip(shapes, chosen, strict=True)
         )
 
     def _chunks(self, group: list[Term]) -> Iterator[slice]:
@@ -119,7 +121,7 @@ class FieldProblem:
         return batches(len(group[0].points), size)
 
     def _factor_bytes(self, whole: Tensor) -> int:
-        """Estimate the memory of all rows' factors: activations and adjoints once, two more arrays for each residual."""
+        """Estimate the memory of all factors: activations and adjoints once, and up to three arrays a residual."""
         width = sum(self.field.layout.sizes)
         arrays = sum(len(group[0]) * (2 + 3 * len(group)) for group in groups(self.terms))
         return arrays * width * whole.element_size()

@@ -8,8 +8,9 @@ kernel interpolation with Hermite data.
 Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
 Where the solution's sign disagrees with the coarse distance ("ghosts"), samples are added and the solve is repeated.
 
-*Smooth.* Deeper networks start from small weights and the same solve of their last layer on the coarse distance alone,
-so that Gauss-Newton finds a smooth field in which undamped directions are good ones.
+*Spectral.* Deeper networks begin with normal frequencies of standard deviation OMEGA in the first layer, hidden weights
+that keep the variance of sines (Sitzmann et al. 2020, theorem 1.8), uniform phases, and one exact solve of the last
+layer, with a ridge that keeps its weights small: from large weights every direction of Gauss-Newton is a bad one.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ DEGREES_OF_FREEDOM = 4.0
 RIDGE = 1e-8
 ROUNDS = 3
 ATTEMPTS = 6
+
+OMEGA = 4.0
+SPECTRAL_RIDGE, SPECTRAL_SAMPLES = 1e-4, 4000
 
 SEARCH_POINTS, FINAL_POINTS = 5000, 20000
 """Most data points of the rounds that look for ghosts, and of the last round."""
@@ -74,16 +78,40 @@ def wide_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Gen
     return theta
 
 
-def smooth_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator) -> Tensor:
-    """Return parameters, of shape (p,), of a smooth network whose last layer fits the coarse distance."""
-    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-    theta = field.initial(generator).to(scene.points)
-    x, distance = scene.volume(scene.volume_count, rng)
-    return solve_last_layer(field, terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS), theta)
+def spectral_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator) -> Tensor:
+    """Return parameters, of shape (p,), of a network of several layers whose last one solves `terms_of` the volume.
+
+    Raises
+    ------
+    FitError
+        When the linear system cannot be solved.
+    """
+    theta = random_network(field, rng, scene.points)
+    x, distance = scene.volume(SPECTRAL_SAMPLES, rng)
+    terms = terms_of(scene.tensor(x), scene.tensor(distance), SPECTRAL_SAMPLES)
+    total = sum(float(torch.as_tensor(term.weight).mean()) for term in terms)
+    return solve_last_layer(field, terms, theta, SPECTRAL_RIDGE * total)
 
 
-def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tensor:
+def random_network(field: Siren, rng: np.random.Generator, like: Tensor) -> Tensor:
+    """Return random sine layers, of shape (p,), with a last layer of zeros."""
+    layers = []
+    for number, (out, into) in enumerate(field.layout.shapes):
+        if number == 0:
+            weights, bias = OMEGA * rng.standard_normal((out, into)), rng.uniform(0.0, 2 * np.pi, out)
+        elif number == len(field.widths):
+            weights, bias = np.zeros((out, into)), np.zeros(out)
+        else:
+            bound = np.sqrt(6.0 / into)
+            weights, bias = rng.uniform(-bound, bound, (out, into)), rng.uniform(-np.pi, np.pi, out)
+        layers.append((torch.as_tensor(weights).to(like), torch.as_tensor(bias).to(like)))
+    return field.layout.flatten(layers)
+
+
+def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor, ridge: float | None = None) -> Tensor:
     """Return theta, of shape (p,), with its last layer solved by least squares; exact for terms linear in f.
+
+    The ridge damps the change of the last layer, by default as little as rounding allows.
 
     Raises
     ------
@@ -95,7 +123,7 @@ def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tens
     problem = FieldProblem(field, terms, theta, units)
     free = problem.free()
     system = Cholesky().linearise(*problem.linearise(free), identity)
-    ridge = RIDGE / max(len(term) for term in terms)
+    ridge = RIDGE / max(len(term) for term in terms) if ridge is None else ridge
     for _ in range(ATTEMPTS):
         step = system.solve(ridge)
         if step.failure is None:

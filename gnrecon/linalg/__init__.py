@@ -19,21 +19,24 @@ from gnrecon.linalg.rows import LayerRows
 from gnrecon.linalg.sampled_gram import SampledGram, Sketch
 from gnrecon.linalg.system import DampedSystem, LinearSolver, Step
 
-SOLVERS: dict[str, Callable[[], LinearSolver]] = {
-    "auto": Auto,
-    "cholesky": Cholesky,
-    "qr": QR,
-    "row-space": RowSpace,
-    "cg-jacobi": lambda: Iterative("cg", Jacobi()),
-    "cg-block-jacobi": lambda: Iterative("cg", BlockJacobi()),
-    "cg-nystrom": lambda: Iterative("cg", Nystrom(100)),
-    "cg-sampled": lambda: Iterative("cg", SampledGram(4000)),
-    "cg-kronecker": lambda: Iterative("cg", Kronecker()),
-    "minres": lambda: Iterative("minres", Jacobi()),
-    "gmres": lambda: Iterative("gmres", Jacobi()),
-    "sketched": lambda: Iterative("cg", Sketch()),
+SOLVERS: dict[str, Callable[..., LinearSolver]] = {
+    "auto": lambda energy=0.0: Auto(energy),
+    "cholesky": lambda energy=0.0: Cholesky(),  # noqa: ARG005 (one signature for all)
+    "qr": lambda energy=0.0: QR(),  # noqa: ARG005
+    "row-space": lambda energy=0.0: RowSpace(),  # noqa: ARG005
+    "cg-jacobi": lambda energy=0.0: Iterative("cg", Jacobi(), energy=energy),
+    "cg-block-jacobi": lambda energy=0.0: Iterative("cg", BlockJacobi(), energy=energy),
+    "cg-nystrom": lambda energy=0.0: Iterative("cg", Nystrom(100), energy=energy),
+    "cg-sampled": lambda energy=0.0: Iterative("cg", SampledGram(4000), energy=energy),
+    "cg-kronecker": lambda energy=0.0: Iterative("cg", Kronecker(), energy=energy),
+    "minres": lambda energy=0.0: Iterative("minres", Jacobi()),  # noqa: ARG005
+    "gmres": lambda energy=0.0: Iterative("gmres", Jacobi()),  # noqa: ARG005
+    "sketched": lambda energy=0.0: Iterative("cg", Sketch(), energy=energy),
 }
-"""Makes each solver by its name; "cg-kronecker" needs a `LayeredJacobian`."""
+"""Makes each solver by its name.
+
+`energy` is where conjugate gradients stop, see `Iterative`; "cg-kronecker" needs a `LayeredJacobian`.
+"""
 
 __all__ = [
     "QR",

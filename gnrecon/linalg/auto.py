@@ -5,13 +5,13 @@ product:
 
     Cholesky      M p^2 + p^3 / 3                          p^2 numbers, twice
     row space     M^2 w + M^3 / 3                          M^2 numbers, twice; where M <= 0.8 p, D constant on groups
-    sampled       m p^2 / 2 + p^3 / 3 + 20 * 8 M p         p^2 numbers, twice; where m < M, with m = max(2 p, 4000)
+    sampled       m p^2 / 2 + p^3 / 3 + 10 * 8 M p         p^2 numbers, twice; where m < M, with m = max(2 p, 4000)
     by layers     2 * 200 * 8 M p                          little
 
 The first two are exact. w is what one entry of the kernel J J^T costs: 4 (in + out) for each layer, p for a dense J.
 The product of the sampled rows counts half, because it serves for more than one step. An iteration of conjugate
-gradients takes 2 M p, in products so thin that they run at a quarter of the rate; with a sampled Gram matrix about 20
-are needed (measured: 5 to 20, and more when the preconditioner is an old one), with Kronecker factors of the layers,
+gradients takes 2 M p, in products so thin that they run at a quarter of the rate; with a sampled Gram matrix about 10
+are needed (measured: 2 to 5, and more when the preconditioner is an old one), with Kronecker factors of the layers,
 or the diagonal where there are no layers, often all 200, which count twice because such a step is only approximate.
 The least work wins among those that fit the memory; the last one always does.
 """
@@ -37,7 +37,7 @@ from gnrecon.linalg.system import DampedSystem, LinearSolver
 
 FEWER = 0.8
 THIN = 8
-ITERATIONS_SAMPLED = 20
+ITERATIONS_SAMPLED = 10
 ITERATIONS_LAYERS = 200
 APPROXIMATE = 2
 SIMILAR = 1.25
@@ -68,9 +68,11 @@ class Auto:
 
     Parameters
     ----------
+    energy : at which conjugate gradients stop, see `Iterative`
     memory_bytes : what matrices may take; by default half of a GPU's memory, or a quarter of the machine's
     """
 
+    energy: float = 0.0
     memory_bytes: int | None = None
     choice: Choice | None = field(default=None, init=False, repr=False)
 
@@ -80,7 +82,7 @@ class Auto:
         constant = constant_on_groups(D, jacobian)
         if self.choice is None or not self.choice.serves(jacobian, constant):
             memory = _memory(jacobian.device) if self.memory_bytes is None else self.memory_bytes
-            self.choice = choose(jacobian, constant, memory)
+            self.choice = choose(jacobian, constant, memory, self.energy)
         return self.choice.solver.linearise(jacobian, residual, lambda _: D)
 
     def describe(self) -> str:
@@ -88,7 +90,7 @@ class Auto:
         return "The solver with the least estimated work." if self.choice is None else self.choice.why
 
 
-def choose(jacobian: Jacobian, constant: bool, memory: int) -> Choice:
+def choose(jacobian: Jacobian, constant: bool, memory: int, energy: float = 0.0) -> Choice:
     """Return the solver with the least work that fits `memory`, in bytes, given whether D is constant on each group."""
     M, p = jacobian.rows, max(jacobian.columns, 1)
     # Entries of the largest matrix that may be held twice
@@ -108,9 +110,15 @@ def choose(jacobian: Jacobian, constant: bool, memory: int) -> Choice:
             f"and there are {M / p:.1f} rows for each."
         )
         work = m * p**2 / 2 + p**3 / 3 + ITERATIONS_SAMPLED * iteration
-        offers.append((work, Iterative("cg", SampledGram(m)), why))
+        offers.append((work, Iterative("cg", SampledGram(m), energy=energy), why))
     why = f"CG with {last.describe()}: {p:,} parameters and {M:,} rows are too many for a factorisation."
-    offers.append((APPROXIMATE * ITERATIONS_LAYERS * iteration, Iterative("cg", last, limit=ITERATIONS_LAYERS), why))
+    offers.append(
+        (
+            APPROXIMATE * ITERATIONS_LAYERS * iteration,
+            Iterative("cg", last, energy=energy, limit=ITERATIONS_LAYERS),
+            why,
+        )
+    )
     _, solver, why = min(offers, key=lambda offer: offer[0])
     return Choice(solver, why, M, jacobian.columns, constant)
 

@@ -2,7 +2,8 @@
 
 A step solves  v -> J^T (J v) + damping D v = -g, at O(M p) an iteration. What an iteration needs no setting up for,
 its preconditioner does, and Gauss-Newton's matrices change little from one step to the next: a preconditioner that
-was set up for one linearisation is used for later ones as long as it serves, which shows in the number of iterations.
+was set up for one linearisation is used for later ones as long as it serves. It serves no longer when a solve takes
+`patience` iterations more than its first one did; that solve is then begun again with a new one.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from gnrecon.linalg.minres import minres
 from gnrecon.linalg.preconditioner import Jacobi, Preconditioner, Prepared
 from gnrecon.linalg.system import Equations, Linearisation, Step
 
-METHODS = {"cg": conjugate_gradients, "minres": minres, "gmres": gmres}
+METHODS = {"minres": minres, "gmres": gmres}
 NAMES = {"cg": "Conjugate gradients", "minres": "MINRES", "gmres": "GMRES"}
+TOLERANCE = 1e-6
 NO_DESCENT = "The iterations ended before they found a step that lowers the loss."
 
 
@@ -33,15 +35,15 @@ class Kept:
     Parameters
     ----------
     prepared : it
+    of : the Jacobian that it was set up from
     like : a gradient of its time, for the number, precision and device of the columns
     first : iterations of the first solve with it, or None before that
-    stale : whether it is to be made anew for the next linearisation
     """
 
     prepared: Prepared
+    of: Jacobian
     like: Tensor
     first: int | None = None
-    stale: bool = False
     last: tuple[float, Apply] | None = None
 
     def at(self, damping: float) -> Apply:
@@ -55,37 +57,41 @@ class Kept:
         like = self.like
         return (like.shape, like.dtype, like.device) == (gradient.shape, gradient.dtype, gradient.device)
 
-    def note(self, result: KrylovResult, patience: int) -> None:
-        """Judge it by a solve."""
-        self.first = result.iterations if self.first is None else self.first
-        self.stale = not result.converged or result.iterations > self.first + patience
-
 
 @dataclass(frozen=True)
 class IterativeSystem(Linearisation):
-    """J, never multiplied out, and a preconditioner (None where there is nothing to solve)."""
+    """J, never multiplied out, and a preconditioner, of which there is none where there is nothing to solve."""
 
     solver: Iterative
-    kept: Kept | None
+    kept: list[Kept]
 
     def solve(self, damping: float, residual: Tensor | None = None) -> Step:
         """Return the step as far as the tolerance or the limit of iterations lets it come."""
         equations = self.equations.at(residual)
         obstacle = equations.obstacle(damping)
-        if obstacle or self.kept is None:
+        if obstacle or not self.kept:
             return equations.failed(obstacle or NO_DESCENT)
+        spent, old = 0, self.kept[0]
+        if old.of is not equations.jacobian:
+            result = self._iterate(equations, damping, old, self.solver.patience + (old.first or 0))
+            if result.converged:
+                return equations.step(result.solution, damping, result.rest, result.iterations)
+            spent, self.kept[0] = result.iterations, self.solver.renew(self.equations)
+        result = self._iterate(equations, damping, self.kept[0], self.solver.limit)
+        if self.kept[0].first is None:
+            self.kept[0].first = result.iterations
+        spent += result.iterations
+        if not result.converged and not float(result.solution @ equations.gradient) < 0.0:
+            return equations.failed(result.failure or NO_DESCENT, spent)
+        return equations.step(result.solution, damping, result.rest, spent)
+
+    def _iterate(self, equations: Equations, damping: float, kept: Kept, limit: int) -> KrylovResult:
         jacobian, diagonal = equations.jacobian, damping * equations.metric
 
         def apply(v: Tensor) -> Tensor:
             return jacobian.tmv(jacobian.mv(v)).addcmul_(diagonal, v)
 
-        method = METHODS[self.solver.method]
-        result = method(apply, -equations.gradient, self.kept.at(damping), self.solver.tolerance, self.solver.limit)
-        if residual is None:
-            self.kept.note(result, self.solver.patience)
-        if not result.converged and not float(result.solution @ equations.gradient) < 0.0:
-            return equations.failed(result.failure or NO_DESCENT, result.iterations)
-        return equations.step(result.solution, damping, result.rest, result.iterations)
+        return self.solver.iterate(apply, -equations.gradient, kept.at(damping), min(limit, self.solver.limit))
 
 
 @dataclass
@@ -97,18 +103,21 @@ class Iterative:
     method : "cg", "minres" or "gmres"
     preconditioner : how J^T J is approximated
     tolerance : |rest| / |g| at which a solve is done
+    energy : conjugate gradients also stop at this relative error of the step in the norm of the damped matrix, as the
+        preconditioner measures it; 0.1 serves Gauss-Newton, whose model is no more exact than that
     limit : iterations after which it ends all the same
     reuse : whether a preconditioner serves more than one linearisation
-    patience : iterations more than its first solve took after which it is made anew
+    patience : iterations more than its first solve took after which an older one is made anew
     seed : of the preconditioners' chance
     """
 
     method: Literal["cg", "minres", "gmres"] = "cg"
     preconditioner: Preconditioner = field(default_factory=Jacobi)
-    tolerance: float = 1e-6
+    tolerance: float = TOLERANCE
+    energy: float = 0.0
     limit: int = 200
     reuse: bool = True
-    patience: int = 10
+    patience: int = 8
     seed: int = 0
     kept: Kept | None = field(default=None, init=False, repr=False)
     generator: torch.Generator = field(init=False, repr=False)
@@ -121,12 +130,23 @@ class Iterative:
         equations = Equations.of(jacobian, residual, metric)
         # What cannot be solved with a damping that stands for all, cannot be with any.
         if equations.obstacle(1.0):
-            return IterativeSystem(equations, self, None)
+            return IterativeSystem(equations, self, [])
         kept = self.kept
-        if kept is None or not self.reuse or kept.stale or not kept.fits(equations.gradient):
-            prepared = self.preconditioner.prepare(jacobian, equations.metric, self.generator)
-            kept = self.kept = Kept(prepared, equations.gradient)
-        return IterativeSystem(equations, self, kept)
+        if kept is None or not self.reuse or not kept.fits(equations.gradient):
+            kept = self.renew(equations)
+        return IterativeSystem(equations, self, [kept])
+
+    def renew(self, equations: Equations) -> Kept:
+        """Set up the preconditioner from a linearisation."""
+        prepared = self.preconditioner.prepare(equations.jacobian, equations.metric, self.generator)
+        self.kept = Kept(prepared, equations.jacobian, equations.gradient)
+        return self.kept
+
+    def iterate(self, apply: Apply, right: Tensor, precondition: Apply, limit: int) -> KrylovResult:
+        """Run the method on  apply(s) = right."""
+        if self.method == "cg":
+            return conjugate_gradients(apply, right, precondition, self.tolerance, limit, self.energy)
+        return METHODS[self.method](apply, right, precondition, self.tolerance, limit)
 
     def describe(self) -> str:
         """Name the method and the preconditioner."""

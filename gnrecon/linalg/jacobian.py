@@ -84,6 +84,10 @@ class Jacobian(Protocol):
         """Return the diagonal of J^T J, of shape (p,)."""
         ...
 
+    def row_squares(self) -> Tensor:
+        """Return the squared lengths of the rows, of shape (M,)."""
+        ...
+
     def sample(self, rows: Tensor) -> Jacobian:
         """Return the Jacobian of the given rows, of shape (m,), in ascending order."""
         ...
@@ -153,6 +157,10 @@ class DenseJacobian:
     def diagonal(self) -> Tensor:
         """Return the diagonal of J^T J, of shape (p,)."""
         return self.matrix.square().sum(0)
+
+    def row_squares(self) -> Tensor:
+        """Return the squared lengths of the rows, of shape (M,)."""
+        return self.matrix.square().sum(1)
 
     def sample(self, rows: Tensor) -> DenseJacobian:
         """Return the Jacobian of the given rows."""
@@ -274,6 +282,16 @@ class LayeredJacobian:
         for block in self.blocks():
             for layer, group in zip(block, self.groups, strict=True):
                 squares[group] += layer.squares()
+        return squares
+
+    def row_squares(self) -> Tensor:
+        """Return the squared lengths of the rows, of shape (M,)."""
+        squares, start = self._zeros(self.rows), 0
+        for block in self.blocks():
+            stop = start + len(block[0])
+            for layer in block:
+                squares[start:stop] += layer.row_squares()
+            start = stop
         return squares
 
     def sample(self, rows: Tensor) -> LayeredJacobian:

@@ -36,7 +36,7 @@ class KrylovResult:
     solution : x, the last good iterate, of shape (p,); usable whether or not it converged
     rest : b - A x as the recurrences have it, of shape (p,)
     iterations : products with A
-    converged : whether |rest| <= tolerance |b|
+    converged : whether the stopping rule holds
     failure : what broke the iteration off, or None; reaching the limit is no failure
     """
 
@@ -47,14 +47,21 @@ class KrylovResult:
     failure: str | None = None
 
 
-def conjugate_gradients(apply: Apply, b: Tensor, precondition: Apply, tolerance: float, limit: int) -> KrylovResult:
-    """Solve A x = b, for b of shape (p,), in at most `limit` products."""
+def conjugate_gradients(
+    apply: Apply, b: Tensor, precondition: Apply, tolerance: float, limit: int, energy: float = 0.0
+) -> KrylovResult:
+    """Solve A x = b, for b of shape (p,), in at most `limit` products.
+
+    With P near A, r.P^-1 r is near |x - A^-1 b|_A^2, the error as a quadratic model feels it; `energy` is the share of
+    its first root at which the iteration stops as well.
+    """
     target = tolerance * norm(b)
     if not norm(b) > 0.0:
         return unmoved(b)
     x, r = torch.zeros_like(b), b.clone()
     z = precondition(r)
     p, rz = z.clone(), float(r @ z)
+    least = energy**2 * rz
     for count in range(1, limit + 1):
         if not 0.0 < rz < math.inf:
             return KrylovResult(x, r, count - 1, False, BAD_PRECONDITIONER)
@@ -68,6 +75,8 @@ def conjugate_gradients(apply: Apply, b: Tensor, precondition: Apply, tolerance:
             return KrylovResult(x, r, count, True)
         z, before = precondition(r), rz
         rz = float(r @ z)
+        if 0.0 <= rz <= least:
+            return KrylovResult(x, r, count, True)
         # p <- z + beta p, conjugate to all directions before
         p.mul_(rz / before).add_(z)
     return KrylovResult(x, r, limit, False)

@@ -102,6 +102,15 @@ class LayerRows:
             weights.addmm_(self.right.square().T, self.tangents.square())
         return torch.cat([weights.flatten(), left.sum(0)])
 
+    def row_squares(self) -> Tensor:
+        """Return the squared lengths of the rows, the diagonal of J J^T, of shape (M,)."""
+        squares = self.inputs.square().sum(1).add_(1.0).mul_(self.left.square().sum(1))
+        if self.right is not None and self.tangents is not None:
+            # |l i^T + r t^T|^2 = |l|^2 |i|^2 + 2 (l.r)(i.t) + |r|^2 |t|^2
+            squares.addcmul_((self.left * self.right).sum(1), (self.inputs * self.tangents).sum(1), value=2.0)
+            squares.addcmul_(self.right.square().sum(1), self.tangents.square().sum(1))
+        return squares
+
     def kernel(self, other: LayerRows) -> Tensor:
         """Return J J'^T, of shape (M, M'), by Hadamard products of Gram matrices."""
         product = (self.inputs @ other.inputs.T).add_(1.0).mul_(self.left @ other.left.T)

@@ -1,9 +1,15 @@
 """Preconditioning by the Gram matrix of some of the rows, or of a sketch of all of them.
 
-Where M is several times p, J^T J = sum_n j_n j_n^T is a sum of many more terms than it has dimensions. The average
-over m rows drawn without replacement,  (M / m) sum_sampled j_n j_n^T,  is near it once m is a small multiple of p,
-unless a few rows hold what the others do not. A count sketch is proof against such rows: S adds every row, with a
-random sign, to one of m sums, and J^T S^T S J is near J^T J whatever J is.
+Where M is several times p, J^T J = sum_n j_n j_n^T is a sum of many more terms than it has dimensions. Rows drawn with
+probabilities q_n = min(1, c |j_n|^2), c such that m are expected, give an estimate without bias,  sum_drawn j_n j_n^T /
+q_n,  which is near it once m is a small multiple of p. Long rows are certain to be drawn: the terms of a fit have
+weights that differ by orders of magnitude, and the few heavy rows hold what the others do not. Measured in the middle
+of a fit with 2,273 parameters and 21,636 rows, 4,500 of them drawn, at dampings of 1e-2, 1e-3 and 1e-4 of the layers'
+diagonals: 1, 2 and 5 iterations of conjugate gradients, instead of 15, 25 and 45 with equal chances for all rows.
+
+A count sketch needs no lengths: S adds every row, with a random sign, to one of m sums, and J^T S^T S J is near J^T J
+whatever J is.
+
 The products are made in the precision of the vectors, also where the rows are stored in float32: float32 products
 lose what is below 1e-7 of J^T J's largest eigenvalue, and of a network's eigenvalues most are. Measured on a network
 of 2,273 parameters and 19,400 rows, with a damping of 2e-9 of the largest eigenvalue: 146 iterations of conjugate
@@ -11,11 +17,13 @@ gradients instead of 17 with 4,546 sampled rows, for a set-up of 0.4 instead of 
 iterations and 1.7 s.
 Sources: Avron, Maymounkov, Toledo, Blendenpik (2010), and Meng, Saunders, Mahoney, LSRN (2014), for least squares
 preconditioned by a sketch; Clarkson and Woodruff, Low-rank approximation and regression in input sparsity time
-(2013), for the count sketch; Roosta-Khorasani and Mahoney, Sub-sampled Newton methods (2016), for sampled rows.
+(2013), for the count sketch; Drineas, Kannan, Mahoney, Fast Monte Carlo algorithms for matrices (2006), for
+probabilities by length; Roosta-Khorasani and Mahoney, Sub-sampled Newton methods (2016).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -49,17 +57,47 @@ class SampledGram:
 
     def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> PreparedGram:
         """Draw rows and assemble their Gram matrix."""
-        chosen, scale = jacobian, 1.0
-        if self.rows < jacobian.rows:
-            # In ascending order and with the same chance for all, so that blocks of rows are drawn from in proportion.
-            drawn = torch.randperm(jacobian.rows, generator=generator)[: self.rows].sort().values
-            chosen, scale = jacobian.sample(drawn.to(jacobian.device)), jacobian.rows / self.rows
-        chunks = (chunk.to(metric) for chunk in chosen.dense())
-        return PreparedGram(gram(chunks, jacobian.columns, metric).mul_(scale), metric)
+        if self.rows >= jacobian.rows:
+            return PreparedGram(
+                gram((chunk.to(metric) for chunk in jacobian.dense()), jacobian.columns, metric), metric
+            )
+        chances = inclusion(jacobian.row_squares(), self.rows)
+        # Drawn on the CPU, so that a seed means the same on every device.
+        dice = torch.rand(jacobian.rows, generator=generator, dtype=torch.float64)
+        drawn = (dice < chances.cpu()).nonzero()[:, 0].to(jacobian.device)
+        scales = chances[drawn].rsqrt().to(metric)
+        return PreparedGram(gram(_scaled(jacobian.sample(drawn), scales), jacobian.columns, metric), metric)
 
     def describe(self) -> str:
         """Name it."""
         return f"the Gram matrix of {self.rows:,} sampled rows"
+
+
+def inclusion(squares: Tensor, count: int) -> Tensor:
+    """Return min(1, c s), of shape (M,), with c such that they sum to `count` < M, or all alike where s is zero."""
+    squares = squares.double()
+    if not float(squares.sum()) > 0.0:
+        return torch.full_like(squares, count / len(squares))
+    falling, order = squares.sort(descending=True)
+    # Summed from the least on: differences of large sums would lose the short rows.
+    rest = falling.flip(0).cumsum(0).flip(0)
+    # With the k longest rows certain, c = (count - k) / (the rest's sum); right is the first k whose next row is not.
+    certain = torch.arange(len(falling), dtype=falling.dtype, device=falling.device)
+    c = (count - certain).clamp_min(0.0) / rest.clamp_min(torch.finfo(falling.dtype).tiny)
+    first = int((c * falling <= 1.0).nonzero()[0])
+    chances = torch.empty_like(squares)
+    chances[order] = (c[first] * falling).clamp_max(1.0)
+    chances[order[:first]] = 1.0
+    return chances
+
+
+def _scaled(jacobian: Jacobian, scales: Tensor) -> Iterator[Tensor]:
+    """Yield chunks of rows, each row times its scale."""
+    start = 0
+    for chunk in jacobian.dense():
+        stop = start + len(chunk)
+        yield chunk.to(scales) * scales[start:stop, None]
+        start = stop
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import FitError, UsageError
 from gnrecon.fit import FitOptions, NeuralSDF, fit
-from gnrecon.fit.options import NORMAL_RESIDUALS, SEARCHES
-from gnrecon.fit.schedule import MAX_STEP_POINTS
+from gnrecon.fit.deep import hold_out
+from gnrecon.fit.options import NORMAL_RESIDUALS, OPTIMISERS, SEARCHES
+from gnrecon.fit.scene import Scene
+from gnrecon.fit.wide import MAX_STEP_POINTS
+from gnrecon.linalg import SOLVERS
 from gnrecon.optim import Record
 
 Float = NDArray[np.float64]
@@ -70,13 +73,14 @@ def test_wide_fit_of_a_sphere() -> None:
 @pytest.mark.parametrize("normals", NORMAL_RESIDUALS)
 def test_deep_fit_of_a_sphere(normals: str) -> None:
     records: list[Record] = []
-    sdf, solution = fit(sphere(), FitOptions(widths=(24, 24), steps=6, normals=normals), records.append)
+    sdf, solution = fit(sphere(), FitOptions(widths=(24, 24), steps=20, normals=normals), records.append)
     rays = directions(500, 1)
     assert np.abs(radii(sdf, rays) / RADIUS - 1).mean() < 0.025
     assert mean_angle(sdf, rays) < 6
     assert tuple(records) == solution.history
-    assert len(records) == 6
+    assert len(records) == 20
     assert all(record.loss < record.before for record in records)
+    assert "geodesic" in solution.method
 
 
 @pytest.mark.parametrize("search", SEARCHES)
@@ -85,6 +89,54 @@ def test_every_search_lowers_the_loss(search: str, widths: tuple[int, ...]) -> N
     sdf, solution = fit(sphere(150), FitOptions(widths=widths, steps=2, search=search))
     assert all(record.loss < record.before for record in solution.history)
     assert np.all(np.isfinite(sdf.sdf(FRAME.to_world(directions(50, 2)))))
+
+
+@pytest.mark.parametrize(("optimiser", "steps"), [("gn", 20), ("adam", 600), ("lbfgs", 20)])
+def test_every_optimiser_lowers_the_error_of_a_deep_network(optimiser: str, steps: int) -> None:
+    samples = sphere(150)
+    start, _ = fit(samples, FitOptions(widths=(8, 8), steps=0))
+    sdf, solution = fit(samples, FitOptions(widths=(8, 8), steps=steps, optimiser=optimiser))
+    at_data = FRAME.to_world(samples.points)
+    assert len(solution.history) == steps
+    assert np.abs(sdf.sdf(at_data)).mean() < 0.5 * np.abs(start.sdf(at_data)).mean()
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS)
+def test_every_optimiser_lowers_the_loss_of_a_wide_network(optimiser: str) -> None:
+    solution = fit(sphere(150), FitOptions(widths=(40,), steps=30, optimiser=optimiser))[1]
+    assert solution.history[-1].loss < solution.history[0].before
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_every_solver_fits(solver: str) -> None:
+    sdf, solution = fit(sphere(150), FitOptions(widths=(8, 8), steps=4, solver=solver))
+    assert all(record.loss < record.before for record in solution.history)
+    assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(50, 2)))).mean() < 0.03 * FRAME.scale
+
+
+def test_held_out_points_are_not_fitted_and_end_the_fit() -> None:
+    rng = np.random.default_rng(0)
+    scene = Scene.of(sphere(1200), "cpu", rng)
+    fitted, held = hold_out(scene, rng)
+    assert held is not None
+    assert len(held.points) == 60
+    together = torch.cat([fitted.points, held.points])
+    assert torch.equal(together[together[:, 0].argsort()], scene.points[scene.points[:, 0].argsort()])
+    few, none = hold_out(Scene.of(sphere(999), "cpu", rng), rng)
+    assert none is None
+    assert len(few.points) == 999
+
+
+def test_a_fit_keeps_the_parameters_of_the_least_held_out_residuals() -> None:
+    noise = 0.02 * np.random.default_rng(1).standard_normal((1000, 1))
+    samples = sphere(1000)
+    noisy = Samples(samples.points * (1 + noise), samples.normals, FRAME)
+    sdf, solution = fit(noisy, FitOptions(widths=(16, 16), steps=40))
+    values = [record.held_out for record in solution.history]
+    assert all(value is not None for value in values)
+    assert "held-out" in solution.status
+    assert len(values) < 40
+    assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(200, 2)))).mean() < 0.01 * FRAME.scale
 
 
 @pytest.mark.parametrize("widths", [(40,), (8, 8)], ids=str)
@@ -136,6 +188,8 @@ def test_normals_that_are_not_finite_end_with_a_sentence() -> None:
         ({"steps": -1}, "-1"),
         ({"normals": "sideways"}, "sideways"),
         ({"search": "blind"}, "blind"),
+        ({"solver": "gauss"}, "gauss"),
+        ({"optimiser": "sgd"}, "sgd"),
     ],
 )
 def test_options_out_of_range(wrong: dict[str, object], named: str) -> None:

@@ -34,11 +34,8 @@ def draw(widths: tuple[int, ...]) -> tuple[Siren, list[Term], Tensor]:
 def loss_gradient(field: Siren, terms: list[Term], theta: Tensor) -> tuple[float, Tensor]:
     """The loss and its gradient by the last layer's parameters."""
     problem = FieldProblem(field, terms, theta)
-    loss, gradient = 0.0, torch.zeros_like(theta)
-    for rows, residual in problem.chunks(theta):
-        loss += 0.5 * float(residual @ residual)
-        gradient += rows.T @ residual
-    return loss, gradient[field.layout.offsets[-1] :]
+    jacobian, residual = problem.linearise(theta)
+    return 0.5 * float(residual @ residual), jacobian.tmv(residual)[field.layout.offsets[-1] :]
 
 
 @each_field

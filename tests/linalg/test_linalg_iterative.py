@@ -69,11 +69,14 @@ def test_an_old_preconditioner_is_made_anew_when_it_serves_badly() -> None:
     counting = Counting()
     solver = Iterative("cg", counting, patience=3)
     first = solver.linearise(*system(0), identity).solve(1e-2)
-    slow = solver.linearise(*system(1), identity).solve(1e-2)
     assert counting.prepared == 1
-    assert slow.iterations > first.iterations + 3
-    assert slow.failure is None, "it is slow, not wrong"
-    assert solver.linearise(*system(1), identity).solve(1e-2).iterations <= first.iterations + 3
+    made = solver.linearise(*system(1), identity)
+    second = made.solve(1e-2)
+    assert counting.prepared == 2
+    assert second.failure is None
+    # The iterations with the old one count too, up to where it was given up.
+    assert second.iterations == first.iterations + (first.iterations + 3)
+    assert made.solve(1e-2).iterations == first.iterations
     assert counting.prepared == 2
 
 
@@ -87,17 +90,12 @@ def test_other_columns_need_another_preconditioner() -> None:
     assert counting.prepared == 3
 
 
-def test_a_solve_that_reached_its_limit_is_used_and_its_preconditioner_is_not_used_again() -> None:
-    counting = Counting()
+def test_a_solve_that_reached_its_limit_is_a_step() -> None:
     jacobian, r = system(0)
-    solver = Iterative("cg", counting, limit=2)
-    solver.linearise(jacobian, r, identity).solve(1e-2)
-    step = solver.linearise(*system(1), identity).solve(1e-2)
+    step = Iterative("cg", Jacobi(), limit=2).linearise(jacobian, r, identity).solve(1e-2)
     assert step.iterations == 2
     assert step.failure is None
     assert step.predicted > 0.0
-    solver.linearise(*system(1), identity)
-    assert counting.prepared == 2
 
 
 def test_the_factor_of_a_damping_is_kept() -> None:

@@ -76,6 +76,7 @@ def test_matrices(make: Callable[[int, torch.dtype], Made], stored: torch.dtype,
     close(torch.cat(rows) if rows else J, J, stored)
     close(jacobian.gram().tril(), (J.T @ J).tril(), stored)
     close(jacobian.diagonal(), J.square().sum(0), stored)
+    close(jacobian.row_squares(), J.square().sum(1), stored)
     close(jacobian.kernel().tril(), (J @ J.T).tril(), stored)
     assert [group.stop - group.start for group in jacobian.groups] == [len(part) for part in jacobian.group_grams()]
     for group, part in zip(jacobian.groups, jacobian.group_grams(), strict=True):

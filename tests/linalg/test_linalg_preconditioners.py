@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from damped_problems import F64, PROBLEMS, Problem, layered, multiplied_out, randn
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from gnrecon.linalg import (
@@ -21,6 +23,7 @@ from gnrecon.linalg import (
     conjugate_gradients,
 )
 from gnrecon.linalg.krylov import Apply
+from gnrecon.linalg.sampled_gram import inclusion
 
 PRECONDITIONERS: dict[str, Preconditioner] = {
     "jacobi": Jacobi(),
@@ -195,3 +198,36 @@ def test_fewer_iterations_than_without(preconditioner: Preconditioner) -> None:
     assert plain.converged
     assert helped.converged
     assert helped.iterations < 0.7 * plain.iterations
+
+
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 49))
+@settings(max_examples=30, deadline=None)
+def test_chances_by_length_sum_to_the_count(seed: int, count: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    squares = torch.rand(50, generator=generator, dtype=F64) ** 8
+    chances = inclusion(squares, count)
+    assert float(chances.sum()) == pytest.approx(count, rel=1e-9)
+    assert float(chances.min()) >= 0.0
+    assert float(chances.max()) <= 1.0
+    unsure = chances < 1.0
+    ratio = chances[unsure] / squares[unsure]
+    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), rtol=1e-9, atol=0.0)
+    assert not bool(unsure.all()) or float(squares.max() * ratio[0]) <= 1.0 + 1e-9
+
+
+def test_chances_of_rows_without_length() -> None:
+    assert torch.equal(inclusion(torch.zeros(8, dtype=F64), 2), torch.full((8,), 0.25, dtype=F64))
+    alone = torch.tensor([0.0, 3.0, 0.0, 0.0], dtype=F64)
+    assert torch.equal(inclusion(alone, 2), torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=F64))
+
+
+def test_few_heavy_rows_are_all_drawn() -> None:
+    """With equal chances they would be missed, and conjugate gradients would have to find them one by one."""
+    generator = torch.Generator().manual_seed(2)
+    J = torch.randn(2000, 40, generator=generator, dtype=F64)
+    J[torch.randperm(2000, generator=generator)[:30]] *= 1e3
+    jacobian = DenseJacobian(J)
+    P = SampledGram(200).prepare(jacobian, torch.ones(40, dtype=F64), generator).at(1e-3)
+    result = conjugate_gradients(lambda v: J.T @ (J @ v) + 1e-3 * v, torch.ones(40, dtype=F64), P, 1e-8, 100)
+    assert result.converged
+    assert result.iterations <= 25

@@ -17,15 +17,14 @@ from benchmarks.engine.loss import Sample, posed
 from benchmarks.engine.scans import VOLUME_COUNT, surrounded
 from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
+from gnrecon.fit.method import ENERGY
 from gnrecon.fit.problem import FieldProblem
-from gnrecon.linalg import Iterative, SampledGram, layer_scaled
+from gnrecon.linalg import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 
 WIDTHS = (32, 32, 32)
 
 FIRST_POINTS, GROWTH, LAST_STAGE, LEAST_VOLUME = 1500, 1.25, 50, 300
-SAMPLED_ROWS = 6000
-TOLERANCE, ITERATIONS = 1e-2, 60
 DAMPING = 1e-2
 
 OnRecord = Callable[[float, Tensor], None]
@@ -52,7 +51,7 @@ def ours(points: Tensor, normals: Tensor, seconds: float, on_record: OnRecord) -
         return posed(field, theta, drawn(sample, count, generator), torch.float32)
 
     start = solved_start(field, sample)
-    solver = Iterative("cg", SampledGram(SAMPLED_ROWS), tolerance=TOLERANCE, limit=ITERATIONS)
+    solver = SOLVERS["auto"](ENERGY)
     search = GainRatioDamping(initial_damping=DAMPING, metric=layer_scaled, geodesic=True)
     steps = 1_000_000
     stop = StopRule(steps, tolerance=0.0, patience=steps, seconds=seconds - clock.seconds)
