@@ -6,7 +6,7 @@ from gnrecon.fit.options import FitOptions
 from gnrecon.linalg import SOLVERS, layer_scaled
 from gnrecon.optim import LBFGS, Adam, GainRatioDamping, GaussNewton, LogLineSearch, Optimiser, Search
 
-ENERGY = 0.1
+ENERGY = 0.3
 """Error at which conjugate gradients stop: steps that the search shortens or bends anyway need no better ones."""
 
 

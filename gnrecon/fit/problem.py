@@ -20,7 +20,7 @@ from gnrecon.linalg.jacobian import Block, LayeredJacobian
 from gnrecon.linalg.rows import LayerRows
 from gnrecon.residuals.first_order import Linearised
 
-CHUNK_POINTS, CHUNK_BYTES = 4096, 64_000_000
+CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000
 """Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""
 
 
@@ -90,7 +90,7 @@ class FieldProblem:
         kept = list(blocks()) if self._factor_bytes(whole) <= self.keep_bytes else None
         residual = self.residual(theta)
         source = blocks if kept is None else lambda: kept
-        return LayeredJacobian(source, len(residual), self._layer_sizes(), theta.device), residual
+        return LayeredJacobian(source, len(residual), self._layer_sizes(), theta.device, stored=whole.dtype), residual
 
     def _blocks(self, whole: Tensor, gathered: list[list[Term]]) -> Iterator[Block]:
         """Yield the factors of J's rows: for each chunk of points, one block for each residual of each term."""

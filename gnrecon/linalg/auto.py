@@ -3,24 +3,26 @@
 Each way has an estimated work for a step, in multiplications with their additions at the rate of a large float64 matrix
 product:
 
-    Cholesky      M p^2 + p^3 / 3                          p^2 numbers, twice
+    Cholesky      M p^2 / 2 + p^3 / 3                      p^2 numbers, twice
     row space     M^2 w + M^3 / 3                          M^2 numbers, twice; where M <= 0.8 p, D constant on groups
-    sampled       m p^2 / 2 + p^3 / 3 + 10 * 8 M p         p^2 numbers, twice; where m < M, with m = max(2 p, 4000)
+    sampled       m p^2 / 4 + p^3 / 3 + n * 8 M p          p^2 numbers, twice; where m < M, with m = max(3 p / 2, 3000)
     by layers     2 * 200 * 8 M p                          little
 
-The first two are exact. w is what one entry of the kernel J J^T costs: 4 (in + out) for each layer, p for a dense J.
-The product of the sampled rows counts half, because it serves for more than one step. An iteration of conjugate
-gradients takes 2 M p, in products so thin that they run at a quarter of the rate; with a sampled Gram matrix about 10
-are needed (measured: 2 to 5, and more when the preconditioner is an old one), with Kronecker factors of the layers,
-or the diagonal where there are no layers, often all 200, which count twice because such a step is only approximate.
-The least work wins among those that fit the memory; the last one always does.
+The first two are exact; their largest product costs half of it where rows are stored in float32. w is what one entry of
+the kernel J J^T costs: 4 (in + out) for each layer, p for a dense J. The product of the sampled rows counts half,
+because it serves for more than one step. An iteration of conjugate gradients takes 2 M p, in products so thin that they
+run at a quarter of the rate. With a sampled Gram matrix n = 15 iterations are reckoned with at first; early in a fit
+there are fewer, late, when the damping is small, more, and once they have cost more than a Cholesky solve for some
+time, that one takes over. With Kronecker factors of the layers, or the diagonal where there are no layers, all 200 are
+reckoned with, twice, because such a step is only approximate. The least work wins among those that fit the memory; the
+last one always does.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -37,7 +39,7 @@ from gnrecon.linalg.system import DampedSystem, LinearSolver
 
 FEWER = 0.8
 THIN = 8
-ITERATIONS_SAMPLED = 10
+ITERATIONS_SAMPLED = 15
 ITERATIONS_LAYERS = 200
 APPROXIMATE = 2
 SIMILAR = 1.25
@@ -61,6 +63,19 @@ class Choice:
         )
         return similar and constant == self.constant
 
+    def reconsidered(self, jacobian: Jacobian) -> Choice:
+        """Return this choice, or Cholesky where conjugate gradients with sampled rows have cost more of late."""
+        solver = self.solver
+        if not isinstance(solver, Iterative) or not isinstance(solver.preconditioner, SampledGram):
+            return self
+        if solver.effort * THIN * jacobian.rows * jacobian.columns < _cholesky_work(jacobian):
+            return self
+        why = (
+            f"Dense normal equations by Cholesky: conjugate gradients with {solver.preconditioner.describe()} took "
+            f"{solver.effort:.0f} iterations a step, which cost more."
+        )
+        return replace(self, solver=Cholesky(), why=why)
+
 
 @dataclass
 class Auto:
@@ -83,6 +98,7 @@ class Auto:
         if self.choice is None or not self.choice.serves(jacobian, constant):
             memory = _memory(jacobian.device) if self.memory_bytes is None else self.memory_bytes
             self.choice = choose(jacobian, constant, memory, self.energy)
+        self.choice = self.choice.reconsidered(jacobian)
         return self.choice.solver.linearise(jacobian, residual, lambda _: D)
 
     def describe(self) -> str:
@@ -95,12 +111,12 @@ def choose(jacobian: Jacobian, constant: bool, memory: int, energy: float = 0.0)
     M, p = jacobian.rows, max(jacobian.columns, 1)
     # Entries of the largest matrix that may be held twice
     fits = memory / (2 * torch.finfo(jacobian.dtype).bits / 8)
-    iteration, m = THIN * M * p, max(2 * p, 4000)
+    iteration, m = THIN * M * p, max(3 * p // 2, 3000)
     last = Kronecker() if isinstance(jacobian, LayeredJacobian) else Jacobi()
     offers: list[tuple[float, LinearSolver, str]] = []
     if p**2 <= fits:
         why = f"Dense normal equations by Cholesky: {p:,} parameters and {M:,} rows are few enough."
-        offers.append((M * p**2 + p**3 / 3, Cholesky(), why))
+        offers.append((_cholesky_work(jacobian), Cholesky(), why))
     if constant and FEWER * p >= M and fits >= M**2:
         why = f"Push-through in row space: there are fewer rows, {M:,}, than parameters, {p:,}."
         offers.append((M**2 * _entry(jacobian) + M**3 / 3, RowSpace(), why))
@@ -109,7 +125,7 @@ def choose(jacobian: Jacobian, constant: bool, memory: int, energy: float = 0.0)
             f"CG with a sampled Gram matrix ({m:,} of {M:,} rows): {p:,} parameters are few enough to factorise, "
             f"and there are {M / p:.1f} rows for each."
         )
-        work = m * p**2 / 2 + p**3 / 3 + ITERATIONS_SAMPLED * iteration
+        work = m * p**2 / 4 + p**3 / 3 + ITERATIONS_SAMPLED * iteration
         offers.append((work, Iterative("cg", SampledGram(m), energy=energy), why))
     why = f"CG with {last.describe()}: {p:,} parameters and {M:,} rows are too many for a factorisation."
     offers.append(
@@ -121,6 +137,11 @@ def choose(jacobian: Jacobian, constant: bool, memory: int, energy: float = 0.0)
     )
     _, solver, why = min(offers, key=lambda offer: offer[0])
     return Choice(solver, why, M, jacobian.columns, constant)
+
+
+def _cholesky_work(jacobian: Jacobian) -> float:
+    M, p = jacobian.rows, jacobian.columns
+    return M * p**2 / 2 * (0.5 if jacobian.stored == torch.float32 else 1.0) + p**3 / 3
 
 
 def _entry(jacobian: Jacobian) -> float:

@@ -25,6 +25,7 @@ from gnrecon.linalg.system import Equations, Linearisation, Step
 METHODS = {"minres": minres, "gmres": gmres}
 NAMES = {"cg": "Conjugate gradients", "minres": "MINRES", "gmres": "GMRES"}
 TOLERANCE = 1e-6
+FADING = 0.7
 NO_DESCENT = "The iterations ended before they found a step that lowers the loss."
 
 
@@ -91,7 +92,9 @@ class IterativeSystem(Linearisation):
         def apply(v: Tensor) -> Tensor:
             return jacobian.tmv(jacobian.mv(v)).addcmul_(diagonal, v)
 
-        return self.solver.iterate(apply, -equations.gradient, kept.at(damping), min(limit, self.solver.limit))
+        result = self.solver.iterate(apply, -equations.gradient, kept.at(damping), min(limit, self.solver.limit))
+        self.solver.spent += result.iterations
+        return result
 
 
 @dataclass
@@ -109,6 +112,7 @@ class Iterative:
     reuse : whether a preconditioner serves more than one linearisation
     patience : iterations more than its first solve took after which an older one is made anew
     seed : of the preconditioners' chance
+    effort : iterations that a linearisation took of late, a running mean
     """
 
     method: Literal["cg", "minres", "gmres"] = "cg"
@@ -120,6 +124,8 @@ class Iterative:
     patience: int = 8
     seed: int = 0
     kept: Kept | None = field(default=None, init=False, repr=False)
+    effort: float = field(default=0.0, init=False, repr=False)
+    spent: int = field(default=0, init=False, repr=False)
     generator: torch.Generator = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -128,6 +134,7 @@ class Iterative:
     def linearise(self, jacobian: Jacobian, residual: Tensor, metric: Metric) -> IterativeSystem:
         """Take J, and set up a preconditioner unless the last one still serves."""
         equations = Equations.of(jacobian, residual, metric)
+        self.effort, self.spent = FADING * self.effort + (1 - FADING) * self.spent, 0
         # What cannot be solved with a damping that stands for all, cannot be with any.
         if equations.obstacle(1.0):
             return IterativeSystem(equations, self, [])

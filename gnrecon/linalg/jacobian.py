@@ -47,6 +47,11 @@ class Jacobian(Protocol):
         ...
 
     @property
+    def stored(self) -> torch.dtype:
+        """Precision of J's own numbers, in which products of its rows are made."""
+        ...
+
+    @property
     def device(self) -> torch.device:
         """Where everything lies."""
         ...
@@ -117,6 +122,11 @@ class DenseJacobian:
         return self.matrix.dtype
 
     @property
+    def stored(self) -> torch.dtype:
+        """Precision of the matrix."""
+        return self.matrix.dtype
+
+    @property
     def device(self) -> torch.device:
         """Where the matrix lies."""
         return self.matrix.device
@@ -179,6 +189,7 @@ class LayeredJacobian:
     group_sizes : number of columns of each layer
     device : where the factors lie
     dtype : of vectors and sums, float64 or that of the factors
+    stored : precision of the factors
     """
 
     blocks: Callable[[], Iterable[Block]]
@@ -186,6 +197,7 @@ class LayeredJacobian:
     group_sizes: tuple[int, ...]
     device: torch.device
     dtype: torch.dtype = torch.float64
+    stored: torch.dtype = torch.float64
 
     @property
     def columns(self) -> int:
@@ -250,7 +262,11 @@ class LayeredJacobian:
         """Return the layers' blocks of J^T J, each with a valid lower triangle."""
         grams = []
         for k, size in enumerate(self.group_sizes):
-            grams.append(LayeredJacobian(partial(self._layer, k), self.rows, (size,), self.device, self.dtype).gram())
+            grams.append(
+                LayeredJacobian(
+                    partial(self._layer, k), self.rows, (size,), self.device, self.dtype, self.stored
+                ).gram()
+            )
         return grams
 
     def _layer(self, k: int) -> Iterator[Block]:
@@ -303,7 +319,7 @@ class LayeredJacobian:
             if len(inside):
                 blocks.append([layer.take(inside) for layer in block])
             start = stop
-        return LayeredJacobian(lambda: blocks, len(rows), self.group_sizes, self.device, self.dtype)
+        return LayeredJacobian(lambda: blocks, len(rows), self.group_sizes, self.device, self.dtype, self.stored)
 
 
 def _stored(block: Block) -> torch.dtype:

@@ -24,7 +24,7 @@ from benchmarks.engine.step import freeze, measure_step
 
 STEP_CASES = {"bunny_20": "bunny-20", "bunny_100": "bunny-100"}
 SOLVER_CASE = "bunny-20"
-KERNEL_REPEAT = 3
+KERNEL_REPEAT = 1
 
 
 @dataclass(frozen=True)

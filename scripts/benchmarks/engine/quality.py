@@ -24,7 +24,7 @@ from gnrecon.field import Siren
 Fit = Callable[[Tensor, Tensor, float, OnRecord], None]
 """Fits points and normals for so many seconds, see `ours.ours`."""
 
-OUR_SECONDS = 300.0
+OUR_SECONDS = 100.0
 
 
 @dataclass(frozen=True)

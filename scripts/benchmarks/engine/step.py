@@ -29,7 +29,7 @@ from gnrecon.optim import GainRatioDamping, GaussNewton, Solution, StopRule
 
 CHUNK = 512
 STEPS = 10
-WARM_STEPS, WARM_DAMPING = 15, 1e-2
+WARM_STEPS, WARM_DAMPING = 5, 1e-2
 PRECISION = torch.float32
 """In which the factors of our rows are stored."""
 
@@ -51,7 +51,7 @@ class Frozen:
 def our_steps(frozen: Frozen, steps: int) -> tuple[Solution, str]:
     """Take so many of our steps on the frozen sample; return where they led, and what the solver says of itself."""
     solver = SOLVERS["auto"](ENERGY)
-    search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled, geodesic=True)
+    search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled)
     field = Siren(frozen.widths)
     never = StopRule(steps=steps, tolerance=0.0, patience=steps + 1)
     solution = GaussNewton(search, solver).run(
