@@ -26,7 +26,9 @@ from gnrecon.options import Options
         ({"widths": ()}, "widths must be positive numbers"),
         ({"widths": (300, 0)}, r"widths must be positive numbers, not \(300, 0\)"),
         ({"normal_residual": "cross"}, "one of vector, projection, cosine, not 'cross'"),
-        ({"search": "golden"}, "one of auto, damping, line, not 'golden'"),
+        ({"search": "golden"}, "one of auto, damping, geodesic, line, not 'golden'"),
+        ({"solver": "gauss"}, "solver must be one of auto, cholesky, qr, .*, not 'gauss'"),
+        ({"optimiser": "sgd"}, "optimiser must be one of gn, adam, lbfgs, not 'sgd'"),
         ({"detail": 3}, "no option 'detail'; the options are fraction, max_points"),
     ],
 )
@@ -43,8 +45,10 @@ def test_the_least_values_are_allowed() -> None:
 
 
 def test_the_fit_receives_its_options() -> None:
-    options = Options(widths=(7, 5), steps=3, normal_residual="cosine", search="line", seed=11)
-    assert options.fit() == FitOptions((7, 5), 3, "cosine", "line", 11, "cpu")
+    options = Options(
+        widths=(7, 5), steps=3, normal_residual="cosine", optimiser="adam", solver="qr", search="line", seed=11
+    )
+    assert options.fit() == FitOptions((7, 5), 3, "cosine", "adam", "qr", "line", 11, "cpu")
     assert Options().fit() == FitOptions()
 
 

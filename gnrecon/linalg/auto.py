@@ -5,7 +5,7 @@ product:
 
     Cholesky      M p^2 / 2 + p^3 / 3                      p^2 numbers, twice
     row space     M^2 w + M^3 / 3                          M^2 numbers, twice; where M <= 0.8 p, D constant on groups
-    sampled       m p^2 / 4 + p^3 / 3 + n * 8 M p          p^2 numbers, twice; where m < M, with m = max(3 p / 2, 3000)
+    sampled       m p^2 / 4 + p^3 / 3 + n * 8 M p          p^2 numbers, twice; where m < M, with m = max(5 p / 4, 3000)
     by layers     2 * 200 * 8 M p                          little
 
 The first two are exact; their largest product costs half of it where rows are stored in float32. w is what one entry of
@@ -111,7 +111,7 @@ def choose(jacobian: Jacobian, constant: bool, memory: int, energy: float = 0.0)
     M, p = jacobian.rows, max(jacobian.columns, 1)
     # Entries of the largest matrix that may be held twice
     fits = memory / (2 * torch.finfo(jacobian.dtype).bits / 8)
-    iteration, m = THIN * M * p, max(3 * p // 2, 3000)
+    iteration, m = THIN * M * p, max(5 * p // 4, 3000)
     last = Kronecker() if isinstance(jacobian, LayeredJacobian) else Jacobi()
     offers: list[tuple[float, LinearSolver, str]] = []
     if p**2 <= fits:

@@ -73,12 +73,12 @@ def test_wide_fit_of_a_sphere() -> None:
 @pytest.mark.parametrize("normals", NORMAL_RESIDUALS)
 def test_deep_fit_of_a_sphere(normals: str) -> None:
     records: list[Record] = []
-    sdf, solution = fit(sphere(), FitOptions(widths=(24, 24), steps=20, normals=normals), records.append)
+    sdf, solution = fit(sphere(), FitOptions(widths=(24, 24), steps=40, normals=normals), records.append)
     rays = directions(500, 1)
     assert np.abs(radii(sdf, rays) / RADIUS - 1).mean() < 0.025
     assert mean_angle(sdf, rays) < 6
     assert tuple(records) == solution.history
-    assert len(records) == 20
+    assert len(records) == 40
     assert all(record.loss < record.before for record in records)
     assert "geodesic" in solution.method
 
@@ -91,23 +91,25 @@ def test_every_search_lowers_the_loss(search: str, widths: tuple[int, ...]) -> N
     assert np.all(np.isfinite(sdf.sdf(FRAME.to_world(directions(50, 2)))))
 
 
-@pytest.mark.parametrize(("optimiser", "steps"), [("gn", 20), ("adam", 600), ("lbfgs", 20)])
-def test_every_optimiser_lowers_the_error_of_a_deep_network(optimiser: str, steps: int) -> None:
-    samples = sphere(150)
-    start, _ = fit(samples, FitOptions(widths=(8, 8), steps=0))
-    sdf, solution = fit(samples, FitOptions(widths=(8, 8), steps=steps, optimiser=optimiser))
-    at_data = FRAME.to_world(samples.points)
+@pytest.mark.parametrize(("optimiser", "steps"), [("gn", 10), ("adam", 250), ("lbfgs", 10)])
+def test_every_optimiser_lowers_the_loss_of_a_deep_network(optimiser: str, steps: int) -> None:
+    sdf, solution = fit(sphere(150), FitOptions(widths=(8, 8), steps=steps, optimiser=optimiser))
     assert len(solution.history) == steps
-    assert np.abs(sdf.sdf(at_data)).mean() < 0.5 * np.abs(start.sdf(at_data)).mean()
+    # Within the last stage, whose weights do not change.
+    last = [record.loss for record in solution.history[int(0.6 * steps) :]]
+    third = len(last) // 3
+    assert np.mean(last[-third:]) < np.mean(last[:third])
+    assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(50, 2)))).mean() < 0.05 * FRAME.scale
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS)
 def test_every_optimiser_lowers_the_loss_of_a_wide_network(optimiser: str) -> None:
-    solution = fit(sphere(150), FitOptions(widths=(40,), steps=30, optimiser=optimiser))[1]
+    solution = fit(sphere(150), FitOptions(widths=(40,), steps=12, optimiser=optimiser))[1]
     assert solution.history[-1].loss < solution.history[0].before
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+# In row space a step's ten thousand rows take minutes; `tests/linalg` and `tests/optim` have it on smaller ones.
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "row-space"])
 def test_every_solver_fits(solver: str) -> None:
     sdf, solution = fit(sphere(150), FitOptions(widths=(8, 8), steps=4, solver=solver))
     assert all(record.loss < record.before for record in solution.history)

@@ -80,7 +80,7 @@ def test_empty_systems_get_some_solver(rows: int, columns: int) -> None:
 
 def test_the_reason_has_the_numbers() -> None:
     assert choose(network(19_378, 32, 3), True, MEMORY).why == (
-        "CG with a sampled Gram matrix (3,409 of 19,378 rows): 2,273 parameters are few enough to factorise, "
+        "CG with a sampled Gram matrix (3,000 of 19,378 rows): 2,273 parameters are few enough to factorise, "
         "and there are 8.5 rows for each."
     )
 
