@@ -107,13 +107,15 @@ class FieldProblem:
             return layers
         return [r if units is None else r.into(units) for r, units in zip(layers, self.units, strict=True)]
 
-    def _layer_sizes(self) -> tuple[int, ...]:
-        chosen = self.units or [None] * len(self.field.layout.shapes)
+    def _free_outs(self) -> list[int]:
+        """Number of free units of each layer."""
         shapes = self.field.layout.shapes
-        return tuple(
-            (out if units is None else len(units)) * (into + 1)
-            for (out, into), units in zip(shapes, chosen, strict=True)
-        )
+        chosen = self.units or [None] * len(shapes)
+        return [out if units is None else len(units) for (out, _), units in zip(shapes, chosen, strict=True)]
+
+    def _layer_sizes(self) -> tuple[int, ...]:
+        shapes = self.field.layout.shapes
+        return tuple(out * (into + 1) for out, (_, into) in zip(self._free_outs(), shapes, strict=True))
 
     def _chunks(self, group: list[Term]) -> Iterator[slice]:
         """Yield slices of the group's points, of which the activations take at most `CHUNK_BYTES` a layer."""
@@ -121,10 +123,15 @@ class FieldProblem:
         return batches(len(group[0].points), size)
 
     def _factor_bytes(self, whole: Tensor) -> int:
-        """Estimate the memory of all factors: activations and adjoints once, and up to three arrays a residual."""
-        width = sum(self.field.layout.sizes)
-        arrays = sum(len(group[0]) * (2 + 3 * len(group)) for group in groups(self.terms))
-        return arrays * width * whole.element_size()
+        """Memory of all factors: inputs and adjoints once a point, lefts and tangents for each residual."""
+        ins, outs = sum(into for _, into in self.field.layout.shapes), sum(self._free_outs())
+        numbers = 0
+        for group in groups(self.terms):
+            numbers += len(group[0]) * (ins + outs)
+            for term in group:
+                linear = _probe(term)
+                numbers += len(term) * linear.residual.shape[1] * (outs + (0 if linear.by_gradient is None else ins))
+        return numbers * whole.element_size()
 
 
 def _column(linear: Linearised, column: int, scale: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -157,6 +164,11 @@ def _in_precision(group: list[Term], dtype: torch.dtype) -> list[Term]:
 
 def _is_value_only(term: Term) -> bool:
     """Whether the residual can be evaluated without the gradient."""
+    return _probe(term).by_gradient is None
+
+
+def _probe(term: Term) -> Linearised:
+    """Return what the residual looks like at one point."""
     probe = term.points.new_zeros(1)
     target = None if term.target is None else term.target[:1]
-    return term.residual(probe, term.points.new_ones(1, 3), target).by_gradient is None
+    return term.residual(probe, term.points.new_ones(1, 3), target)
