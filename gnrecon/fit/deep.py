@@ -89,10 +89,12 @@ def hold_out(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Scene | Non
     if count < LEAST_POINTS_TO_HOLD_OUT:
         return scene, None
     order = torch.as_tensor(rng.permutation(count)).to(scene.points.device)
-    held, fitted = (rows.sort().values for rows in (order[: count // HELD_OUT], order[count // HELD_OUT :]))
-    of = {"held": held, "fitted": fitted}
-    parts = {name: replace(scene, points=scene.points[rows], normals=scene.normals[rows]) for name, rows in of.items()}
-    return parts["fitted"], parts["held"]
+    held, fitted = (rows.sort().values for rows in order.tensor_split([count // HELD_OUT]))
+    return _only(scene, fitted), _only(scene, held)
+
+
+def _only(scene: Scene, rows: Tensor) -> Scene:
+    return replace(scene, points=scene.points[rows], normals=scene.normals[rows])
 
 
 def _held_out_loss(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass, field
@@ -19,15 +18,13 @@ from typing import Any
 
 import numpy as np
 
-import gnrecon
+from benchmarks.alone import run_program
 from benchmarks.methods import METHODS
 from gnrecon.cloud import Float
 from gnrecon.errors import GnreconError
 from gnrecon.export import measure, verify
 from gnrecon.mesh import Mesh
 from gnrecon.report import peak_memory_mb
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -56,21 +53,7 @@ def run_trial(job: Job, folder: Path) -> dict[str, Any]:
 
     A failure of the method is a result too: the sentence under ``"error"`` then takes the figures' place.
     """
-    folder.mkdir(parents=True)
-    (folder / "job.json").write_text(json.dumps(asdict(job)), encoding="utf-8")
-    here = [Path(__file__).resolve().parents[1], Path(str(gnrecon.__file__)).parents[1]]
-    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(job.threads))
-    # The new process is to measure this very gnrecon, wherever it was imported from.
-    environment["PYTHONPATH"] = os.pathsep.join(map(str, here))
-    command = [sys.executable, "-m", "benchmarks.trial", str(folder)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        last = done.stderr.strip().splitlines()[-1:]
-        # What was killed (for want of memory, say) has said nothing about it.
-        said = last[0] if last and done.returncode > 0 else f"The process ended with status {done.returncode}."
-        return {"error": said}
-    figures: dict[str, Any] = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
-    return figures
+    return run_program("benchmarks.trial", asdict(job), job.threads, folder)
 
 
 def load_mesh(path: Path) -> Mesh:

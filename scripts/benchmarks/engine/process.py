@@ -6,8 +6,6 @@ The two sides meet in a folder: the function's name and arguments go in, what it
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 
 import torch
 
-import gnrecon
+from benchmarks.alone import run_program
 from gnrecon.report import peak_memory_mb
 
 
@@ -25,24 +23,8 @@ def run_alone(module: str, function: str, folder: Path, **arguments: Any) -> dic
     Added to them are peak memory, `peak_memory_mb`, and what of it the libraries took, `libraries_memory_mb`. A failure
     is a result too: the sentence under ``"error"`` then takes the figures' place.
     """
-    # Here, so that the new process does not carry its libraries.
-    from benchmarks.trial import THREAD_VARIABLES
-
-    folder.mkdir(parents=True)
     job = {"module": module, "function": function, "arguments": arguments}
-    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
-    here = [Path(__file__).resolve().parents[2], Path(str(gnrecon.__file__)).parents[1]]
-    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(torch.get_num_threads()))
-    environment["PYTHONPATH"] = os.pathsep.join(map(str, here))
-    command = [sys.executable, "-m", "benchmarks.engine.process", str(folder)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        last = done.stderr.strip().splitlines()[-1:]
-        # What was killed (for want of memory, say) has said nothing about it.
-        said = last[0] if last and done.returncode > 0 else f"The process ended with status {done.returncode}."
-        return {"error": said}
-    figures: dict[str, Any] = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
-    return figures
+    return run_program("benchmarks.engine.process", job, torch.get_num_threads(), folder)
 
 
 def own_peak_mb() -> float:
