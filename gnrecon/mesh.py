@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,8 @@ class Mesh:
         Rows of vertex indices.
     normals : array of shape (V, 3), optional
         Unit vertex normals, outward.
+    attributes : mapping of name to array of shape (V,) or (V, C)
+        Whatever else is known of each vertex: ``colors`` (8-bit, 3 or 4 columns) and scalar fields.
 
     Raises
     ------
@@ -35,6 +38,7 @@ class Mesh:
     vertices: Float
     faces: Int
     normals: Float | None = None
+    attributes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64).reshape(-1, 3)
@@ -48,6 +52,9 @@ class Mesh:
             if normals.shape != vertices.shape:
                 raise InputError(f"Normals of shape {normals.shape} do not fit {len(vertices)} vertices.")
             object.__setattr__(self, "normals", normals)
+        for name, values in self.attributes.items():
+            if len(values) != len(vertices):
+                raise InputError(f"{len(values)} values of {name!r} do not fit {len(vertices)} vertices.")
 
     @property
     def corners(self) -> Float:
@@ -91,5 +98,9 @@ class Mesh:
         return sums / lengths
 
     def with_vertices(self, vertices: Float) -> Mesh:
-        """Return the same faces and normals over moved vertices, of shape (V, 3)."""
+        """Return the same faces, normals and attributes over moved vertices, of shape (V, 3)."""
         return replace(self, vertices=vertices)
+
+    def with_attributes(self, attributes: Mapping[str, npt.NDArray[np.generic]]) -> Mesh:
+        """Return the same mesh with these attributes, each of V rows, added to what it carries."""
+        return replace(self, attributes={**self.attributes, **attributes})
