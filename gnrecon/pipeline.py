@@ -10,27 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 import torch
 
-from gnrecon.cloud import Float, PointCloud, Samples
+from gnrecon.cloud import PointCloud
 from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.export import (
-    MeshFacts,
-    Metrics,
-    extract,
-    measure,
-    project,
-    remove_stray,
-    repair,
-    require_sound,
-    verify_file,
-)
+from gnrecon.export import MeshFacts, Metrics, measure, require_sound, verify_file
 from gnrecon.fit import NeuralSDF, fit
 from gnrecon.ingest import IngestCounts, prepare
 from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
 from gnrecon.report import Stages, versions
@@ -156,7 +146,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total))
     progress.remark(solution.status)
     with stages("mesh"):
-        mesh, actions = _mesh(sdf, samples, options)
+        mesh, actions = mesh_field(sdf, options, data=samples.frame.to_world(samples.points))
     for sentence in actions:
         progress.remark(sentence)
     with stages("verify"):
@@ -192,27 +182,6 @@ def _cloud(source: Any, normals: Any) -> PointCloud:
 
 def _reference(reference: Any) -> Mesh | PointCloud | None:
     return read_reference(reference) if isinstance(reference, str | Path) else reference
-
-
-def _mesh(sdf: NeuralSDF, samples: Samples, options: Options) -> tuple[Mesh, list[str]]:
-    """Extract, drop components that no data supports, project and repair."""
-    data = samples.frame.to_world(samples.points)
-    mesh = extract(_coarse(sdf, data, options.resolution), resolution=options.resolution, data=data)
-    mesh, dropped = remove_stray(mesh, data)
-    mesh = project(mesh, sdf, steps=2)
-    mesh, repaired = repair(mesh)
-    return mesh, [*dropped, *repaired]
-
-
-def _coarse(sdf: NeuralSDF, data: Float, resolution: int) -> NeuralSDF:
-    """Return the field in single precision where that places vertices well within a cell; projection makes them exact.
-
-    Features of high frequency with large weights cancel, so the error is measured and not assumed.
-    """
-    some = data[:: max(1, len(data) // 2000)]
-    error = np.abs(sdf.single().sdf(some) - sdf.sdf(some)).max()
-    cell = np.ptp(sdf.bounds, axis=0).max() / resolution
-    return sdf.single() if error < 0.2 * cell else sdf
 
 
 def _verify(path: Path) -> None:

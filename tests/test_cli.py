@@ -254,9 +254,9 @@ def test_a_kill_leaves_nothing_under_the_targets_name(out: Path, scan: Path, pla
 
 
 TORN_BY_REPAIR = """
-import gnrecon.pipeline
+import gnrecon.meshing
 from gnrecon.mesh import Mesh
-gnrecon.pipeline.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
+gnrecon.meshing.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
 """
 TORN_BY_WRITING = """
 import gnrecon.io.formats

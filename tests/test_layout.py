@@ -26,6 +26,7 @@ ROWS = [
     {"sampling"},
     {"fit", "ingest", "io", "export"},
     {"options", "report", "shapes"},
+    {"meshing"},
     {"pipeline"},
     {"run"},
     {"batch", "doctor"},

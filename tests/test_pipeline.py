@@ -306,6 +306,6 @@ def test_an_unsound_mesh_is_neither_returned_nor_saved(
     with pytest.raises(MeshError, match="open: 3 edges"):
         replace(result, mesh=torn(result.mesh)[0]).save(tmp_path / "mesh.ply")
     assert not list(tmp_path.iterdir())
-    monkeypatch.setattr("gnrecon.pipeline.repair", torn)
+    monkeypatch.setattr("gnrecon.meshing.repair", torn)
     with pytest.raises(MeshError, match="open: 3 edges"):
         reconstruct(*scan, **TINY)
