@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gnrecon.cloud import Frame, PointCloud, Samples
-from gnrecon.errors import FitError, GnreconError, InputError, MeshError, OutputError, UsageError
+from gnrecon.errors import Cancelled, FitError, GnreconError, InputError, MeshError, OutputError, UsageError
 from gnrecon.mesh import Mesh
 from gnrecon.version import __version__
 
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from gnrecon.ingest import prepare
     from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
     from gnrecon.options import Options
-    from gnrecon.pipeline import Reconstruction, reconstruct
+    from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+    from gnrecon.schema import report_schema
 
 _ROOMS = {
     "gnrecon.export": ("extract", "measure", "project", "remove_stray", "render", "repair", "require_sound", "verify"),
@@ -31,11 +32,13 @@ _ROOMS = {
     "gnrecon.ingest": ("prepare",),
     "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
     "gnrecon.options": ("Options",),
-    "gnrecon.pipeline": ("Reconstruction", "reconstruct"),
+    "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
+    "gnrecon.schema": ("report_schema",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
+    "Cancelled",
     "FitError",
     "FitOptions",
     "Frame",
@@ -47,6 +50,7 @@ __all__ = [
     "Options",
     "OutputError",
     "PointCloud",
+    "Progress",
     "Reconstruction",
     "Samples",
     "UsageError",
@@ -63,6 +67,7 @@ __all__ = [
     "remove_stray",
     "render",
     "repair",
+    "report_schema",
     "require_sound",
     "to_open3d",
     "to_trimesh",

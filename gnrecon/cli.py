@@ -22,7 +22,7 @@ from gnrecon.version import __version__
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
 _CommandLineError: Any = typer.BadParameter.__mro__[2]
 
-COMMANDS = ("reconstruct", "batch", "doctor")
+COMMANDS = ("reconstruct", "batch", "doctor", "schema")
 DEFAULT_COMMAND = "reconstruct"
 
 app = typer.Typer(
@@ -223,6 +223,14 @@ def doctor_command() -> None:
     checks = diagnose()
     render(checks, Console())
     raise SystemExit(0 if all(check.ok for check in checks) else ExitCode.INPUT)
+
+
+@app.command("schema")
+def schema_command() -> None:
+    """Print the JSON schema of the report: every field with its meaning and unit."""
+    from gnrecon.schema import schema_text
+
+    print(schema_text(), end="")
 
 
 def parse_widths(text: str) -> tuple[int, ...]:

@@ -59,6 +59,15 @@ class OutputError(GnreconError, OSError):
     exit_code = ExitCode.OUTPUT
 
 
+class Cancelled(GnreconError):  # noqa: N818 - it is no error
+    """Not a failure: the caller's own `Progress` raises this to end a run, which then writes and returns nothing."""
+
+    exit_code = ExitCode.INTERRUPTED
+
+    def __init__(self, sentence: str = "Cancelled; nothing was written.") -> None:
+        super().__init__(sentence)
+
+
 class MemoryLimitError(GnreconError, MemoryError):
     """The work needs more memory than there is."""
 

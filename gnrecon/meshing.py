@@ -5,14 +5,26 @@ A reconstruction and `gnrecon mesh`, which meshes a saved field again, both do t
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
 
 import numpy as np
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.export import SignedDistance, extract, project, remove_stray, repair
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
+
+StageTimer = Callable[[str], AbstractContextManager[None]]
+"""Gives the context in which a stage of a name runs, such as `gnrecon.report.Stages`."""
+
+
+def untimed(name: str) -> AbstractContextManager[None]:
+    """Run a stage without timing it."""
+    del name
+    return nullcontext()
 
 
 class MeshedField(SignedDistance, Protocol):
@@ -24,7 +36,13 @@ class MeshedField(SignedDistance, Protocol):
 
 
 def mesh_field(
-    field: MeshedField, options: Options, *, data: Float | None, bounds: Float | None = None
+    field: MeshedField,
+    options: Options,
+    *,
+    data: Float | None,
+    bounds: Float | None = None,
+    stages: StageTimer = untimed,
+    advance: Advance = unheard,
 ) -> tuple[Mesh, list[str]]:
     """Mesh the zero level of a field as the options ask.
 
@@ -36,6 +54,10 @@ def mesh_field(
         Points that the field was fitted to, which tell surface from sheets that were invented; with None all is kept.
     bounds : array of shape (2, 3), file units, optional
         The box to mesh in; by default the field's own.
+    stages : callable
+        Times the stages ``extract``, ``project`` and ``repair``.
+    advance : callable
+        Told of the share that is done of each stage.
 
     Returns
     -------
@@ -49,11 +71,14 @@ def mesh_field(
     MeshError
         When there is no zero level in the box, or no sound mesh can be made of it.
     """
-    coarse = field if data is None else _coarse(field, data, options.resolution)
-    mesh = extract(coarse, resolution=options.resolution, bounds=bounds, data=data)
-    mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
-    mesh = project(mesh, field, steps=2)
-    mesh, repaired = repair(mesh)
+    with stages("extract"):
+        coarse = field if data is None else _coarse(field, data, options.resolution)
+        mesh = extract(coarse, resolution=options.resolution, bounds=bounds, data=data, advance=advance)
+        mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
+    with stages("project"):
+        mesh = project(mesh, field, steps=2, advance=advance)
+    with stages("repair"):
+        mesh, repaired = repair(mesh)
     return mesh, [*dropped, *repaired]
 
 

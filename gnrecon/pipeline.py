@@ -23,14 +23,22 @@ from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
-from gnrecon.report import Stages, versions
+from gnrecon.report import Stages, plain, versions
+from gnrecon.schema import SCHEMA_VERSION
 
 
 class Progress:
-    """What a caller may want to know while a reconstruction runs; this one ignores everything."""
+    """What a caller may want to know while a reconstruction runs; this one ignores everything.
+
+    A method may raise `gnrecon.Cancelled` to end the run, which then returns nothing. It is asked every second or so,
+    except during the linear solve that a fit begins with.
+    """
 
     def stage(self, name: str) -> None:
         """Called when a stage begins."""
+
+    def advance(self, share: float) -> None:
+        """Called now and then with the share of the stage that is done, from 0 to 1 and never less than before."""
 
     def step(self, record: Record, total: int) -> None:
         """Called after each Gauss-Newton step, of `total` at most."""
@@ -49,7 +57,8 @@ class Reconstruction:
         Closed, oriented 2-manifold, in file units.
     sdf : NeuralSDF
     report : dict
-        Options, versions, stages, counts, fit history, mesh facts and metrics as plain values, ready for JSON.
+        Options, versions, stages, counts, fit history, mesh facts and metrics as plain values, ready for JSON;
+        `gnrecon.report_schema` describes each.
     metrics : Metrics, optional
         Distances to the reference, where one was given.
     interrupted : bool
@@ -102,7 +111,7 @@ def reconstruct(
     reference : path, Mesh or PointCloud, optional
         Truth to measure the mesh against.
     progress : Progress, optional
-        Told of stages, steps and remarks.
+        Told of stages, steps and remarks; it may end the run by raising `gnrecon.Cancelled`.
     **options
         The fields of `Options`, by name.
 
@@ -133,20 +142,21 @@ def reconstruct(
 
 
 def _run(source: Any, normals: Any, reference: Any, progress: Progress, options: Options) -> Reconstruction:
-    stages = Stages(progress.stage)
+    stages = Stages(progress.stage, options.device)
     with stages("read"):
         cloud = _cloud(source, normals)
+        progress.advance(0.5)
         truth = _reference(reference)
     with stages("ingest"):
-        samples, counts = prepare(cloud, **options.ingest())
+        samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
     for sentence in counts.remarks():
         progress.remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
         sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total))
     progress.remark(solution.status)
-    with stages("mesh"):
-        mesh, actions = mesh_field(sdf, options, data=samples.frame.to_world(samples.points))
+    data = samples.frame.to_world(samples.points)
+    mesh, actions = mesh_field(sdf, options, data=data, stages=stages, advance=progress.advance)
     for sentence in actions:
         progress.remark(sentence)
     with stages("verify"):
@@ -154,7 +164,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     metrics = None
     if truth is not None:
         with stages("measure"):
-            metrics = measure(mesh, truth, seed=options.seed)
+            metrics = measure(mesh, truth, seed=options.seed, advance=progress.advance)
     report = _report(source, options, stages, counts, solution, sdf, facts, actions, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
 
@@ -206,7 +216,8 @@ def _report(
     actions: list[str],
     metrics: Metrics | None,
 ) -> dict[str, Any]:
-    return {
+    found = {
+        "schema_version": SCHEMA_VERSION,
         "input": str(source) if isinstance(source, str | Path) else type(source).__name__,
         "options": options.as_dict(),
         "versions": versions(),
@@ -223,4 +234,7 @@ def _report(
         "actions": actions,
         "metrics": None if metrics is None else metrics.as_dict(),
         "stages": stages.as_list(),
+        "resources": stages.resources(),
     }
+    values: dict[str, Any] = plain(found)
+    return values

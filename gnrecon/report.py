@@ -1,52 +1,87 @@
-"""What a run says of itself: stages with their times and peak memory, and the versions that made it."""
+"""What a run says of itself: stages with their times and peak memory, its resources, and the versions that made it.
+
+What the numbers mean, and their units, is told for each by the JSON schema beside this file, see `gnrecon.schema`.
+"""
 
 from __future__ import annotations
 
+import math
 import platform
-import resource
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from typing import Any
 
+import torch
+
+from gnrecon.memory import PeakMemory, process_peak_mb
 from gnrecon.version import __version__
 
 _NAMED = ("numpy", "scipy", "torch", "open3d", "scikit-image", "manifold3d", "trimesh")
 
 
 class Stages:
-    """A record of stages, in order.
+    """A record of stages, in order, and of what all of them together took.
 
     Parameters
     ----------
     announce : called with a stage's name when it begins
+    device : where the fit runs, ``"cpu"`` or ``"cuda"``
     """
 
-    def __init__(self, announce: Callable[[str], None]) -> None:
-        self._announce = announce
+    def __init__(self, announce: Callable[[str], None], device: str = "cpu") -> None:
+        self._announce, self._device = announce, device
         self._done: list[dict[str, Any]] = []
+        self._sampled = False
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
+        if self._on_cuda:
+            torch.cuda.reset_peak_memory_stats(device)
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time a block."""
+        """Time a block and watch its memory."""
         self._announce(name)
-        start = time.perf_counter()
-        yield
-        seconds = time.perf_counter() - start
-        self._done.append({"name": name, "seconds": round(seconds, 3), "peak_memory_mb": peak_memory_mb()})
+        with PeakMemory() as peak:
+            start, cpu_start = time.perf_counter(), time.process_time()
+            yield
+            seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
+        self._sampled |= peak.sampled
+        times = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu_seconds, 3)}
+        self._done.append({"name": name, **times, "peak_memory_mb": peak.mb})
+
+    @property
+    def _on_cuda(self) -> bool:
+        return self._device.startswith("cuda")
 
     def as_list(self) -> list[dict[str, Any]]:
-        """Return the stages as plain values; the peak is the process's, from its start to the stage's end."""
+        """Return the stages as plain values."""
         return list(self._done)
 
+    def resources(self) -> dict[str, Any]:
+        """Return what the run has taken until now, as plain values."""
+        cuda_peak = round(torch.cuda.max_memory_allocated(self._device) / 1e6, 1) if self._on_cuda else None
+        return {
+            "seconds": round(time.perf_counter() - self._start, 3),
+            "cpu_seconds": round(time.process_time() - self._cpu_start, 3),
+            "threads": torch.get_num_threads(),
+            "device": self._device,
+            "device_name": torch.cuda.get_device_name(self._device) if self._on_cuda else None,
+            "peak_memory_mb": process_peak_mb(),
+            "stage_peaks_sampled": self._sampled,
+            "cuda_peak_memory_mb": cuda_peak,
+        }
 
-def peak_memory_mb() -> float:
-    """Return the process's greatest resident memory so far, in MB."""
-    # Kilobytes on Linux, bytes on macOS.
-    unit = 1 if sys.platform == "darwin" else 1024
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)
+
+def plain(value: Any) -> Any:
+    """Return nested values as JSON can hold them: tuples as lists, and None for a number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def versions() -> dict[str, str]:

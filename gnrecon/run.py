@@ -24,9 +24,12 @@ STAGES = {
     "read": "Reading",
     "ingest": "Cleaning",
     "fit": "Fitting",
-    "mesh": "Meshing",
+    "extract": "Extracting",
+    "project": "Projecting",
+    "repair": "Repairing",
     "verify": "Verifying",
     "measure": "Measuring",
+    "write": "Writing",
 }
 
 
@@ -88,7 +91,8 @@ def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: 
     console = Console(stderr=True, quiet=quiet)
     with _shown(console, verbose) as progress:
         result = reconstruct(files.scan, reference=files.reference, progress=progress, **options)
-    warnings = _write(files, result)
+        progress.stage("write")
+        warnings = _write(files, result)
     for sentence in warnings:
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     console.print(_summary(files, result), highlight=False, markup=False, soft_wrap=True)
@@ -106,7 +110,7 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
         # The side files are complete under their temporary names before the mesh receives its own.
         if files.report is not None:
             report = stack.enter_context(atomic_write(files.report, files.overwrite))
-            report.write_text(json.dumps(result.report, indent=2) + "\n", encoding="utf-8")
+            report.write_text(json.dumps(result.report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         if files.preview is not None:
             picture = stack.enter_context(atomic_write(files.preview, files.overwrite))
             render(result.mesh, picture, size=(1200, 600), points=read_cloud(files.scan))
@@ -114,12 +118,11 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
 
 
 def _summary(files: Files, result: Reconstruction) -> str:
-    facts, stages = result.report["mesh"], result.report["stages"]
-    seconds = sum(stage["seconds"] for stage in stages)
+    facts, resources = result.report["mesh"], result.report["resources"]
     return (
         f"{files.output}: {facts['vertices']} vertices, {facts['faces']} faces, {facts['components']} component"
         f"{'s' if facts['components'] != 1 else ''}, genus {facts['genus']}, closed and manifold, volume "
-        f"{facts['volume']:.6g}; {seconds:.1f} s, {stages[-1]['peak_memory_mb']:.0f} MB."
+        f"{facts['volume']:.6g}; {resources['seconds']:.1f} s, {resources['peak_memory_mb']:.0f} MB."
     )
 
 
@@ -135,6 +138,11 @@ class Shown(PipelineProgress):
         if self._task is not None:
             self._bar.remove_task(self._task)
         self._task = self._bar.add_task(STAGES[name], total=None, detail="")
+
+    def advance(self, share: float) -> None:
+        """Fill the bar up to a share of the stage."""
+        if self._task is not None:
+            self._bar.update(self._task, completed=share, total=1.0)
 
     def step(self, record: Record, total: int) -> None:
         """Show a step's loss, damping and gain ratio, and the time left."""

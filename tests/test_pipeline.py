@@ -20,10 +20,13 @@ from gnrecon.export import measure
 from gnrecon.mesh import Mesh
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.schema import SCHEMA_VERSION
 
 RADIUS = 1 + TUBE
 # Enough to reach every stage, where the mesh itself does not matter.
 TINY = {"widths": (200,), "steps": 0, "resolution": 24}
+
+STAGES = ["read", "ingest", "fit", "extract", "project", "repair", "verify"]
 
 Cloud = tuple[np.ndarray, np.ndarray]
 
@@ -166,8 +169,7 @@ def test_the_field_is_a_signed_distance_near_the_surface(scan: Cloud, result: Re
 
 def test_the_report_holds_everything_as_plain_values(scan: Cloud, result: Reconstruction) -> None:
     report = json.loads(json.dumps(result.report, allow_nan=False))
-    entries = ["input", "options", "versions", "ingest", "frame", "fit", "mesh", "actions", "metrics", "stages"]
-    assert list(report) == entries
+    assert report["schema_version"] == SCHEMA_VERSION
     assert report["input"] == "ndarray"
     assert report["options"]["widths"] == [300]
     assert {"gnrecon", "python", "platform", "torch", "numpy"} <= set(report["versions"])
@@ -188,15 +190,14 @@ def test_the_report_holds_everything_as_plain_values(scan: Cloud, result: Recons
     assert facts["faces"] == len(result.mesh.faces)
     assert all(isinstance(sentence, str) for sentence in report["actions"])
     assert report["metrics"] is None
-    assert [stage["name"] for stage in report["stages"]] == ["read", "ingest", "fit", "mesh", "verify"]
-    assert all(stage["seconds"] >= 0 and stage["peak_memory_mb"] > 1 for stage in report["stages"])
+    assert [stage["name"] for stage in report["stages"]] == STAGES
 
 
 def test_progress_is_told_of_stages_steps_and_remarks(scan: Cloud) -> None:
     told = Recorder()
     twice = tuple(np.concatenate([rows, rows[:7]]) for rows in scan)
     result = reconstruct(*twice, progress=told, widths=(200,), steps=2, resolution=32)
-    assert told.stages == ["read", "ingest", "fit", "mesh", "verify"]
+    assert told.stages == STAGES
     assert told.steps == [(1, 2), (2, 2)]
     assert f"Dropped 7 of {len(twice[0])} points at the position of another." in told.remarks
     assert result.report["fit"]["status"] in told.remarks

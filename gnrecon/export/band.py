@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
 from gnrecon.export.lattice import Int, Lattice
 
@@ -41,6 +42,9 @@ OUTSIDE, INSIDE, FIRST = 0, 1, 2
 _LEAVES = CHUNK // LEAF
 _LEAF_NODES = np.stack(np.meshgrid(*3 * [np.arange(LEAF)], indexing="ij"), axis=-1).reshape(-1, 3)
 _CORNERS = tuple(itertools.product((0, 1), repeat=3))
+
+LOCATED = 0.1
+"""About which share of the time has passed when the leaves to evaluate are known."""
 
 
 @dataclass
@@ -79,10 +83,10 @@ class Band:
         values = self.store[self.leaves(chunk)].transpose(0, 3, 1, 4, 2, 5).reshape(side, side, side)
         return values[: CHUNK + 1, : CHUNK + 1, : CHUNK + 1]
 
-    def evaluate(self, leaves: Int) -> None:
+    def evaluate(self, leaves: Int, advance: Advance = unheard) -> None:
         """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
         nodes = (leaves[:, None] * LEAF + _LEAF_NODES).reshape(-1, 3)
-        values = self.lattice.values(nodes, self.slope)
+        values = self.lattice.values(nodes, self.slope, advance)
         values = np.clip(np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values), -LIMIT, LIMIT)
         self.rows[tuple(leaves.T)] = len(self.store) + np.arange(len(leaves), dtype=np.int32)
         self.store = np.concatenate([self.store, values.reshape(-1, LEAF, LEAF, LEAF)])
@@ -104,7 +108,7 @@ class Band:
         return np.unique(np.argwhere(wanted) // LEAF, axis=0) + chunk * _LEAVES
 
 
-def narrow_band(lattice: Lattice, data: Float | None = None) -> Band:
+def narrow_band(lattice: Lattice, data: Float | None = None, advance: Advance = unheard) -> Band:
     """Evaluate the field where its zero level may pass.
 
     Parameters
@@ -112,6 +116,8 @@ def narrow_band(lattice: Lattice, data: Float | None = None) -> Band:
     lattice : Lattice
     data : array of shape (N, 3), lattice coordinates, optional
         Points near which the surface is searched; everywhere when None.
+    advance : callable
+        Told of the share that is done after each batch of points.
 
     Raises
     ------
@@ -126,6 +132,7 @@ def narrow_band(lattice: Lattice, data: Float | None = None) -> Band:
     centers = (blocks * COARSE + COARSE / 2).astype(np.float64)
     slope = _lipschitz(lattice, centers)
     values = lattice.values(centers, slope)
+    advance(LOCATED / 2)
     band = Band(lattice, slope, rows, store)
     tree = None if data is None else _tree(data)
     size = COARSE
@@ -142,7 +149,7 @@ def narrow_band(lattice: Lattice, data: Float | None = None) -> Band:
         size //= 2
         blocks = (blocks[near][:, None] * 2 + np.array(_CORNERS)).reshape(-1, 3)
         values = lattice.values(blocks * size + size / 2, slope)
-    band.evaluate(blocks[near])
+    band.evaluate(blocks[near], part(advance, LOCATED, 1.0))
     _propagate(band)
     return band
 

@@ -14,12 +14,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import MeshError
 from gnrecon.export.band import CHUNK, Band, narrow_band
 from gnrecon.export.lattice import Int, Lattice
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.mesh import Mesh
+
+EVALUATED = 0.9
+"""About which share of the time has passed when the field is known; marching cubes takes the rest."""
 
 
 def extract(
@@ -29,6 +33,7 @@ def extract(
     bounds: Float | None = None,
     data: Float | None = None,
     batch: int = 65536,
+    advance: Advance = unheard,
 ) -> Mesh:
     """Mesh the zero level of a field.
 
@@ -44,6 +49,8 @@ def extract(
         then be left out, which saves most of the work where the field is steep in free space.
     batch : int
         Most points to ask the field for at once.
+    advance : callable
+        Told of the share that is done after each batch, and after each chunk that the surface passes.
 
     Returns
     -------
@@ -59,16 +66,18 @@ def extract(
         When the resolution, the bounds or the batch make no sense.
     """
     lattice = Lattice.over(field, resolution, bounds, batch)
-    band = narrow_band(lattice, None if data is None else lattice.nodes(data))
+    band = narrow_band(lattice, None if data is None else lattice.nodes(data), part(advance, 0.0, EVALUATED))
     keys, places, faces = [], [], []
     count = 0
-    for chunk in band.chunks():
-        part = _march(band, chunk)
-        if part is not None:
-            keys.append(part[0])
-            places.append(part[1])
-            faces.append(part[2] + count)
-            count += len(part[0])
+    chunks = band.chunks()
+    for number, chunk in enumerate(chunks, 1):
+        piece = _march(band, chunk)
+        if piece is not None:
+            keys.append(piece[0])
+            places.append(piece[1])
+            faces.append(piece[2] + count)
+            count += len(piece[0])
+            advance(EVALUATED + (1.0 - EVALUATED) * number / len(chunks))
     if not keys:
         raise MeshError(
             f"The field has no zero level among the {' x '.join(str(n + 1) for n in lattice.cells)} points of its box, "

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.protocol import SignedDistance
@@ -73,7 +74,7 @@ class Lattice:
         coordinates: Float = (self.field.frame.to_unit(points) - self.origin) / self.cell
         return coordinates
 
-    def values(self, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
+    def values(self, nodes: npt.NDArray[np.floating] | Int, slope: float, advance: Advance = unheard) -> Float:
         """Field in cells over its slope, of shape (N,), at lattice coordinates of shape (N, 3), closed at the box.
 
         Closing is the intersection with the box that ends half a cell before the outermost layer, so that this layer
@@ -90,6 +91,7 @@ class Lattice:
         for start in range(0, len(nodes), self.batch):
             rows = slice(start, start + self.batch)
             out[rows] = self.field.sdf(self.world(inside[rows]))
+            advance(min(start + self.batch, len(nodes)) / len(nodes))
         if not np.isfinite(out).all():
             raise MeshError(f"The field is not finite at {np.count_nonzero(~np.isfinite(out))} of {len(out)} points.")
         closed: Float = np.maximum(out / (self.field.frame.scale * self.cell * slope), 0.5 - depth)

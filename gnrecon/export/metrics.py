@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float, PointCloud
 from gnrecon.errors import InputError, UsageError
 from gnrecon.export.definitions import Metrics
@@ -28,6 +29,7 @@ def measure(
     samples: int = 100_000,
     seed: int = 0,
     scale: float | None = None,
+    advance: Advance = unheard,
 ) -> Metrics:
     """Measure a mesh against the surface, or the cloud, that it should be.
 
@@ -43,6 +45,8 @@ def measure(
     scale : float, file units, optional
         What relative figures and the F-score's threshold refer to; by default the reference's radius, the largest
         distance of its vertices from their mean.
+    advance : callable
+        Told of the share that is done.
 
     Raises
     ------
@@ -69,7 +73,10 @@ def measure(
     else:
         on_reference = _samples_of_cloud(reference)
         back = _to_points(on_mesh, on_reference)
-    return _summary(_to_surface(on_reference, mesh), back, radius, samples, isinstance(reference, PointCloud))
+    advance(0.5)
+    there = _to_surface(on_reference, mesh)
+    advance(1.0)
+    return _summary(there, back, radius, samples, isinstance(reference, PointCloud))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.protocol import SignedDistance
@@ -23,7 +24,13 @@ TURN, COLLAPSE = 0.3, 1e-3
 
 
 def project(
-    mesh: Mesh, field: SignedDistance, *, steps: int = 3, limit: float | None = None, batch: int = 65536
+    mesh: Mesh,
+    field: SignedDistance,
+    *,
+    steps: int = 3,
+    limit: float | None = None,
+    batch: int = 65536,
+    advance: Advance = unheard,
 ) -> Mesh:
     """Move vertices onto the zero level and give them normals.
 
@@ -39,6 +46,8 @@ def project(
         Longest way that a vertex may go; by default half the median edge, which is less than half a cell.
     batch : int
         Most points to ask the field for at once.
+    advance : callable
+        Told of the share that is done after each batch.
 
     Returns
     -------
@@ -63,6 +72,7 @@ def project(
     for start in range(0, len(moved), batch):
         rows = slice(start, start + batch)
         moved[rows], value[rows], gradient[rows] = _newton(mesh.vertices[rows], field, steps, limit)
+        advance(min(start + batch, len(moved)) / len(moved))
     back = _undo_turned(mesh, moved)
     lengths = np.linalg.norm(gradient, axis=1, keepdims=True)
     normals = np.divide(gradient, lengths, out=np.zeros_like(gradient), where=lengths > 0)

@@ -23,8 +23,8 @@ from benchmarks.methods import METHODS
 from gnrecon.cloud import Float
 from gnrecon.errors import GnreconError
 from gnrecon.export import measure, verify
+from gnrecon.memory import process_peak_mb
 from gnrecon.mesh import Mesh
-from gnrecon.report import peak_memory_mb
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,12 @@ def main(folder: Path) -> None:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: job.threads])
     points, normals = load_scan(Path(job.scan))
     method = METHODS[job.method]()
-    memory_before = peak_memory_mb()
+    memory_before = process_peak_mb()
     start = time.perf_counter()
     mesh, details = method(points, normals, **job.settings)
     figures: dict[str, Any] = {
         "seconds": time.perf_counter() - start,
-        "peak_memory_mb": peak_memory_mb(),
+        "peak_memory_mb": process_peak_mb(),
         "libraries_memory_mb": memory_before,
     }
     save_mesh(mesh, folder / "mesh.npz")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from benchmarks.alone import run_program
-from gnrecon.report import peak_memory_mb
+from gnrecon.memory import process_peak_mb
 
 
 def run_alone(module: str, function: str, folder: Path, **arguments: Any) -> dict[str, Any]:
@@ -27,23 +27,13 @@ def run_alone(module: str, function: str, folder: Path, **arguments: Any) -> dic
     return run_program("benchmarks.engine.process", job, torch.get_num_threads(), folder)
 
 
-def own_peak_mb() -> float:
-    """Return this program's greatest resident memory so far, in MB."""
-    status = Path("/proc/self/status")
-    # On Linux `getrusage` counts the process that started this one too, as it was then; VmHWM does not.
-    if status.is_file():
-        lines = status.read_text(encoding="utf-8").splitlines()
-        return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:"))
-    return peak_memory_mb()
-
-
 def main(folder: Path) -> None:
     """Do the job in `folder`, leaving figures.json there."""
     job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
     call = getattr(import_module(job["module"]), job["function"])
-    before = own_peak_mb()
+    before = process_peak_mb()
     figures = call(folder=str(folder), **job["arguments"])
-    memory = {"peak_memory_mb": own_peak_mb(), "libraries_memory_mb": before}
+    memory = {"peak_memory_mb": process_peak_mb(), "libraries_memory_mb": before}
     if torch.cuda.is_available():
         memory["peak_device_memory_mb"] = torch.cuda.max_memory_allocated() / 1e6
     (folder / "figures.json").write_text(json.dumps(figures | memory), encoding="utf-8")

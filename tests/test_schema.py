@@ -1,0 +1,188 @@
+"""Every report of a real run follows the published schema, and the schema describes every field of it."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from scan_files import gnrecon, torus, write_scan
+
+import gnrecon as package
+from gnrecon.export import MeshFacts, Metrics
+from gnrecon.ingest import IngestCounts
+from gnrecon.optim import Record
+from gnrecon.options import Options
+from gnrecon.pipeline import Progress, reconstruct
+from gnrecon.schema import SCHEMA_VERSION, report_schema
+
+Report = dict[str, Any]
+
+SMALL = {"resolution": 24, "widths": (200,)}
+RUNS: dict[str, dict[str, Any]] = {
+    "plain": {"steps": 0},
+    "thinned": {"steps": 0, "fraction": 0.5, "subsample": "voxel", "threads": 1},
+    "gauss-newton": {"steps": 2},
+    "line": {"steps": 2, "search": "line", "solver": "qr"},
+    "adam": {"steps": 3, "optimiser": "adam"},
+    "lbfgs": {"steps": 1, "optimiser": "lbfgs"},
+    "deep": {"steps": 3, "widths": (16, 16)},
+    "interrupted": {"steps": 50},
+    "reference": {"steps": 0},
+}
+
+
+class Interrupting(Progress):
+    """Presses Ctrl-C in the second step."""
+
+    def step(self, record: Record, total: int) -> None:
+        if record.step == 2 < total == 50:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def cloud() -> tuple[np.ndarray, np.ndarray]:
+    return torus(1200, np.random.default_rng(3))
+
+
+@pytest.fixture(scope="module")
+def report_of(cloud: tuple[np.ndarray, np.ndarray]) -> Callable[[str], Report]:
+    """The report of a run by name; each run is made once."""
+    made: dict[str, Report] = {}
+
+    def report(name: str) -> Report:
+        if name not in made:
+            truth = package.PointCloud(*cloud) if name == "reference" else None
+            result = reconstruct(*cloud, reference=truth, progress=Interrupting(), **(SMALL | RUNS[name]))
+            made[name] = json.loads(json.dumps(result.report, allow_nan=False))
+        return made[name]
+
+    return report
+
+
+@pytest.fixture(scope="module")
+def validator() -> jsonschema.Draft202012Validator:
+    return jsonschema.Draft202012Validator(report_schema())
+
+
+def test_the_schema_is_one() -> None:
+    jsonschema.Draft202012Validator.check_schema(report_schema())
+    assert report_schema()["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert report_schema()["properties"]["schema_version"]["const"] == SCHEMA_VERSION
+    assert package.report_schema() == report_schema()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_reports_follow_the_schema(
+    name: str, report_of: Callable[[str], Report], validator: jsonschema.Draft202012Validator
+) -> None:
+    report = report_of(name)
+    assert [error.message for error in validator.iter_errors(report)] == []
+    assert report["fit"]["interrupted"] == (name == "interrupted")
+    assert (report["metrics"] is not None) == (name == "reference")
+    assert len(report["fit"]["history"]) == (2 if name == "interrupted" else RUNS[name]["steps"])
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_numbers_of_a_report_hold(name: str, report_of: Callable[[str], Report]) -> None:
+    report = report_of(name)
+    resources, stages, ingest = report["resources"], report["stages"], report["ingest"]
+    rounding = 0.001 * (len(stages) + 1)
+    for key in ("seconds", "cpu_seconds"):
+        assert 0 < sum(stage[key] for stage in stages) <= resources[key] + rounding
+    # What lies between the stages is bookkeeping.
+    assert sum(stage["seconds"] for stage in stages) > 0.9 * resources["seconds"]
+    assert all(10 < stage["peak_memory_mb"] <= resources["peak_memory_mb"] for stage in stages)
+    names = [stage["name"] for stage in stages]
+    assert names == ["read", "ingest", "fit", "extract", "project", "repair", "verify", "measure"][: len(names)]
+    assert ("measure" in names) == (report["metrics"] is not None)
+    dropped = ("non_finite", "zero_normals", "duplicates", "outliers", "thinned")
+    assert ingest["read"] == ingest["kept"] + sum(ingest[reason] for reason in dropped) == 1200
+    if RUNS[name].get("threads"):
+        assert resources["threads"] == RUNS[name]["threads"]
+    times = [record["seconds"] for record in report["fit"]["history"]]
+    assert times == sorted(times)
+
+
+def objects(schema: dict[str, Any], path: str = "report") -> Iterator[tuple[str, dict[str, Any]]]:
+    """All descriptions of objects and values in the schema, with their places."""
+    yield path, schema
+    for name, inner in schema.get("properties", {}).items():
+        yield from objects(inner, f"{path}.{name}")
+    if "items" in schema:
+        yield from objects(schema["items"], f"{path}[]")
+
+
+DESCRIBED = dict(objects(report_schema()))
+
+
+@pytest.mark.parametrize(("path", "schema"), [*DESCRIBED.items()], ids=[*DESCRIBED])
+def test_everything_is_described(path: str, schema: dict[str, Any]) -> None:
+    name = path.split(".")[-1]
+    if not (path.endswith("[]") and "properties" not in schema):
+        assert schema["description"].endswith("."), path
+    if "properties" in schema:
+        assert schema["additionalProperties"] is False
+        assert schema["required"] == list(schema["properties"])
+    for ending, unit in (("seconds", "in seconds"), ("_mb", "in MB of 10^6 bytes")):
+        assert not name.endswith(ending) or unit in schema["description"]
+
+
+@pytest.mark.parametrize(
+    ("place", "names"),
+    [
+        ("options", [field.name for field in fields(Options)]),
+        ("ingest", [field.name for field in fields(IngestCounts)]),
+        ("mesh", [field.name for field in fields(MeshFacts)]),
+        ("metrics", [*(field.name for field in fields(Metrics)), "relative"]),
+        ("fit.history[]", [field.name for field in fields(Record)]),
+    ],
+)
+def test_the_schema_has_the_fields_of_what_it_describes(place: str, names: list[str]) -> None:
+    described = DESCRIBED[f"report.{place}"]["properties"]
+    assert sorted(described) == sorted(names)
+
+
+def containers(value: Any) -> Iterator[dict[str, Any]]:
+    """All objects within a report."""
+    if isinstance(value, dict):
+        yield value
+    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else []:
+        yield from containers(inner)
+
+
+@pytest.mark.parametrize("name", ["gauss-newton", "reference"])
+def test_a_field_that_is_new_or_gone_does_not_pass(
+    name: str, report_of: Callable[[str], Report], validator: jsonschema.Draft202012Validator
+) -> None:
+    report = copy.deepcopy(report_of(name))
+    for found in containers(report):
+        found["brand_new"] = 1
+        assert not validator.is_valid(report)
+        del found["brand_new"]
+        first = next(iter(found))
+        value = found.pop(first)
+        assert not validator.is_valid(report)
+        found[first] = value
+    assert validator.is_valid(report)
+
+
+def test_the_command_line_prints_it_and_its_reports_follow_it(
+    tmp_path: Path, cloud: tuple[np.ndarray, np.ndarray], validator: jsonschema.Draft202012Validator
+) -> None:
+    printed = gnrecon("schema")
+    assert (printed.returncode, printed.stderr) == (0, "")
+    assert json.loads(printed.stdout) == report_schema()
+    scan = write_scan(tmp_path / "ring.ply", *cloud)
+    words = ("--report", tmp_path / "report.json", "--widths", "200", "--steps", "0", "--resolution", "24")
+    done = gnrecon(scan, "-o", tmp_path / "mesh.obj", *words)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [error.message for error in validator.iter_errors(report)] == []
+    assert f"{report['resources']['seconds']:.1f} s" in done.stderr
