@@ -23,16 +23,25 @@ SUMMARY = "summary.json"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scan: exit code 0 and the mesh, or the code and the sentence that says why not."""
+    """What became of one scan: exit code 0, the mesh and its report, or the code and the sentence that says why not."""
 
     scan: str
     mesh: str
+    report: str
     exit_code: int
     message: str
     seconds: float
 
 
-def run_batch(folder: Path, output: Path, mesh_format: str, arguments: Sequence[str], *, quiet: bool = False) -> int:
+def run_batch(
+    folder: Path,
+    output: Path,
+    mesh_format: str,
+    arguments: Sequence[str],
+    *,
+    reports: bool = False,
+    quiet: bool = False,
+) -> int:
     """Reconstruct every readable file of `folder` into `output` and return the exit code.
 
     A JSON summary is written beside the meshes.
@@ -43,6 +52,7 @@ def run_batch(folder: Path, output: Path, mesh_format: str, arguments: Sequence[
     output : made when missing
     mesh_format : extension of the meshes, without the dot
     arguments : passed on to ``gnrecon reconstruct``
+    reports : whether a JSON report is written beside each mesh, under its name with ``.report.json``
 
     Raises
     ------
@@ -64,7 +74,7 @@ def run_batch(folder: Path, output: Path, mesh_format: str, arguments: Sequence[
     try:
         for number, (scan, target) in enumerate(zip(scans, targets, strict=True), 1):
             console.print(f"[{number}/{len(scans)}] {scan}", highlight=False, markup=False)
-            outcomes.append(_one(scan, target, arguments))
+            outcomes.append(_one(scan, target, arguments, reports))
             interrupted = outcomes[-1].exit_code == ExitCode.INTERRUPTED
             if interrupted:
                 break
@@ -106,9 +116,11 @@ def _make(output: Path) -> None:
         raise OutputError(f"The folder {output} cannot be made: {error.strerror or error}.") from error
 
 
-def _one(scan: Path, target: Path, arguments: Sequence[str]) -> Outcome:
+def _one(scan: Path, target: Path, arguments: Sequence[str], reports: bool) -> Outcome:
     """Run one scan; its last line on stderr is the sentence to report."""
+    report = str(target.with_suffix(".report.json")) if reports else ""
     command = [sys.executable, "-m", "gnrecon", "reconstruct", str(scan), "-o", str(target), "--quiet", *arguments]
+    command += ["--report", report] if reports else []
     start = time.perf_counter()
     # No standard input, and output by pipe: nothing of one scan can end up in the batch's own streams.
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
@@ -117,7 +129,8 @@ def _one(scan: Path, target: Path, arguments: Sequence[str]) -> Outcome:
     message = lines[-1].removeprefix("gnrecon: ") if lines and done.returncode else ""
     if done.returncode < 0:
         message = f"Killed by {signal.Signals(-done.returncode).name}."
-    return Outcome(str(scan), str(target) if done.returncode == 0 else "", done.returncode, message, seconds)
+    files = (str(target), report) if done.returncode == 0 else ("", "")
+    return Outcome(str(scan), *files, done.returncode, message, seconds)
 
 
 def _table(outcomes: Sequence[Outcome]) -> Table:

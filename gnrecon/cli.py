@@ -185,6 +185,12 @@ def batch_command(
     device: Device = "cpu",
     threads: Threads = None,
     resolution: Resolution = 256,
+    reports: Annotated[
+        bool,
+        typer.Option(
+            "--reports", help="Write a JSON report beside each mesh: NAME.report.json.", rich_help_panel=OUTPUT
+        ),
+    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -210,7 +216,7 @@ def batch_command(
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
-    raise SystemExit(run_batch(folder, output, mesh_format, passed, quiet=quiet))
+    raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, quiet=quiet))
 
 
 @app.command("doctor")

@@ -30,8 +30,7 @@ from gnrecon.schema import SCHEMA_VERSION
 class Progress:
     """What a caller may want to know while a reconstruction runs; this one ignores everything.
 
-    A method may raise `gnrecon.Cancelled` to end the run, which then returns nothing. It is asked every second or so,
-    except during the linear solve that a fit begins with.
+    Any method may raise `gnrecon.Cancelled` to end the run, which then returns nothing.
     """
 
     def stage(self, name: str) -> None:
@@ -153,7 +152,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         progress.remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
-        sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total))
+        sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total), progress.advance)
     progress.remark(solution.status)
     data = samples.frame.to_world(samples.points)
     mesh, actions = mesh_field(sdf, options, data=data, stages=stages, advance=progress.advance)

@@ -145,10 +145,10 @@ class Shown(PipelineProgress):
             self._bar.update(self._task, completed=share, total=1.0)
 
     def step(self, record: Record, total: int) -> None:
-        """Show a step's loss, damping and gain ratio, and the time left."""
+        """Show a step's loss, damping and gain ratio."""
         detail = f"loss {record.loss:.3e}  damping {record.damping:.1e}  gain {record.gain_ratio:.2f}"
         if self._task is not None:
-            self._bar.update(self._task, completed=record.step, total=total, detail=detail)
+            self._bar.update(self._task, detail=detail)
         if self._verbose:
             self._console.print(
                 f"step {record.step:4d}/{total}  {detail}", highlight=False, markup=False, soft_wrap=True

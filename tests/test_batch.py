@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from scan_files import FAST_WORDS, box, gnrecon, torus, write_scan
@@ -13,6 +14,7 @@ from scan_files import FAST_WORDS, box, gnrecon, torus, write_scan
 from gnrecon.batch import run_batch
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.export import verify_file
+from gnrecon.schema import report_schema
 
 
 def write_good(folder: Path) -> None:
@@ -36,20 +38,24 @@ def test_bad_files_are_named_and_stop_nothing(tmp_path: Path) -> None:
     (scans / "void.ply").touch()
     (scans / "letter.txt").write_text("Dear reader,\nthis is a letter.\n")
     (scans / "README.md").write_text("No extension of a scan, so it is passed over.\n")
-    done = gnrecon("batch", scans, "-o", meshes, *FAST_WORDS, "--format", "off")
+    done = gnrecon("batch", scans, "-o", meshes, *FAST_WORDS, "--format", "off", "--reports")
     assert done.returncode == ExitCode.BATCH, done.stderr
     assert done.stdout == ""
     assert "2 of 5 scans reconstructed" in done.stderr
-    assert sorted(path.name for path in meshes.iterdir()) == ["plate.off", "ring.off", "summary.json"]
+    written = ["plate.off", "plate.report.json", "ring.off", "ring.report.json", "summary.json"]
+    assert sorted(path.name for path in meshes.iterdir()) == written
     assert verify_file(meshes / "ring.off").genus == 1
     assert verify_file(meshes / "plate.off").genus == 0
     scan = summary(meshes)
     assert list(scan) == ["letter.txt", "plate.xyz", "ring.ply", "torn.ply", "void.ply"]
     assert scan["ring.ply"]["mesh"] == str(meshes / "ring.off")
     assert scan["ring.ply"]["message"] == ""
+    report = json.loads(Path(str(scan["ring.ply"]["report"])).read_text())
+    assert report["input"] == str(scans / "ring.ply")
+    jsonschema.validate(report, report_schema())
     for name, cause in (("torn.ply", "declares 1200"), ("void.ply", "is empty"), ("letter.txt", "neither numbers")):
         assert scan[name]["exit_code"] == ExitCode.INPUT
-        assert scan[name]["mesh"] == ""
+        assert (scan[name]["mesh"], scan[name]["report"]) == ("", "")
         assert f"{scans / name}: " in str(scan[name]["message"])
         assert cause in str(scan[name]["message"])
 
@@ -58,7 +64,7 @@ def test_a_folder_of_good_scans_alone(tmp_path: Path) -> None:
     write_good(tmp_path)
     done = gnrecon("batch", tmp_path, "-o", tmp_path / "meshes", "--quiet", *FAST_WORDS)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert {scan["exit_code"] for scan in summary(tmp_path / "meshes").values()} == {0}
+    assert {(scan["exit_code"], scan["report"]) for scan in summary(tmp_path / "meshes").values()} == {(0, "")}
     assert verify_file(tmp_path / "meshes" / "ring.obj").genus == 1
 
 

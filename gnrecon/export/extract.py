@@ -78,6 +78,7 @@ def extract(
             faces.append(piece[2] + count)
             count += len(piece[0])
             advance(EVALUATED + (1.0 - EVALUATED) * number / len(chunks))
+    advance(1.0)
     if not keys:
         raise MeshError(
             f"The field has no zero level among the {' x '.join(str(n + 1) for n in lattice.cells)} points of its box, "

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.field.siren import Siren
 from gnrecon.fit.loss import data_terms, start_terms, step_terms
 from gnrecon.fit.method import optimiser_for
@@ -60,12 +61,18 @@ HELD_OUT_PATIENCE = 20
 
 
 def fit_deep(
-    field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
+    field: Siren,
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    callback: Callback | None,
+    advance: Advance = unheard,
 ) -> Solution:
-    """Fit a network of several hidden layers."""
+    """Fit a network of several hidden layers; `advance` is told when the start is made."""
     steps = options.steps_for(len(scene.points))
     fitted, held = hold_out(scene, rng)
     theta = spectral_start(field, fitted, lambda x, d, n: start_terms(fitted, options, rng, x, d, n), rng)
+    advance(1.0)
     # Signing volume samples takes as long as a step, so that one pool serves for all of them.
     pool = tuple(scene.tensor(values) for values in fitted.volume(POOL, rng))
 

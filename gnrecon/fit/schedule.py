@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
@@ -13,11 +14,17 @@ from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.wide import fit_wide
-from gnrecon.optim import Callback, Solution
+from gnrecon.optim import Callback, Record, Solution
+
+STARTED = 0.3
+"""About which share of the time has passed when the start is made, where steps follow."""
 
 
 def fit(
-    samples: Samples, options: FitOptions | None = None, callback: Callback | None = None
+    samples: Samples,
+    options: FitOptions | None = None,
+    callback: Callback | None = None,
+    advance: Advance = unheard,
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a sine network to the signed distance of oriented points.
 
@@ -28,6 +35,7 @@ def fit(
     samples : points and normals of shape (N, 3) in the unit ball, with their frame
     options : choices of network, start and steps
     callback : called with the record of each step
+    advance : told of the share that is done, of the start and of the most steps that may follow
 
     Raises
     ------
@@ -38,7 +46,16 @@ def fit(
     rng = np.random.default_rng(options.seed)
     scene = Scene.of(samples, options.device, rng)
     field = Siren(options.widths_for(len(samples)))
-    fitted = (fit_wide if len(field.widths) == 1 else fit_deep)(field, scene, options, rng, callback)
+    steps = options.steps_for(len(samples))
+    started = STARTED if steps else 1.0
+
+    def told(record: Record) -> None:
+        if callback is not None:
+            callback(record)
+        advance(started + (1.0 - started) * record.step / steps)
+
+    method = fit_wide if len(field.widths) == 1 else fit_deep
+    fitted = method(field, scene, options, rng, told, part(advance, 0.0, started))
     if not bool(torch.isfinite(fitted.theta).all()):
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())

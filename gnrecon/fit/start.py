@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
 from gnrecon.fit.problem import FieldProblem
@@ -54,8 +55,12 @@ def random_features(width: int, rng: np.random.Generator, like: Tensor) -> tuple
     return torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like)
 
 
-def wide_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator) -> Tensor:
+def wide_start(
+    field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator, advance: Advance = unheard
+) -> Tensor:
     """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
+
+    `advance` is told of the share of the rounds that is done.
 
     Raises
     ------
@@ -70,6 +75,7 @@ def wide_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Gen
         last = round_number + 1 == ROUNDS
         terms = terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS if last else SEARCH_POINTS)
         theta = solve_last_layer(field, terms, theta)
+        advance((round_number + 1) / ROUNDS)
         if not last:
             trial, expected = scene.volume(3 * scene.volume_count, rng)
             value = field.value(theta, scene.tensor(trial)).cpu().numpy()

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.advance import Advance, unheard
 from gnrecon.field.siren import Siren
 from gnrecon.fit.loss import start_terms, step_terms
 from gnrecon.fit.method import optimiser_for
@@ -24,10 +25,15 @@ MAX_STEP_POINTS = 4000
 
 
 def fit_wide(
-    field: Siren, scene: Scene, options: FitOptions, rng: np.random.Generator, callback: Callback | None
+    field: Siren,
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    callback: Callback | None,
+    advance: Advance = unheard,
 ) -> Solution:
-    """Fit a network of one hidden layer."""
-    theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng)
+    """Fit a network of one hidden layer; `advance` is told of the share of the start that is done."""
+    theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng, advance)
     whole = options.optimiser != "gn"
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
