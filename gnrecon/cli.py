@@ -98,6 +98,14 @@ Threads = Annotated[int | None, typer.Option(help="CPU threads; torch's choice w
 Resolution = Annotated[
     int, typer.Option(help="Cells along the longest side of the box; at least 16.", rich_help_panel=MESH)
 ]
+Attributes = Annotated[
+    str,
+    typer.Option(
+        help="What vertices carry: auto (all that the scan's points do, and their distance), none, or names such as "
+        "colors,intensity.",
+        rich_help_panel=MESH,
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -127,6 +135,7 @@ def reconstruct_command(
     device: Device = "cpu",
     threads: Threads = None,
     resolution: Resolution = 256,
+    attributes: Attributes = "auto",
     reference: Annotated[
         Path | None,
         typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
@@ -158,6 +167,7 @@ def reconstruct_command(
         "device": device,
         "threads": threads,
         "resolution": resolution,
+        "attributes": attributes,
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(scan, output, reference, report, preview, overwrite)
@@ -185,6 +195,7 @@ def batch_command(
     device: Device = "cpu",
     threads: Threads = None,
     resolution: Resolution = 256,
+    attributes: Attributes = "auto",
     reports: Annotated[
         bool,
         typer.Option(
@@ -213,6 +224,7 @@ def batch_command(
         "--device": device,
         "--threads": threads,
         "--resolution": resolution,
+        "--attributes": attributes,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug

@@ -23,6 +23,9 @@ class Options:
         How the kept points are chosen.
     outliers : ``"auto"``, ``"on"`` or ``"off"``
         Whether scattered points are removed; ``"auto"`` leaves them when they are more than 5 % of all.
+    attributes : str
+        Of the vertices: ``"auto"`` carries over all that the scan holds of its points (colours, labels, measured
+        values) and adds ``distance``, to the nearest of them; ``"none"``; or names of these, separated by commas.
     resolution : int
         Cells of the extraction along the longest side of the shape's box.
     widths, steps, normal_residual, optimiser, solver, search, seed, device
@@ -40,6 +43,7 @@ class Options:
     max_points: int | None = None
     subsample: str = "random"
     outliers: str = "auto"
+    attributes: str = "auto"
     resolution: int = 256
     widths: tuple[int, ...] | None = None
     steps: int | None = None
@@ -60,6 +64,8 @@ class Options:
             raise UsageError(f"The seed must not be negative, not {self.seed}.")
         if self.widths is not None and not isinstance(self.widths, list | tuple):
             raise UsageError(f"The widths must be a sequence such as (2000,), not {self.widths!r}.")
+        if not all(name.strip() for name in self.attributes.split(",")):
+            raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
         self.fit()
 
     @classmethod

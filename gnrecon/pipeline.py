@@ -13,9 +13,10 @@ from typing import Any
 import numpy.typing as npt
 import torch
 
+from gnrecon.adorn import Sources, adorn, wanted
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.export import MeshFacts, Metrics, measure, require_sound, verify_file
+from gnrecon.export import Attribute, MeshFacts, Metrics, measure, require_sound, verify_file
 from gnrecon.fit import NeuralSDF, fit
 from gnrecon.ingest import IngestCounts, prepare
 from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
@@ -146,6 +147,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         cloud = _cloud(source, normals)
         progress.advance(0.5)
         truth = _reference(reference)
+    wanted(cloud, options.attributes)  # a misspelt name is refused before the work
     with stages("ingest"):
         samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
     for sentence in counts.remarks():
@@ -160,11 +162,15 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         progress.remark(sentence)
     with stages("verify"):
         facts = require_sound(mesh)
+    with stages("attributes"):
+        mesh, attributes, remarks = adorn(Sources(mesh, sdf, cloud, samples, options), progress.advance)
+    for sentence in remarks:
+        progress.remark(sentence)
     metrics = None
     if truth is not None:
         with stages("measure"):
             metrics = measure(mesh, truth, seed=options.seed, advance=progress.advance)
-    report = _report(source, options, stages, counts, solution, sdf, facts, actions, metrics)
+    report = _report(source, options, stages, counts, solution, sdf, facts, actions, attributes, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
 
 
@@ -213,6 +219,7 @@ def _report(
     sdf: NeuralSDF,
     facts: MeshFacts,
     actions: list[str],
+    attributes: list[Attribute],
     metrics: Metrics | None,
 ) -> dict[str, Any]:
     found = {
@@ -231,6 +238,7 @@ def _report(
         },
         "mesh": facts.as_dict(),
         "actions": actions,
+        "attributes": [{"name": one.name, "origin": one.origin} for one in attributes],
         "metrics": None if metrics is None else metrics.as_dict(),
         "stages": stages.as_list(),
         "resources": stages.resources(),

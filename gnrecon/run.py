@@ -28,6 +28,7 @@ STAGES = {
     "project": "Projecting",
     "repair": "Repairing",
     "verify": "Verifying",
+    "attributes": "Carrying",
     "measure": "Measuring",
     "write": "Writing",
 }

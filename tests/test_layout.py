@@ -18,7 +18,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # From the ground up; a room imports from lower rows and from itself, never from its neighbours in the row.
 ROWS = [
     {"errors", "version", "system_packages"},
-    {"cloud", "mesh", "atomic", "advance", "memory"},
+    {"cloud", "mesh", "atomic", "advance", "memory", "colors"},
     {"linalg"},
     {"optim"},
     {"field"},
@@ -26,7 +26,7 @@ ROWS = [
     {"sampling"},
     {"fit", "ingest", "io", "export"},
     {"options", "report", "schema", "shapes"},
-    {"meshing"},
+    {"meshing", "adorn"},
     {"pipeline"},
     {"run"},
     {"batch", "doctor"},

@@ -26,7 +26,7 @@ RADIUS = 1 + TUBE
 # Enough to reach every stage, where the mesh itself does not matter.
 TINY = {"widths": (200,), "steps": 0, "resolution": 24}
 
-STAGES = ["read", "ingest", "fit", "extract", "project", "repair", "verify"]
+STAGES = ["read", "ingest", "fit", "extract", "project", "repair", "verify", "attributes"]
 
 Cloud = tuple[np.ndarray, np.ndarray]
 

@@ -1,8 +1,11 @@
-"""From a field to a verified mesh: extract, project, repair, verify, measure, draw."""
+"""From a field to a verified mesh: extract, project, repair, verify, measure, draw, and attributes."""
 
+from gnrecon.export.attribute import Attribute
+from gnrecon.export.carry import carry
 from gnrecon.export.definitions import Metrics
 from gnrecon.export.extract import extract
 from gnrecon.export.metrics import measure
+from gnrecon.export.neighbours import Neighbourhood
 from gnrecon.export.picture import render
 from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
@@ -11,9 +14,12 @@ from gnrecon.export.stray import remove_stray
 from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
 
 __all__ = [
+    "Attribute",
     "MeshFacts",
     "Metrics",
+    "Neighbourhood",
     "SignedDistance",
+    "carry",
     "extract",
     "measure",
     "project",

@@ -1,0 +1,102 @@
+"""What a finished mesh is told of each of its vertices: a stage of the pipeline, after all that moves vertices.
+
+To add an attribute, write a function from `Sources` to attributes and sentences, and a line in `MAKERS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+from gnrecon.advance import Advance, unheard
+from gnrecon.cloud import PointCloud, Samples
+from gnrecon.errors import UsageError
+from gnrecon.export import Attribute, Neighbourhood, carry
+from gnrecon.fit import NeuralSDF
+from gnrecon.mesh import Mesh
+from gnrecon.options import Options
+
+
+@dataclass(frozen=True)
+class Sources:
+    """All that attributes are made from.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        In its final state, in file units.
+    sdf : NeuralSDF
+        The field that it was extracted from.
+    cloud : PointCloud
+        The scan as it was read.
+    samples : Samples
+        What the fit saw of it.
+    options : Options
+    """
+
+    mesh: Mesh
+    sdf: NeuralSDF
+    cloud: PointCloud
+    samples: Samples
+    options: Options
+
+    @cached_property
+    def around(self) -> Neighbourhood:
+        """The scanned points, as a search tree."""
+        return Neighbourhood(self.cloud.points)
+
+
+Made = tuple[list[Attribute], list[str]]
+"""Attributes, and sentences about what could not be made."""
+
+
+def adorn(sources: Sources, advance: Advance = unheard) -> tuple[Mesh, list[Attribute], list[str]]:
+    """Return the mesh with its attributes, the attributes themselves, and sentences for the user."""
+    attributes: list[Attribute] = []
+    sentences: list[str] = []
+    for number, maker in enumerate(MAKERS):
+        advance(number / len(MAKERS))
+        made, remarks = maker(sources)
+        attributes += made
+        sentences += remarks
+    return sources.mesh.with_attributes({one.name: one.values for one in attributes}), attributes, sentences
+
+
+def wanted(cloud: PointCloud, attributes: str) -> list[str]:
+    """Return the names of a cloud's attributes that ``--attributes`` asks for; ``distance`` may be among them.
+
+    Raises
+    ------
+    UsageError
+        When a name is neither ``distance`` nor one of the cloud's.
+    """
+    offered = list(dict.fromkeys(["distance", *cloud.attributes]))
+    if attributes in ("auto", "none"):
+        return offered if attributes == "auto" else []
+    names = [name.strip() for name in attributes.split(",")]
+    for name in names:
+        if name not in offered:
+            raise UsageError(f"There is no attribute {name!r} to carry over; this scan offers {', '.join(offered)}.")
+    return names
+
+
+def _distance(sources: Sources) -> Made:
+    """How far each vertex lies from the nearest scanned point, in file units."""
+    if "distance" not in wanted(sources.cloud, sources.options.attributes):
+        return [], []
+    distances = sources.around.distances(sources.mesh.vertices)
+    return [Attribute("distance", distances, "distance to the nearest point as read, file units")], []
+
+
+def _carried(sources: Sources) -> Made:
+    """Whatever the scan holds of its points."""
+    names = [name for name in wanted(sources.cloud, sources.options.attributes) if name in sources.cloud.attributes]
+    if "distance" not in names:
+        return carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+    names.remove("distance")
+    attributes, sentences = carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+    return attributes, [*sentences, "The points' attribute 'distance' gives way to the distance from the points."]
+
+
+MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried)

@@ -1,0 +1,90 @@
+"""Whole reconstructions carry what their scans hold, and the distance to them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from scan_files import torus
+
+from gnrecon.adorn import wanted
+from gnrecon.cloud import PointCloud
+from gnrecon.errors import UsageError
+from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+
+FAST = {"widths": (300,), "steps": 0, "resolution": 32}
+
+
+class Told(Progress):
+    """Remembers stages and remarks."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.remarks: list[str] = []
+
+    def stage(self, name: str) -> None:
+        self.stages.append(name)
+
+    def remark(self, sentence: str) -> None:
+        self.remarks.append(sentence)
+
+
+@pytest.fixture(scope="module")
+def scan() -> PointCloud:
+    """A torus of two halves, red and blue, at another height each."""
+    points, normals = torus(1200, np.random.default_rng(5))
+    red = points[:, :1] > 0
+    colors = np.where(red, [200, 0, 0], [0, 0, 200]).astype(np.uint8)
+    return PointCloud(points, normals, {"colors": colors, "height": points[:, 2], "half": red[:, 0].astype(np.int16)})
+
+
+@pytest.fixture(scope="module")
+def result(scan: PointCloud) -> Reconstruction:
+    return reconstruct(scan, **FAST)
+
+
+def test_a_mesh_looks_like_its_scan(scan: PointCloud, result: Reconstruction) -> None:
+    vertices, found = result.mesh.vertices, result.mesh.attributes
+    clear = np.abs(vertices[:, 0]) > 0.25
+    right = vertices[:, 0] > 0
+    expected = np.where(right[:, None], [200, 0, 0], [0, 0, 200])
+    assert np.array_equal(found["colors"][clear], expected[clear])
+    assert np.array_equal(found["half"][clear], right[clear].astype(np.int16))
+    assert np.abs(found["height"] - vertices[:, 2]).max() < 0.15
+    away = np.linalg.norm(vertices[:, None] - scan.points, axis=2).min(axis=1)
+    np.testing.assert_allclose(found["distance"], away, atol=1e-12)
+
+
+def test_the_report_says_how_each_was_made(result: Reconstruction) -> None:
+    listed = json.loads(json.dumps(result.report["attributes"]))
+    assert [one["name"] for one in listed] == ["distance", "colors", "height", "half"] == list(result.mesh.attributes)
+    assert listed[1]["origin"] == "weighted mean in linear light of the 8 nearest points"
+    assert listed[3]["origin"].startswith("greatest weight")
+
+
+@pytest.mark.parametrize(
+    ("asked", "given"), [("none", []), ("height", ["height"]), ("half, distance", ["distance", "half"])]
+)
+def test_only_what_is_asked_for(scan: PointCloud, asked: str, given: list[str]) -> None:
+    mesh = reconstruct(scan, attributes=asked, **FAST).mesh
+    assert list(mesh.attributes) == given
+
+
+def test_a_misspelt_name_is_refused_before_the_fit(scan: PointCloud) -> None:
+    told = Told()
+    with pytest.raises(UsageError, match=r"no attribute 'colour'.*offers distance, colors, height, half"):
+        reconstruct(scan, attributes="colour", progress=told)
+    assert told.stages == ["read"]
+    with pytest.raises(UsageError, match="names separated by commas, not 'a,,b'"):
+        reconstruct(scan, attributes="a,,b")
+
+
+def test_a_scan_with_distances_of_its_own_is_told_that_they_give_way(scan: PointCloud) -> None:
+    told = Told()
+    own: dict[str, Any] = {"distance": np.full(len(scan), 9.0)}
+    mesh = reconstruct(PointCloud(scan.points, scan.normals, own), progress=told, **FAST).mesh
+    assert mesh.attributes["distance"].max() < 1
+    assert "The points' attribute 'distance' gives way to the distance from the points." in told.remarks
+    assert wanted(PointCloud(scan.points, None, own), "auto") == ["distance"]
