@@ -36,6 +36,7 @@ class Stages:
         self._sampled = False
         self._start, self._cpu_start = time.perf_counter(), time.process_time()
         if self._on_cuda:
+            torch.cuda.current_device()  # makes torch's context, without which there is nothing to reset
             torch.cuda.reset_peak_memory_stats(device)
 
     @contextmanager

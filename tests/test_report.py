@@ -61,6 +61,7 @@ def test_the_gpu_is_asked_for_the_peak_of_this_run(monkeypatch: pytest.MonkeyPat
     answers = {"reset_peak_memory_stats": None, "max_memory_allocated": 2_500_000, "get_device_name": "A GPU"}
     for name, answer in answers.items():
         monkeypatch.setattr(torch.cuda, name, lambda device, n=name, a=answer: (asked.append((n, device)), a)[1])
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     stages = Stages(ignored, "cuda:1")
     assert asked == [("reset_peak_memory_stats", "cuda:1")]
     resources = stages.resources()

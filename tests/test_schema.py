@@ -24,15 +24,15 @@ from gnrecon.schema import SCHEMA_VERSION, report_schema
 
 Report = dict[str, Any]
 
-SMALL = {"resolution": 24, "widths": (200,)}
+SMALL = {"resolution": 24, "widths": (100,), "max_points": 400}
 RUNS: dict[str, dict[str, Any]] = {
     "plain": {"steps": 0},
-    "thinned": {"steps": 0, "fraction": 0.5, "subsample": "voxel", "threads": 1},
+    "thinned": {"steps": 0, "max_points": None, "fraction": 0.5, "subsample": "voxel", "threads": 1},
     "gauss-newton": {"steps": 2},
     "line": {"steps": 2, "search": "line", "solver": "qr"},
     "adam": {"steps": 3, "optimiser": "adam"},
     "lbfgs": {"steps": 1, "optimiser": "lbfgs"},
-    "deep": {"steps": 3, "widths": (16, 16)},
+    "deep": {"steps": 3, "widths": (16, 16), "max_points": None},
     "interrupted": {"steps": 50},
     "reference": {"steps": 0},
 }
@@ -86,6 +86,8 @@ def test_reports_follow_the_schema(
     assert [error.message for error in validator.iter_errors(report)] == []
     assert report["fit"]["interrupted"] == (name == "interrupted")
     assert (report["metrics"] is not None) == (name == "reference")
+    # From a thousand points on, deep fits keep some to check on.
+    assert {record["held_out"] is None for record in report["fit"]["history"]} <= {name != "deep"}
     assert len(report["fit"]["history"]) == (2 if name == "interrupted" else RUNS[name]["steps"])
 
 

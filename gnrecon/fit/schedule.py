@@ -16,7 +16,7 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Callback, Record, Solution
 
-STARTED = 0.3
+WIDE_STARTED, DEEP_STARTED = 0.4, 0.05
 """About which share of the time has passed when the start is made, where steps follow."""
 
 
@@ -47,14 +47,14 @@ def fit(
     scene = Scene.of(samples, options.device, rng)
     field = Siren(options.widths_for(len(samples)))
     steps = options.steps_for(len(samples))
-    started = STARTED if steps else 1.0
+    method, started = (fit_wide, WIDE_STARTED) if len(field.widths) == 1 else (fit_deep, DEEP_STARTED)
+    started = started if steps else 1.0
 
     def told(record: Record) -> None:
         if callback is not None:
             callback(record)
         advance(started + (1.0 - started) * record.step / steps)
 
-    method = fit_wide if len(field.widths) == 1 else fit_deep
     fitted = method(field, scene, options, rng, told, part(advance, 0.0, started))
     if not bool(torch.isfinite(fitted.theta).all()):
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
