@@ -70,7 +70,7 @@ def ledger(cloud: Cloud) -> Ledger:
 def test_shares_only_grow_from_nothing_to_all(ledger: Ledger) -> None:
     for stage, shares in ledger.shares.items():
         assert shares == sorted(shares), stage
-        assert all(0 < share <= 1 for share in shares), stage
+        assert all(0 <= share <= 1 for share in shares), stage
     for stage in ("fit", "extract", "project", "measure"):
         assert ledger.shares[stage][-1] == pytest.approx(1), stage
     # Three rounds of the start, and two steps.

@@ -34,6 +34,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "lbfgs": {"steps": 1, "optimiser": "lbfgs"},
     "deep": {"steps": 3, "widths": (16, 16), "max_points": None},
     "interrupted": {"steps": 50},
+    "attributes": {"steps": 0},
     "reference": {"steps": 0},
 }
 
@@ -51,6 +52,12 @@ def cloud() -> tuple[np.ndarray, np.ndarray]:
     return torus(1200, np.random.default_rng(3))
 
 
+def coloured(points: np.ndarray, normals: np.ndarray) -> package.PointCloud:
+    """The same points with a colour and a measured value each."""
+    colors = np.full((len(points), 3), 200, dtype=np.uint8)
+    return package.PointCloud(points, normals, {"colors": colors, "intensity": points[:, 2]})
+
+
 @pytest.fixture(scope="module")
 def report_of(cloud: tuple[np.ndarray, np.ndarray]) -> Callable[[str], Report]:
     """The report of a run by name; each run is made once."""
@@ -59,7 +66,8 @@ def report_of(cloud: tuple[np.ndarray, np.ndarray]) -> Callable[[str], Report]:
     def report(name: str) -> Report:
         if name not in made:
             truth = package.PointCloud(*cloud) if name == "reference" else None
-            result = reconstruct(*cloud, reference=truth, progress=Interrupting(), **(SMALL | RUNS[name]))
+            scan = coloured(*cloud) if name == "attributes" else package.PointCloud(*cloud)
+            result = reconstruct(scan, reference=truth, progress=Interrupting(), **(SMALL | RUNS[name]))
             made[name] = json.loads(json.dumps(result.report, allow_nan=False))
         return made[name]
 
@@ -86,6 +94,8 @@ def test_reports_follow_the_schema(
     assert [error.message for error in validator.iter_errors(report)] == []
     assert report["fit"]["interrupted"] == (name == "interrupted")
     assert (report["metrics"] is not None) == (name == "reference")
+    carried = [one["name"] for one in report["attributes"]]
+    assert ({"colors", "intensity"} <= set(carried)) == (name == "attributes")
     # From a thousand points on, deep fits keep some to check on.
     assert {record["held_out"] is None for record in report["fit"]["history"]} <= {name != "deep"}
     assert len(report["fit"]["history"]) == (2 if name == "interrupted" else RUNS[name]["steps"])
@@ -102,8 +112,7 @@ def test_the_numbers_of_a_report_hold(name: str, report_of: Callable[[str], Repo
     assert sum(stage["seconds"] for stage in stages) > 0.9 * resources["seconds"]
     assert all(10 < stage["peak_memory_mb"] <= resources["peak_memory_mb"] for stage in stages)
     names = [stage["name"] for stage in stages]
-    known = ["read", "ingest", "fit", "extract", "project", "repair", "verify", "attributes", "measure"]
-    assert names == known[: len(names)]
+    assert names == [known for known in STAGES if known in names]
     assert ("measure" in names) == (report["metrics"] is not None)
     dropped = ("non_finite", "zero_normals", "duplicates", "outliers", "thinned")
     assert ingest["read"] == ingest["kept"] + sum(ingest[reason] for reason in dropped) == 1200
@@ -111,6 +120,11 @@ def test_the_numbers_of_a_report_hold(name: str, report_of: Callable[[str], Repo
         assert resources["threads"] == RUNS[name]["threads"]
     times = [record["seconds"] for record in report["fit"]["history"]]
     assert times == sorted(times)
+
+
+def test_every_stage_is_explained() -> None:
+    explained = DESCRIBED["report.stages[].name"]["description"]
+    assert [name for name in STAGES if f"{name}: " not in explained] == []
 
 
 def objects(schema: dict[str, Any], path: str = "report") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -123,6 +137,7 @@ def objects(schema: dict[str, Any], path: str = "report") -> Iterator[tuple[str,
 
 
 DESCRIBED = dict(objects(report_schema()))
+STAGES = DESCRIBED["report.stages[].name"]["enum"]
 
 
 @pytest.mark.parametrize(("path", "schema"), [*DESCRIBED.items()], ids=[*DESCRIBED])
