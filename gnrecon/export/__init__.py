@@ -3,6 +3,7 @@
 from gnrecon.export.attribute import Attribute
 from gnrecon.export.carry import carry
 from gnrecon.export.definitions import Metrics
+from gnrecon.export.examine import Findings, examine
 from gnrecon.export.extract import extract
 from gnrecon.export.metrics import measure
 from gnrecon.export.neighbours import Neighbourhood
@@ -15,11 +16,13 @@ from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
 
 __all__ = [
     "Attribute",
+    "Findings",
     "MeshFacts",
     "Metrics",
     "Neighbourhood",
     "SignedDistance",
     "carry",
+    "examine",
     "extract",
     "measure",
     "project",

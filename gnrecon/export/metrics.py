@@ -51,9 +51,9 @@ def measure(
     Raises
     ------
     InputError
-        When either has nothing to measure, or the reference's points all coincide.
+        When either has nothing to measure or coordinates that are not finite.
     UsageError
-        When `samples` or `scale` is not positive.
+        When `samples` or `scale` is not positive, or the reference's points all coincide.
     """
     if samples < 1:
         raise UsageError(f"The number of samples is {samples}, but must be at least 1.")
@@ -62,6 +62,9 @@ def measure(
     anchor = reference.vertices if isinstance(reference, Mesh) else reference.points
     if not len(anchor) or (isinstance(reference, Mesh) and not len(reference.faces)):
         raise InputError("The reference has neither faces nor points, so there is nothing to measure against.")
+    for name, positions in (("mesh", mesh.vertices), ("reference", anchor)):
+        if broken := int((~np.isfinite(positions)).any(axis=1).sum()):
+            raise InputError(f"The {name} has {broken} points that are not finite, so distances cannot be measured.")
     radius = float(np.linalg.norm(anchor - anchor.mean(axis=0), axis=1).max()) if scale is None else scale
     if not radius > 0:
         raise UsageError(f"Distances cannot be given relative to a scale of {radius}, which is not positive.")

@@ -1,4 +1,4 @@
-"""The nearest points of a surface, found by open3d's ray-casting tree.
+"""The nearest points of a surface, found by open3d's ray-casting tree, and which points lie inside of it.
 
 The tree works in float32. Positions are therefore centred and scaled to one first, and the foot point is computed again
 in float64 from the nearest triangle and its barycentric coordinates: a rounding of 1e-7 then shifts the foot along the
@@ -10,10 +10,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.export.solid import centre_and_size
 from gnrecon.mesh import Int, Mesh
+
+RAYS = 5
+"""Rays that vote on whether a point lies inside: one alone may graze an edge and count it twice, or not at all."""
 
 
 def ray_scene(vertices: Float, faces: Int) -> Any:
@@ -26,22 +30,51 @@ def ray_scene(vertices: Float, faces: Int) -> Any:
     return scene
 
 
+class Surface:
+    """A mesh with faces, ready for many queries.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    batch : int
+        Most points that the tree is asked for at once.
+    """
+
+    def __init__(self, mesh: Mesh, batch: int = 1_000_000) -> None:
+        self._centre, self._size = centre_and_size(mesh)
+        self._scene = ray_scene((mesh.vertices - self._centre) / self._size, mesh.faces)
+        self._corners, self._batch = mesh.corners, batch
+
+    def nearest(self, points: Float) -> tuple[Float, Int]:
+        """Return the nearest points of the surface, of shape (N, 3), and their faces, for points of shape (N, 3)."""
+        feet = np.empty((len(points), 3))
+        faces = np.empty(len(points), dtype=np.int64)
+        for rows in self._batches(len(points)):
+            answer = self._scene.compute_closest_points(self._queries(points[rows]))
+            faces[rows] = answer["primitive_ids"].numpy()
+            u, v = np.moveaxis(answer["primitive_uvs"].numpy().astype(np.float64), 1, 0)
+            weights = np.stack([1 - u - v, u, v], axis=1)
+            feet[rows] = np.einsum("ij,ijk->ik", weights, self._corners[faces[rows]])
+        return feet, faces
+
+    def inside(self, points: Float) -> npt.NDArray[np.bool_]:
+        """Return which points, of shape (N, 3), a closed surface encloses, to about 1e-7 of its size."""
+        inside = np.empty(len(points), dtype=bool)
+        for rows in self._batches(len(points)):
+            answer = self._scene.compute_occupancy(self._queries(points[rows]), nsamples=RAYS)
+            inside[rows] = answer.numpy() > 0
+        return inside
+
+    def _queries(self, points: Float) -> Any:
+        from open3d import core
+
+        return core.Tensor.from_numpy(((points - self._centre) / self._size).astype(np.float32))
+
+    def _batches(self, count: int) -> list[slice]:
+        return [slice(start, start + self._batch) for start in range(0, count, self._batch)]
+
+
 def nearest_on_surface(mesh: Mesh, points: Float, batch: int = 1_000_000) -> tuple[Float, Int]:
     """Distance to a surface, in its units, and the nearest face, for points of shape (N, 3)."""
-    from open3d import core
-
-    centre, size = centre_and_size(mesh)
-    scene = ray_scene((mesh.vertices - centre) / size, mesh.faces)
-    corners = mesh.corners
-    distances = np.empty(len(points))
-    faces = np.empty(len(points), dtype=np.int64)
-    for start in range(0, len(points), batch):
-        rows = slice(start, start + batch)
-        queries = ((points[rows] - centre) / size).astype(np.float32)
-        answer = scene.compute_closest_points(core.Tensor.from_numpy(queries))
-        faces[rows] = answer["primitive_ids"].numpy()
-        u, v = np.moveaxis(answer["primitive_uvs"].numpy().astype(np.float64), 1, 0)
-        weights = np.stack([1 - u - v, u, v], axis=1)
-        feet = np.einsum("ij,ijk->ik", weights, corners[faces[rows]])
-        distances[rows] = np.linalg.norm(points[rows] - feet, axis=1)
-    return distances, faces
+    feet, faces = Surface(mesh, batch).nearest(points)
+    return np.linalg.norm(points - feet, axis=1), faces

@@ -104,12 +104,12 @@ def require_sound(mesh: Mesh) -> MeshFacts:
     if broken:
         raise MeshError(f"The mesh has {broken} vertices that are not finite.")
     facts = verify(mesh)
-    failure = _first_failure(facts)
-    if failure is None:
+    failed = failures(facts)
+    if not failed:
         error = refusal(to_solid(mesh, merge=False))
-        failure = f"is refused by manifold3d ({error})" if error else None
-    if failure is not None:
-        raise MeshError(f"The mesh {failure}.")
+        failed = [f"is refused by manifold3d ({error})"] if error else []
+    if failed:
+        raise MeshError(f"The mesh {failed[0]}.")
     return facts
 
 
@@ -131,8 +131,9 @@ def verify_file(path: str | Path) -> MeshFacts:
         raise MeshError(f"{path}, read back: {error}") from error
 
 
-def _first_failure(facts: MeshFacts) -> str | None:
-    failures = (
+def failures(facts: MeshFacts) -> list[str]:
+    """Say all that keeps a mesh from bounding a solid, as ends of a sentence that begins with "The mesh"."""
+    sentences = (
         (facts.faces == 0, "is empty"),
         (facts.degenerate_faces > 0, f"has {facts.degenerate_faces} faces that name a vertex twice"),
         (not facts.closed, f"is open: {facts.boundary_edges} edges have only one face"),
@@ -141,4 +142,4 @@ def _first_failure(facts: MeshFacts) -> str | None:
         (facts.split_vertices > 0, f"has {facts.split_vertices} vertices where several fans of faces touch"),
         (facts.volume <= 0, f"is inside out: its volume is {facts.volume:.6g}"),
     )
-    return next((sentence for failed, sentence in failures if failed), None)
+    return [sentence for failed, sentence in sentences if failed]

@@ -1,0 +1,1 @@
+"""What the command line does beside reconstructing, one file for each command, each with one function that does it."""
