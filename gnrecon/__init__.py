@@ -18,22 +18,34 @@ from gnrecon.mesh import Mesh
 from gnrecon.version import __version__
 
 if TYPE_CHECKING:
-    from gnrecon.export import extract, measure, project, remove_stray, render, repair, require_sound, verify
+    from gnrecon.export import examine, extract, measure, project, remove_stray, render, repair, require_sound, verify
     from gnrecon.fit import FitOptions, NeuralSDF, fit
     from gnrecon.ingest import prepare
     from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
     from gnrecon.options import Options
     from gnrecon.pipeline import Progress, Reconstruction, reconstruct
     from gnrecon.schema import report_schema
+    from gnrecon.shaping import Shape, shaped
 
 _ROOMS = {
-    "gnrecon.export": ("extract", "measure", "project", "remove_stray", "render", "repair", "require_sound", "verify"),
+    "gnrecon.export": (
+        "examine",
+        "extract",
+        "measure",
+        "project",
+        "remove_stray",
+        "render",
+        "repair",
+        "require_sound",
+        "verify",
+    ),
     "gnrecon.fit": ("FitOptions", "NeuralSDF", "fit"),
     "gnrecon.ingest": ("prepare",),
     "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
     "gnrecon.options": ("Options",),
     "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
     "gnrecon.schema": ("report_schema",),
+    "gnrecon.shaping": ("Shape", "shaped"),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
@@ -53,9 +65,11 @@ __all__ = [
     "Progress",
     "Reconstruction",
     "Samples",
+    "Shape",
     "UsageError",
     "__version__",
     "as_cloud",
+    "examine",
     "extract",
     "fit",
     "measure",
@@ -69,6 +83,7 @@ __all__ = [
     "repair",
     "report_schema",
     "require_sound",
+    "shaped",
     "to_open3d",
     "to_trimesh",
     "verify",

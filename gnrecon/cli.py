@@ -1,4 +1,4 @@
-"""The command line: ``gnrecon scan.ply -o mesh.obj``, ``gnrecon batch``, ``gnrecon doctor``.
+"""The command line: ``gnrecon scan.ply -o mesh.obj``, and the other commands by their names.
 
 A first word that names no command is a scan. Results go to files, figures that were asked for to stdout, everything
 else to stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon.errors`.
@@ -22,7 +22,7 @@ from gnrecon.version import __version__
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
 _CommandLineError: Any = typer.BadParameter.__mro__[2]
 
-COMMANDS = ("reconstruct", "batch", "doctor", "schema")
+COMMANDS = ("reconstruct", "batch", "mesh", "eval", "check", "doctor", "schema")
 DEFAULT_COMMAND = "reconstruct"
 
 app = typer.Typer(
@@ -106,6 +106,10 @@ Attributes = Annotated[
         rich_help_panel=MESH,
     ),
 ]
+Output = Annotated[
+    Path,
+    typer.Option("-o", "--output", help="Mesh to write: .obj, .ply, .stl, .off or .glb.", rich_help_panel=OUTPUT),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -117,10 +121,7 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show a traceback on failur
 @app.command(DEFAULT_COMMAND)
 def reconstruct_command(
     scan: Annotated[Path, typer.Argument(help="PLY, PCD, XYZ, PTS, TXT, CSV, OBJ, OFF or STL file.")],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="Mesh to write: .obj, .ply, .stl, .off or .glb.", rich_help_panel=OUTPUT),
-    ],
+    output: Output,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
     subsample: Subsample = "random",
@@ -143,6 +144,10 @@ def reconstruct_command(
     report: Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=OUTPUT)] = None,
     preview: Annotated[
         Path | None, typer.Option(help="PNG picture of scan and mesh to write.", rich_help_panel=OUTPUT)
+    ] = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(help="Fitted field to write, a .gnr file that gnrecon mesh reads.", rich_help_panel=OUTPUT),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -170,7 +175,7 @@ def reconstruct_command(
         "attributes": attributes,
     }
     del debug  # read from the arguments by `main`, which handles failures
-    files = Files(scan, output, reference, report, preview, overwrite)
+    files = Files(scan, output, reference, report, preview, save, overwrite)
     raise SystemExit(run(files, options, quiet=quiet, verbose=verbose))
 
 
@@ -229,6 +234,91 @@ def batch_command(
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
     raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, quiet=quiet))
+
+
+@app.command("mesh")
+def mesh_command(
+    model: Annotated[Path, typer.Argument(help="Fitted field, a .gnr file that --save wrote.")],
+    output: Output,
+    resolution: Resolution = 256,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is the box's then, and cuts "
+            "are closed by flat caps.",
+            rich_help_panel=MESH,
+        ),
+    ] = None,
+    offset: Annotated[
+        str,
+        typer.Option(
+            help="Move the surface outward, inward if negative: 0.5, or 2mm with --units.", rich_help_panel=MESH
+        ),
+    ] = "0",
+    shell: Annotated[
+        str | None,
+        typer.Option(help="Hollow the solid to a wall of this thickness, measured inward.", rich_help_panel=MESH),
+    ] = None,
+    units: Annotated[
+        str | None,
+        typer.Option(
+            help="The file's own unit (um, mm, cm, m, km, in, ft), for lengths with a suffix.", rich_help_panel=MESH
+        ),
+    ] = None,
+    attributes: Annotated[
+        str,
+        typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=MESH),
+    ] = "auto",
+    threads: Threads = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Mesh a fitted field again, without refitting: at another resolution, cropped, offset, or as a hollow shell."""
+    import numpy as np
+
+    from gnrecon.commands.remesh import remesh
+    from gnrecon.lengths import parse_box, parse_length
+    from gnrecon.shaping import Shape
+
+    del debug
+    shape = Shape(
+        parse_length(offset, units),
+        None if shell is None else parse_length(shell, units),
+        None if crop is None else np.array(parse_box(crop)),
+    )
+    options = {"resolution": resolution, "attributes": attributes, "threads": threads}
+    raise SystemExit(remesh(model, output, options, shape, overwrite=overwrite, quiet=quiet))
+
+
+@app.command("eval")
+def eval_command(
+    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF or GLB file.")],
+    reference: Annotated[Path, typer.Option(help="Mesh or cloud to measure it against.")],
+    samples: Annotated[int, typer.Option(help="Points drawn on each surface.")] = 100_000,
+    seed: Seed = 0,
+    report: Annotated[Path | None, typer.Option("--json", help="JSON file to write.", rich_help_panel=OUTPUT)] = None,
+    overwrite: Overwrite = False,
+    debug: Debug = False,
+) -> None:
+    """Print how far a mesh lies from a reference: Chamfer, RMS, Hausdorff, F-score, normal consistency."""
+    from gnrecon.commands.evaluate import evaluate
+
+    del debug
+    raise SystemExit(evaluate(mesh, reference, samples=samples, seed=seed, report=report, overwrite=overwrite))
+
+
+@app.command("check")
+def check_command(
+    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF or GLB file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Tell whether a mesh bounds a solid: exit code 0 if it is a closed, oriented 2-manifold, 5 if it is not."""
+    from gnrecon.commands.check import check
+
+    del debug
+    raise SystemExit(check(mesh, as_json=as_json))
 
 
 @app.command("doctor")

@@ -6,6 +6,8 @@ The way of the data: file -> cloud -> samples -> fitted field -> mesh -> report.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,12 +124,24 @@ def reconstruct(
     """
     chosen = Options.of(**options)
     _require_device(chosen.device)
-    progress = progress or Progress()
-    threads = torch.get_num_threads()
+    with limited(chosen.threads):
+        return _run(source, normals, reference, progress or Progress(), chosen)
+
+
+@contextmanager
+def limited(threads: int | None) -> Iterator[None]:
+    """Run a block with so many of torch's threads (None: as many as before), and say so where memory does not suffice.
+
+    Raises
+    ------
+    MemoryLimitError
+        When an allocation in the block failed.
+    """
+    before = torch.get_num_threads()
     try:
-        if chosen.threads is not None:
-            torch.set_num_threads(chosen.threads)
-        return _run(source, normals, reference, progress, chosen)
+        if threads is not None:
+            torch.set_num_threads(threads)
+        yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
         raise
     except MemoryError as error:
@@ -138,7 +152,7 @@ def reconstruct(
             raise _out_of_memory(error) from error
         raise
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)
 
 
 def _run(source: Any, normals: Any, reference: Any, progress: Progress, options: Options) -> Reconstruction:
@@ -156,8 +170,8 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         total = options.fit().steps_for(len(samples))
         sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total), progress.advance)
     progress.remark(solution.status)
-    data = samples.frame.to_world(samples.points)
-    mesh, actions = mesh_field(sdf, options, data=data, stages=stages, advance=progress.advance)
+    # The field's own points, so that a saved field makes the same mesh again.
+    mesh, actions = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
     for sentence in actions:
         progress.remark(sentence)
     with stages("verify"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gnrecon.atomic import atomic_write
-from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
+from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import render
+from gnrecon.files import require_files
 from gnrecon.io import check_writable, read_cloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress as PipelineProgress
@@ -27,6 +28,8 @@ STAGES = {
     "extract": "Extracting",
     "project": "Projecting",
     "repair": "Repairing",
+    "offset": "Offsetting",
+    "cut": "Cutting",
     "verify": "Verifying",
     "attributes": "Carrying",
     "measure": "Measuring",
@@ -43,6 +46,7 @@ class Files:
     reference: Path | None = None
     report: Path | None = None
     preview: Path | None = None
+    model: Path | None = None
     overwrite: bool = False
 
     def check(self) -> None:
@@ -60,24 +64,11 @@ class Files:
         check_writable(self.output)
         if self.preview is not None and self.preview.suffix.lower() != ".png":
             raise UsageError(f"The preview is a PNG picture, so it cannot be called {self.preview}.")
+        if self.model is not None and self.model.suffix.lower() != ".gnr":
+            raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
         inputs = [path for path in (self.scan, self.reference) if path is not None]
-        for path in inputs:
-            if not path.exists():
-                raise InputError(f"There is no file {path}.")
-        targets = [path for path in (self.output, self.report, self.preview) if path is not None]
-        for index, target in enumerate(targets):
-            if any(_same(target, other) for other in [*inputs, *targets[:index]]):
-                raise UsageError(f"{target} is named twice; an input or another output is never overwritten.")
-            if not target.parent.is_dir():
-                raise OutputError(f"{target} cannot be written: the folder {target.parent} does not exist.")
-            if target.exists() and not self.overwrite:
-                raise OutputError(f"{target} exists already; choose another name or add --overwrite.")
-
-
-def _same(one: Path, other: Path) -> bool:
-    if one.exists() and other.exists():
-        return one.samefile(other)
-    return one.resolve() == other.resolve()
+        targets = [path for path in (self.output, self.report, self.preview, self.model) if path is not None]
+        require_files(inputs, targets, self.overwrite)
 
 
 def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: bool = False) -> int:
@@ -90,13 +81,13 @@ def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: 
     """
     files.check()
     console = Console(stderr=True, quiet=quiet)
-    with _shown(console, verbose) as progress:
+    with shown(console, verbose) as progress:
         result = reconstruct(files.scan, reference=files.reference, progress=progress, **options)
         progress.stage("write")
         warnings = _write(files, result)
-    for sentence in warnings:
+    summary = summarise(files.output, result.report["mesh"], result.report["resources"])
+    for sentence in [*warnings, summary]:
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
-    console.print(_summary(files, result), highlight=False, markup=False, soft_wrap=True)
     if result.metrics is not None:
         print("\n".join(result.metrics.describe()))
     if result.interrupted:
@@ -115,13 +106,16 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
         if files.preview is not None:
             picture = stack.enter_context(atomic_write(files.preview, files.overwrite))
             render(result.mesh, picture, size=(1200, 600), points=read_cloud(files.scan))
+        if files.model is not None:
+            model = stack.enter_context(atomic_write(files.model, files.overwrite))
+            result.sdf.save(model, overwrite=True)
         return result.save(files.output, files.overwrite)
 
 
-def _summary(files: Files, result: Reconstruction) -> str:
-    facts, resources = result.report["mesh"], result.report["resources"]
+def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, Any]) -> str:
+    """Return a line about a written mesh, from the facts and resources of the report."""
     return (
-        f"{files.output}: {facts['vertices']} vertices, {facts['faces']} faces, {facts['components']} component"
+        f"{output}: {facts['vertices']} vertices, {facts['faces']} faces, {facts['components']} component"
         f"{'s' if facts['components'] != 1 else ''}, genus {facts['genus']}, closed and manifold, volume "
         f"{facts['volume']:.6g}; {resources['seconds']:.1f} s, {resources['peak_memory_mb']:.0f} MB."
     )
@@ -161,7 +155,8 @@ class Shown(PipelineProgress):
 
 
 @contextmanager
-def _shown(console: Console, verbose: bool) -> Iterator[Shown]:
+def shown(console: Console, verbose: bool) -> Iterator[Shown]:
+    """Show a bar on a terminal while the block runs, and give what must be told of stages, steps and remarks."""
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:10}"),

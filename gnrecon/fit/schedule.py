@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from gnrecon.advance import Advance, part, unheard
@@ -18,6 +19,9 @@ from gnrecon.optim import Callback, Record, Solution
 
 WIDE_STARTED, DEEP_STARTED = 0.4, 0.05
 """About which share of the time has passed when the start is made, where steps follow."""
+
+MOST_SUPPORT = 20_000
+"""Points that stay with a field, so that meshing it later can tell surface from what was invented."""
 
 
 def fit(
@@ -58,5 +62,14 @@ def fit(
     fitted = method(field, scene, options, rng, told, part(advance, 0.0, started))
     if not bool(torch.isfinite(fitted.theta).all()):
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
-    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
+    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict(), _support(samples))
     return sdf, fitted
+
+
+def _support(samples: Samples) -> npt.NDArray[np.float32]:
+    """Return the points, or some of them where they are many, in their order, of shape (N, 3)."""
+    rows = np.arange(len(samples))
+    if len(rows) > MOST_SUPPORT:
+        # By chance, because a scanner's order has patterns; and by chance of its own, so that the fit's is untouched.
+        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_SUPPORT, replace=False))
+    return samples.points[rows].astype(np.float32)

@@ -32,6 +32,8 @@ class NeuralSDF:
     frame : the similarity from unit to file coordinates
     box : where the field was fitted, in unit coordinates
     options : what the fit was asked to do, as plain values
+    support : points that the field was fitted to, of shape (N, 3), unit coordinates; where there were many, some of
+        them; None where they are not known
     """
 
     field: Siren
@@ -39,6 +41,7 @@ class NeuralSDF:
     frame: Frame
     box: Box
     options: Mapping[str, Any] = dataclass_field(default_factory=dict)
+    support: npt.NDArray[np.float32] | None = None
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Write the field to one file, conventionally `.gnr`, see `gnrecon.fit.model_file`."""
@@ -61,6 +64,11 @@ class NeuralSDF:
     def bounds(self) -> Float:
         """Lower and upper corner of the box within which the field may be trusted, of shape (2, 3), file units."""
         return self.frame.to_world(np.stack([self.box.lower, self.box.upper]))
+
+    @property
+    def data(self) -> Float | None:
+        """The points that support the field, of shape (N, 3), file units, to about 1e-7 of the radius."""
+        return None if self.support is None else self.frame.to_world(self.support.astype(np.float64))
 
     def sdf(self, points: npt.ArrayLike) -> Float:
         """Return signed distances, of shape (N,), at `points`, of shape (N, 3), all in file units."""

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
-from gnrecon.cloud import Frame
+from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import InputError, OutputError
 from gnrecon.field import Siren
-from gnrecon.fit import FitOptions, NeuralSDF
+from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.sampling import Box
 
 UNIT = Frame(np.zeros(3), 1.0)
@@ -108,6 +110,62 @@ def test_a_file_brings_back_every_bit(tmp_path: Path, widths: tuple[int, ...], d
     again = tmp_path / "again.gnr"
     loaded.save(again)
     assert NeuralSDF.load(again).options == loaded.options
+
+
+def with_support(count: int = 30) -> NeuralSDF:
+    return replace(random_field(), support=points(count).astype(np.float32))
+
+
+def test_the_data_stays_with_the_field(tmp_path: Path) -> None:
+    sdf = with_support()
+    sdf.save(tmp_path / "model.gnr")
+    loaded = NeuralSDF.load(tmp_path / "model.gnr")
+    assert loaded.support.dtype == np.float32
+    assert np.array_equal(loaded.support, sdf.support)
+    assert np.abs(loaded.data - UTM.to_world(points(30))).max() < 1e-7 * UTM.scale
+    assert np.array_equal(loaded.single().data, loaded.data)
+
+
+def test_files_of_earlier_versions_hold_no_data(tmp_path: Path) -> None:
+    random_field().save(tmp_path / "model.gnr")
+    loaded = NeuralSDF.load(tmp_path / "model.gnr")
+    assert loaded.support is None
+    assert loaded.data is None
+
+
+def test_a_fit_keeps_at_most_20000_points_of_its_own() -> None:
+    directions = np.random.default_rng(3).normal(size=(20_500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    samples = Samples(directions, directions, UNIT)
+    sdf, _ = fit(samples, FitOptions(widths=(20,), steps=0))
+    assert len(sdf.support) == 20_000
+    order = {tuple(row): number for number, row in enumerate(directions.astype(np.float32).tolist())}
+    rows = [order[tuple(row)] for row in sdf.support.tolist()]
+    assert rows == sorted(set(rows))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "sentence"),
+    [
+        ("theta", float("nan"), "'theta' that are not finite"),
+        ("support", float("inf"), "'support' that are not finite"),
+        ("frame.scale", 0.0, "without extent"),
+        ("box", 0.5, "without extent"),
+    ],
+)
+def test_numbers_that_no_fit_makes(tmp_path: Path, name: str, values: float, sentence: str) -> None:
+    path = tmp_path / "model.gnr"
+    with_support().save(path)
+    with safe_open(path, framework="pt") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    tensors[name] = torch.full_like(tensors[name], values)
+    save_file(tensors, path, metadata)
+    with pytest.raises(InputError, match=sentence):
+        NeuralSDF.load(path)
+    for wrong in (torch.zeros(4), torch.zeros(2, 3, 4)):
+        save_file({**tensors, name: wrong}, path, metadata)
+        with pytest.raises(InputError, match=r"shape|parameters|numbers|extent"):
+            NeuralSDF.load(path)
 
 
 def test_the_same_field_makes_the_same_file(tmp_path: Path) -> None:

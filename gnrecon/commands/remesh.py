@@ -1,0 +1,76 @@
+"""``gnrecon mesh MODEL -o MESH``: mesh a fitted field again without refitting: finer, cropped, offset, hollowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from gnrecon.adorn import wanted
+from gnrecon.cloud import PointCloud
+from gnrecon.errors import ExitCode
+from gnrecon.export import Neighbourhood, require_sound, verify_file
+from gnrecon.files import require_files
+from gnrecon.fit import NeuralSDF
+from gnrecon.io import check_writable, write_mesh
+from gnrecon.mesh import Mesh
+from gnrecon.options import Options
+from gnrecon.pipeline import limited
+from gnrecon.report import Stages
+from gnrecon.run import shown, summarise
+from gnrecon.shaping import Shape, shaped
+
+
+def remesh(
+    model: Path, output: Path, options: dict[str, Any], shape: Shape, *, overwrite: bool = False, quiet: bool = False
+) -> int:
+    """Mesh a saved field, write the mesh once it is verified, and return the exit code 0.
+
+    Parameters
+    ----------
+    model : a file that `NeuralSDF.save` wrote
+    output : the mesh; its extension names the format
+    options : of the meshing, by their names in `Options`
+    shape : offset, shell and crop, in file units
+    overwrite : whether an existing mesh may be replaced
+    quiet : say nothing but failures
+
+    Raises
+    ------
+    UsageError, InputError, MeshError, OutputError, MemoryLimitError
+        Each says in one sentence what is wrong; nothing is written then.
+    """
+    check_writable(output)
+    require_files([model], [output], overwrite)
+    chosen = Options.of(**options)
+    distance = "distance" in wanted(PointCloud(np.empty((0, 3))), chosen.attributes)
+    console = Console(stderr=True, quiet=quiet)
+    with shown(console, verbose=False) as progress, limited(chosen.threads):
+        stages = Stages(progress.stage)
+        with stages("read"):
+            sdf = NeuralSDF.load(model)
+        mesh, remarks = shaped(sdf, chosen, shape, stages=stages, advance=progress.advance)
+        with stages("verify"):
+            facts = require_sound(mesh)
+        if distance:
+            with stages("attributes"):
+                mesh = _with_distance(mesh, sdf, shape)
+        progress.stage("write")
+        losses = write_mesh(mesh, output, overwrite, verify=_verify)
+    summary = summarise(output, facts.as_dict(), stages.resources())
+    for sentence in [*remarks, *losses, summary]:
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    return ExitCode.OK
+
+
+def _with_distance(mesh: Mesh, sdf: NeuralSDF, shape: Shape) -> Mesh:
+    """Tell each vertex how far it lies from the model's points, where the mesh is the surface that they lie on."""
+    if sdf.data is None or shape.levels != (0.0,):
+        return mesh
+    return mesh.with_attributes({"distance": Neighbourhood(sdf.data).distances(mesh.vertices)})
+
+
+def _verify(path: Path) -> None:
+    verify_file(path)

@@ -1,0 +1,57 @@
+"""Lengths as people write them: a plain number is in the file's unit; with a suffix, that unit must be known."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from gnrecon.errors import UsageError
+
+METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+
+_LENGTH = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", re.IGNORECASE)
+
+
+def parse_length(text: str, units: str | None) -> float:
+    """Return a length in the file's unit.
+
+    Parameters
+    ----------
+    text : such as ``2mm``, ``-0.5`` or ``1e-3 m``
+    units : the file's unit, a name of `METRES`, or None where it is not known
+
+    Raises
+    ------
+    UsageError
+        When `text` is no length, a unit is unknown, or it has a suffix and the file's unit is not known.
+    """
+    if units is not None and units not in METRES:
+        raise UsageError(f"The file's unit must be one of {', '.join(METRES)}, not {units!r}.")
+    match = _LENGTH.fullmatch(text)
+    if match is None or not math.isfinite(float(match[1])):
+        raise UsageError(f"{text!r} is not a length such as 0.5 or 2mm.")
+    suffix = match[2].lower()
+    if not suffix:
+        return float(match[1])
+    if suffix not in METRES:
+        raise UsageError(f"{text!r} has an unknown unit; use one of {', '.join(METRES)}, or a plain number.")
+    if units is None:
+        raise UsageError(f"{text!r} needs the file's own unit to be converted: add --units, such as --units mm.")
+    return float(match[1]) * (METRES[suffix] / METRES[units])
+
+
+def parse_box(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return lower and upper corner of a box written as six numbers ``xmin,ymin,zmin,xmax,ymax,zmax``.
+
+    Raises
+    ------
+    UsageError
+        When these are not six finite numbers, or an upper one is not above its lower one.
+    """
+    try:
+        x, y, z, u, v, w = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"{text!r} is not a box: six numbers xmin,ymin,zmin,xmax,ymax,zmax are expected.") from None
+    if not all(map(math.isfinite, (x, y, z, u, v, w))) or not (x < u and y < v and z < w):
+        raise UsageError(f"{text!r} is not a box: its lower corner must come first, and each side have some length.")
+    return (x, y, z), (u, v, w)

@@ -1,0 +1,179 @@
+"""A fitted field's solid in other shapes than its own: offset, hollowed, cropped.
+
+The order is: mesh the field, near the crop only and as finely as the crop asks for; extract surfaces at a distance from
+that mesh; take the inner one away for a shell; cut the crop's box out last, so that a cropped shell is open to see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gnrecon.advance import Advance, unheard
+from gnrecon.cloud import Float
+from gnrecon.errors import MeshError, UsageError
+from gnrecon.export.cut import crop, subtract
+from gnrecon.export.nearest import nearest_on_surface
+from gnrecon.export.offset import OffsetField
+from gnrecon.fit import NeuralSDF
+from gnrecon.mesh import Mesh
+from gnrecon.meshing import StageTimer, mesh_field, untimed
+from gnrecon.options import Options
+
+MARGIN = 3
+"""Cells beyond a crop that are meshed too, so that what closes the surface there is cut away."""
+
+PROBE = 48
+"""Points along each side of the box in which the deepest place of a solid is looked for."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What to make of a solid; lengths in file units.
+
+    Parameters
+    ----------
+    offset : float
+        How far the surface is moved outward, inward where negative.
+    shell : float, optional
+        Thickness of the wall that is left, measured inward from the surface, offset included.
+    crop : array of shape (2, 3), optional
+        Lower and upper corner of the box that is kept.
+
+    Raises
+    ------
+    UsageError
+        When the thickness is not positive.
+    """
+
+    offset: float = 0.0
+    shell: float | None = None
+    crop: Float | None = None
+
+    def __post_init__(self) -> None:
+        if self.shell is not None and not self.shell > 0:
+            raise UsageError(f"The thickness of a shell must be positive, not {self.shell:g}.")
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Distances from the zero level at which surfaces are wanted: the outer, and the inner of a shell."""
+        return (self.offset,) if self.shell is None else (self.offset, self.offset - self.shell)
+
+
+def shaped(
+    sdf: NeuralSDF,
+    options: Options,
+    shape: Shape,
+    *,
+    stages: StageTimer = untimed,
+    advance: Advance = unheard,
+) -> tuple[Mesh, list[str]]:
+    """Mesh a field in the given shape.
+
+    Parameters
+    ----------
+    sdf : NeuralSDF
+    options : Options
+        The resolution is that of the crop where there is one, else of the field's box.
+    shape : Shape
+    stages, advance : callables
+        Of `gnrecon.meshing.mesh_field`; the further stages are ``offset`` and ``cut``.
+
+    Returns
+    -------
+    Mesh
+        Closed, with normals, in file units.
+    list of str
+        A sentence for each thing that a user should know: what was dropped, repaired, or is not supported by data.
+
+    Raises
+    ------
+    UsageError
+        When the crop misses the field's box, or the shape leaves nothing of the solid.
+    MeshError
+        When there is no zero level, or no sound mesh can be made of it.
+    """
+    cell = float(np.ptp(sdf.bounds if shape.crop is None else shape.crop, axis=0).max()) / options.resolution
+    region = sdf.bounds
+    if shape.crop is not None:
+        # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
+        region = _around(shape.crop, max(map(abs, shape.levels)) + MARGIN * cell, sdf.bounds)
+    data, remarks = _data(sdf, region)
+    mesh, actions = mesh_field(
+        sdf, _at(options, region, cell), data=data, bounds=region, stages=stages, advance=advance
+    )
+    remarks += actions
+    surfaces = []
+    for level in shape.levels:
+        surface = mesh
+        if level != 0:
+            with stages("offset"):
+                surface, actions = _offset(mesh, level, sdf, options, cell, shape.crop, advance)
+            remarks += actions
+        surfaces.append(surface)
+    if len(surfaces) == 1 and shape.crop is None:
+        return surfaces[0], remarks
+    with stages("cut"):
+        result = surfaces[0] if len(surfaces) == 1 else subtract(*surfaces)
+        return result if shape.crop is None else crop(result, shape.crop), remarks
+
+
+def _around(box: Float, reach: float, limits: Float) -> Float:
+    """The part within `limits` of a box with so much more on each side; all boxes of shape (2, 3)."""
+    low, high = np.maximum(box[0] - reach, limits[0]), np.minimum(box[1] + reach, limits[1])
+    if not (low < high).all():
+        raise UsageError(f"The crop lies outside of the model, whose box is {_corners(limits)}.")
+    return np.stack([low, high])
+
+
+def _corners(box: Float) -> str:
+    return ",".join(f"{number:.9g}" for number in box.ravel())
+
+
+def _at(options: Options, region: Float, cell: float) -> Options:
+    """The same options for another box, with cells of the given size."""
+    return replace(options, resolution=max(16, int(np.ceil(np.ptp(region, axis=0).max() / cell - 1e-9))))
+
+
+def _data(sdf: NeuralSDF, region: Float) -> tuple[Float | None, list[str]]:
+    """The points that tell which parts of the mesh are real, and a sentence where there are none."""
+    if sdf.data is None:
+        return None, ["The model holds no points of its scan, so that parts which no data supports are not dropped."]
+    near = sdf.data[((sdf.data >= region[0]) & (sdf.data <= region[1])).all(axis=1)]
+    if not len(near):
+        return None, ["None of the model's points lie in the box, so that what the mesh shows there was not scanned."]
+    return near, []
+
+
+def _offset(
+    mesh: Mesh, level: float, sdf: NeuralSDF, options: Options, cell: float, box: Float | None, advance: Advance
+) -> tuple[Mesh, list[str]]:
+    """The surface at a distance from a mesh, and how far from it its vertices were found to lie."""
+    reach = max(level, 0.0) + MARGIN * cell
+    bounds = np.stack([mesh.vertices.min(axis=0) - reach, mesh.vertices.max(axis=0) + reach])
+    if box is not None:
+        bounds = _around(box, MARGIN * cell, bounds)
+    field = OffsetField(mesh, level, sdf.frame, bounds)
+    try:
+        surface, remarks = mesh_field(field, _at(options, bounds, cell), data=None, bounds=bounds, advance=advance)
+    except MeshError:
+        _require_depth(field, bounds)
+        raise
+    inner = ((surface.vertices > bounds[0] + 2 * cell) & (surface.vertices < bounds[1] - 2 * cell)).all(axis=1)
+    lengths = nearest_on_surface(mesh, surface.vertices[inner])[0]
+    if not len(lengths):
+        return surface, remarks
+    found = f"{lengths.mean():.6g} units from the zero level on average, {lengths.min():.6g} to {lengths.max():.6g}"
+    return surface, [*remarks, f"The surface offset by {level:g} lies {found}."]
+
+
+def _require_depth(field: OffsetField, bounds: Float) -> None:
+    """Say so where the reason for a missing surface is that the solid is not so deep."""
+    axes = [np.linspace(low, high, PROBE) for low, high in bounds.T]
+    values = field.sdf(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+    if values.min() >= 0:
+        deepest = max(0.0, -(float(values.min()) + field.level))
+        raise UsageError(
+            f"An offset of {field.level:g} leaves nothing: the solid is nowhere deeper than about {deepest:.3g} units."
+        )

@@ -1,0 +1,156 @@
+"""`--save` keeps the fitted field beside the mesh, and `gnrecon mesh` meshes it again."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import CommandLine
+from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, torus, write_scan
+
+from gnrecon.errors import ExitCode
+from gnrecon.export import verify_file
+from gnrecon.fit import NeuralSDF
+from gnrecon.io import read_mesh
+
+
+@pytest.fixture
+def command(capfd: pytest.CaptureFixture[str]) -> CommandLine:
+    return CommandLine(capfd)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A torus as a scan, a mesh without attributes and a model."""
+    folder = tmp_path_factory.mktemp("model")
+    scan = write_scan(folder / "ring.ply", *torus(1200, np.random.default_rng(3)))
+    files = ("-o", folder / "ring.obj", "--save", folder / "ring.gnr", "--attributes", "none")
+    done = gnrecon(scan, *files, *FAST_WORDS)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture
+def model(folder: Path) -> Path:
+    return folder / "ring.gnr"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_nothing_but_what_was_asked_for_is_written(folder: Path) -> None:
+    assert names(folder) == ["ring.gnr", "ring.obj", "ring.ply"]
+    sdf = NeuralSDF.load(folder / "ring.gnr")
+    assert len(sdf.data) == 1200
+    assert np.abs(sdf.sdf(sdf.data)).max() < 0.05
+
+
+def test_the_same_resolution_gives_the_same_bytes(model: Path, folder: Path, tmp_path: Path) -> None:
+    done = gnrecon("mesh", model, "-o", tmp_path / "again.obj", "--resolution", 48, "--attributes", "none")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "again.obj").read_bytes() == (folder / "ring.obj").read_bytes()
+    assert done.stdout == ""
+    assert "genus 1, closed and manifold" in done.stderr
+
+
+def test_a_finer_mesh_of_the_same_field(model: Path, folder: Path, tmp_path: Path, command: CommandLine) -> None:
+    words = ("mesh", model, "-o", tmp_path / "fine.ply", "--resolution", 80, "--quiet")
+    done = command(*words)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    facts = verify_file(tmp_path / "fine.ply")
+    assert (facts.components, facts.genus) == (1, 1)
+    assert facts.volume == pytest.approx(TORUS_VOLUME, rel=0.02)
+    assert facts.faces > 2 * len(read_mesh(folder / "ring.obj").faces)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
+def test_offset_shell_and_crop_at_once(model: Path, tmp_path: Path, command: CommandLine, suffix: str) -> None:
+    shape = ("--offset", "-20mm", "--units", "m", "--shell", "0.1", "--crop", "-2,-2,-2,2,2,0")
+    target = tmp_path / f"bowl.{suffix}"
+    done = command("mesh", model, "-o", target, "--resolution", 48, *shape)
+    assert done.returncode == 0, done.stderr
+    assert "offset by -0.02 lies 0.0" in done.stderr
+    assert "offset by -0.12 lies 0.1" in done.stderr
+    facts = verify_file(target)
+    assert facts.components == 1
+    # Half a torus of tube 0.28 without one of tube 0.18.
+    assert facts.volume == pytest.approx(np.pi**2 * (0.28**2 - 0.18**2), rel=0.03)
+    assert read_mesh(target).vertices[:, 2].max() == pytest.approx(0, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--offset", "2mm"), "needs the file's own unit"),
+        (("--offset", "much"), "'much' is not a length"),
+        (("--offset", "1", "--units", "parsec"), "must be one of um, mm"),
+        (("--shell", "0"), "thickness of a shell must be positive"),
+        (("--shell", "-1"), "thickness of a shell must be positive"),
+        (("--shell", "3"), "leaves nothing"),
+        (("--crop", "0,0,0,1,1"), "six numbers"),
+        (("--crop", "1,1,1,0,0,0"), "lower corner must come first"),
+        (("--crop", "8,8,8,9,9,9"), "crop lies outside of the model"),
+        (("--resolution", "3"), "at least 16 cells"),
+        (("--attributes", "colors"), "no attribute 'colors'"),
+        (("--threads", "0"), "threads must be positive"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_usage(model: Path, tmp_path: Path, command: CommandLine, words: tuple[str, ...], sentence: str) -> None:
+    coarse = () if "--resolution" in words else ("--resolution", "24")
+    command.refuses(ExitCode.USAGE, sentence, "mesh", model, "-o", tmp_path / "m.ply", *words, *coarse, "--quiet")
+    assert names(tmp_path) == []
+
+
+def test_files_that_are_no_models(model: Path, folder: Path, tmp_path: Path, command: CommandLine) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    target = ("-o", out / "mesh.ply")
+    command.refuses(ExitCode.INPUT, "There is no file", "mesh", tmp_path / "missing.gnr", *target)
+    command.refuses(ExitCode.INPUT, "is not a gnrecon model", "mesh", folder / "ring.ply", *target)
+    torn = tmp_path / "torn.gnr"
+    torn.write_bytes(model.read_bytes()[:-100])
+    command.refuses(ExitCode.INPUT, "is not a gnrecon model", "mesh", torn, *target)
+    command.refuses(ExitCode.INPUT, "no file", "mesh", tmp_path, *target)
+    assert names(out) == []
+
+
+def test_targets_that_cannot_be_written(model: Path, tmp_path: Path, command: CommandLine) -> None:
+    (tmp_path / "taken.ply").write_text("somebody's work")
+    words = ("--resolution", "24", "--quiet")
+    command.refuses(ExitCode.OUTPUT, "exists already", "mesh", model, "-o", tmp_path / "taken.ply", *words)
+    command.refuses(ExitCode.OUTPUT, "does not exist", "mesh", model, "-o", tmp_path / "no" / "mesh.ply", *words)
+    command.refuses(ExitCode.USAGE, "cannot be written as '.docx'", "mesh", model, "-o", tmp_path / "a.docx", *words)
+    copy = tmp_path / "model.obj"
+    shutil.copy(model, copy)
+    command.refuses(ExitCode.USAGE, "named twice", "mesh", copy, "-o", copy, "--overwrite", *words)
+    assert (tmp_path / "taken.ply").read_text() == "somebody's work"
+    assert copy.read_bytes() == model.read_bytes()
+    assert command("mesh", model, "-o", tmp_path / "taken.ply", "--overwrite", *words).returncode == 0
+    verify_file(tmp_path / "taken.ply")
+
+
+def test_a_model_is_saved_with_the_mesh_or_not_at_all(folder: Path, tmp_path: Path, command: CommandLine) -> None:
+    scan = folder / "ring.ply"
+    words = (scan, "-o", tmp_path / "mesh.obj", "--save")
+    command.refuses(ExitCode.USAGE, "saved as a .gnr file", *words, tmp_path / "model.ply")
+    command.refuses(ExitCode.OUTPUT, "does not exist", *words, tmp_path / "no" / "model.gnr")
+    (tmp_path / "taken.gnr").write_text("somebody's work")
+    command.refuses(ExitCode.OUTPUT, "exists already", *words, tmp_path / "taken.gnr")
+    assert names(tmp_path) == ["taken.gnr"]
+    assert (tmp_path / "taken.gnr").read_text() == "somebody's work"
+
+
+def test_a_mesh_that_fails_leaves_no_model(
+    folder: Path, tmp_path: Path, command: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise RuntimeError(f"cannot read {path.suffix} back")
+
+    monkeypatch.setattr("gnrecon.pipeline._verify", refuse)
+    files = ("-o", tmp_path / "mesh.obj", "--save", tmp_path / "model.gnr")
+    command.refuses(ExitCode.UNFORESEEN, "cannot read .obj back", folder / "ring.ply", *files, *FAST_WORDS, "--quiet")
+    assert names(tmp_path) == []
