@@ -49,5 +49,10 @@ def to_srgb(light: Float) -> Bytes:
     return np.rint(255 * _with_alpha_of(shares, light)).astype(np.uint8)
 
 
+def with_alpha(colors: Bytes) -> Bytes:
+    """Return colours of shape (N, 4): those of three columns are opaque."""
+    return colors if colors.shape[1] == 4 else np.hstack([colors, np.full((len(colors), 1), 255, np.uint8)])
+
+
 def _with_alpha_of(colors: Float, source: Float) -> Float:
     return np.column_stack([colors[:, :3], source[:, 3:]])

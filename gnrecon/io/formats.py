@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from gnrecon.io.contents import Contents
-from gnrecon.io.glb import read_glb, write_glb
+from gnrecon.io.glb import fits_glb, read_glb, write_glb
 from gnrecon.io.obj import read_obj, write_obj
 from gnrecon.io.off import read_off, write_off
 from gnrecon.io.pcd import read_pcd
 from gnrecon.io.ply import read_ply, write_ply
 from gnrecon.io.stl import read_stl, write_stl
+from gnrecon.io.threemf import write_3mf
+from gnrecon.io.threemf_model import read_3mf
 from gnrecon.io.xyz import read_xyz
 from gnrecon.mesh import Mesh
 
@@ -26,6 +31,7 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".off": read_off,
     ".stl": read_stl,
     ".glb": read_glb,
+    ".3mf": read_3mf,
 }
 
 WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
@@ -34,7 +40,39 @@ WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".stl": write_stl,
     ".off": write_off,
     ".glb": write_glb,
+    ".3mf": write_3mf,
 }
+
+Values = npt.NDArray[np.generic]
+
+
+def _color(name: str, values: Values) -> bool:
+    del values
+    return name == "colors"
+
+
+def _number(name: str, values: Values) -> bool:
+    del name
+    return values.dtype.kind in "biuf"
+
+
+def _nothing(name: str, values: Values) -> bool:
+    del name, values
+    return False
+
+
+HOLDS: dict[str, Callable[[str, Values], bool]] = {
+    ".obj": _color,
+    ".ply": _number,
+    ".stl": _nothing,
+    ".off": _color,
+    ".glb": fits_glb,
+    ".3mf": _color,
+}
+"""Which attributes of vertices a format can hold, by name and values."""
+
+ZIPPED = (".3mf",)
+"""Formats that are ZIP archives of their parts."""
 
 # How files begin, to name what a wrongly named file really is.
 SIGNATURES: dict[bytes, str] = {

@@ -2,22 +2,47 @@
 
 glTF stores float32. Positions are therefore stored relative to the middle of the mesh's bounding box, and the node's
 matrix, whose numbers are JSON text with all digits, carries the offset.
+
+Colours of vertices are linear light in glTF, which 8 bits would make too coarse in the dark: they are written, and
+read, as the 16-bit numbers that the format also allows. trimesh knows 8 bits only, so it handles them as an attribute
+of another name, and the file's JSON is renamed behind it. All other attributes are float32, named with an underscore.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from gnrecon.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.mesh import Mesh
 
+_COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"
+"""The name of colours in glTF, and the one under which trimesh takes them for any attribute."""
+
+_JSON = b"JSON"
+
+
+def fits_glb(name: str, values: npt.NDArray[np.generic]) -> bool:
+    """Whether glTF can hold an attribute: finite numbers of up to four columns that float32 tells apart."""
+    if name == "colors":
+        return True
+    if values.dtype.kind not in "biuf" or values.ndim > 2 or (values.ndim == 2 and values.shape[1] > 4):
+        return False
+    numbers = values.astype(np.float64)
+    exact = values.dtype.kind == "f" or bool((numbers.astype(np.float32) == numbers).all())
+    return exact and bool(np.isfinite(numbers.astype(np.float32)).all())
+
 
 def read_glb(path: Path) -> Contents:
     """Read all meshes of the scene into one, each moved by its node's matrix.
+
+    Attributes are kept where all meshes have them, with their names in lower case.
 
     Raises
     ------
@@ -27,12 +52,12 @@ def read_glb(path: Path) -> Contents:
     import trimesh
 
     try:
-        with path.open("rb") as file:
-            scene = trimesh.load_scene(file, file_type="glb", process=False, skip_materials=True)
+        file = trimesh.util.wrap_as_stream(_renamed(path.read_bytes()))
+        scene = trimesh.load_scene(file, file_type="glb", process=False, skip_materials=True)
     # A malformed file surfaces as whatever the parser of JSON and buffers happens to raise.
     except Exception as error:
         raise InputError(f"the file is not a well-formed GLB ({type(error).__name__}: {error}).") from None
-    vertices, normals, faces, start = [], [], [], 0
+    vertices, normals, faces, attributes, start = [], [], [], [], 0
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         part = scene.geometry[name]
@@ -42,6 +67,7 @@ def read_glb(path: Path) -> Contents:
         faces.append((triangles if np.linalg.det(matrix[:3, :3]) > 0 else triangles[:, ::-1]) + start)
         turned = np.asarray(getattr(part, "vertex_normals", np.zeros((len(part.vertices), 3))))
         normals.append(turned @ np.linalg.inv(matrix[:3, :3]))
+        attributes.append(getattr(part, "vertex_attributes", {}))
         start += len(part.vertices)
     if not start:
         raise InputError("the file holds no vertices.")
@@ -49,19 +75,81 @@ def read_glb(path: Path) -> Contents:
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = np.divide(directions, lengths, out=np.zeros_like(directions), where=lengths > 0)
     all_faces = np.concatenate(faces)
-    return Contents(np.concatenate(vertices), directions if len(all_faces) else None, all_faces)
+    return Contents(
+        np.concatenate(vertices), directions if len(all_faces) else None, all_faces, _attributes(attributes)
+    )
+
+
+def _renamed(data: bytes) -> bytes:
+    """The file with colours under the name of any attribute, so that trimesh gives them as they are stored."""
+    length = int.from_bytes(data[12:16], "little")
+    if data[16:20] != _JSON or _COLOR.encode() not in data[20 : 20 + length]:
+        return data
+    tree = json.loads(data[20 : 20 + length])
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            _rename(primitive["attributes"], _COLOR, _HIDDEN)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    size = (20 + len(text) + len(rest)).to_bytes(4, "little")
+    return data[:8] + size + len(text).to_bytes(4, "little") + _JSON + text + rest
+
+
+def _rename(names: dict[str, Any], old: str, new: str) -> None:
+    if old in names:
+        names[new] = names.pop(old)
+
+
+def _attributes(parts: list[dict[str, Any]]) -> dict[str, npt.NDArray[np.generic]]:
+    """Attributes that all parts have in the same shape."""
+    found: dict[str, npt.NDArray[np.generic]] = {}
+    for name, first in parts[0].items():
+        values = [np.asarray(part[name]) for part in parts if name in part]
+        if len(values) < len(parts) or any(one.shape[1:] != first.shape[1:] for one in values):
+            continue
+        joined = np.concatenate(values)
+        if name == _HIDDEN:
+            full = 1.0 if joined.dtype.kind == "f" else float(np.iinfo(joined.dtype).max)
+            colors = to_srgb(joined / full)
+            found["colors"] = colors if (colors[:, 3:] < 255).any() else colors[:, :3]
+        else:
+            found[name.lstrip("_").lower()] = joined[:, 0] if joined.shape[1:] == (1,) else joined
+    return found
 
 
 def write_glb(mesh: Mesh, path: Path) -> None:
-    """Write one node with the mesh, its vertex normals, and a translation to the mesh's middle."""
+    """Write one node with the mesh, its vertex normals and attributes, and a translation to the mesh's middle."""
     import trimesh
 
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     matrix = np.eye(4)
     matrix[:3, 3] = middle
+    attributes: dict[str, Any] = {
+        f"_{name.upper()}": values.astype(np.float32) for name, values in mesh.attributes.items() if name != "colors"
+    }
+    if "colors" in mesh.attributes:
+        light = to_linear(with_alpha(as_bytes(mesh.attributes["colors"])))
+        attributes[_HIDDEN] = np.rint(light * np.iinfo(np.uint16).max).astype(np.uint16)
     part = trimesh.Trimesh(
-        mesh.vertices - middle, mesh.faces, vertex_normals=mesh.vertex_normals(), process=False, validate=False
+        mesh.vertices - middle,
+        mesh.faces,
+        vertex_normals=mesh.vertex_normals(),
+        vertex_attributes=attributes,
+        process=False,
+        validate=False,
     )
     scene: Any = trimesh.Scene()
     scene.add_geometry(part, node_name="mesh", transform=matrix)
-    path.write_bytes(scene.export(file_type="glb", include_normals=True))
+    path.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=_finish))
+
+
+def _finish(tree: dict[str, Any]) -> None:
+    """Name the colours as glTF does, and give the mesh a matt material: without one, viewers take it for metal."""
+    primitive = tree["meshes"][0]["primitives"][0]
+    _rename(primitive["attributes"], _HIDDEN, _COLOR)
+    if _COLOR in primitive["attributes"]:
+        accessor = tree["accessors"][primitive["attributes"][_COLOR]]
+        accessor["normalized"] = True
+    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
+    primitive["material"] = 0

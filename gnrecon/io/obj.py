@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan
@@ -100,8 +101,16 @@ def _normals(
 
 
 def write_obj(mesh: Mesh, path: Path) -> None:
-    """Write positions with all digits of float64, vertex normals where the mesh has them, and triangles."""
-    blocks = format_rows("v %r %r %r\n", mesh.vertices)
+    """Write positions with all digits of float64, vertex normals where the mesh has them, and triangles.
+
+    Colours follow the positions as shares of full brightness, which is no part of the format but widely read.
+    """
+    colors = mesh.attributes.get("colors")
+    if colors is None:
+        blocks = format_rows("v %r %r %r\n", mesh.vertices)
+    else:
+        rows = np.hstack([mesh.vertices, as_bytes(colors)[:, :3] / 255])
+        blocks = format_rows("v %r %r %r %.4f %.4f %.4f\n", rows)
     corners = mesh.faces + 1
     if mesh.normals is None:
         blocks += format_rows("f %d %d %d\n", corners)

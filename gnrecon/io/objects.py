@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.cloud import PointCloud
+from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
 from gnrecon.mesh import Mesh
 
@@ -38,7 +39,7 @@ def _convert(obj: Any) -> PointCloud:
     if isinstance(obj, PointCloud):
         return obj
     if isinstance(obj, Mesh):
-        return PointCloud(obj.vertices, obj.vertex_normals())
+        return PointCloud(obj.vertices, obj.vertex_normals(), obj.attributes)
     libraries = {kind.__module__.partition(".")[0] for kind in type(obj).__mro__}
     if "open3d" in libraries and hasattr(obj, "point"):
         return _from_open3d_tensor(obj)
@@ -47,7 +48,10 @@ def _convert(obj: Any) -> PointCloud:
         return PointCloud(np.array(obj.points), np.array(obj.normals) if obj.has_normals() else None, colors)
     if "trimesh" in libraries and hasattr(obj, "vertices"):
         has_faces = hasattr(obj, "faces") and len(obj.faces) > 0
-        return PointCloud(np.array(obj.vertices), np.array(obj.vertex_normals) if has_faces else None)
+        normals = np.array(obj.vertex_normals) if has_faces else None
+        colors = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
+        # A cloud without colours may say that it has some, and hold none.
+        return PointCloud(np.array(obj.vertices), normals, {"colors": colors} if len(colors) else {})
     return _from_array(_array(obj))
 
 
@@ -78,19 +82,29 @@ def _from_array(rows: npt.NDArray[np.float64]) -> PointCloud:
 
 
 def to_trimesh(mesh: Mesh) -> Any:
-    """Return a ``trimesh.Trimesh`` with the same vertices, faces and vertex normals, unprocessed."""
+    """Return a ``trimesh.Trimesh`` with the same vertices, faces, vertex normals and attributes, unprocessed."""
     import trimesh
 
-    # A copy of the normals, because trimesh makes the array that it is given read-only.
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals().copy(), process=False)
+    return trimesh.Trimesh(
+        mesh.vertices,
+        mesh.faces,
+        # A copy of the normals, because trimesh makes the array that it is given read-only.
+        vertex_normals=mesh.vertex_normals().copy(),
+        vertex_colors=mesh.attributes.get("colors"),
+        vertex_attributes={name: values for name, values in mesh.attributes.items() if name != "colors"},
+        process=False,
+    )
 
 
 def to_open3d(mesh: Mesh) -> Any:
-    """Return a legacy ``open3d.geometry.TriangleMesh`` with the same vertices, faces and vertex normals."""
+    """Return a legacy ``open3d.geometry.TriangleMesh`` with the same vertices, faces, vertex normals and colours."""
     import open3d
 
     result = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
     )
     result.vertex_normals = open3d.utility.Vector3dVector(mesh.vertex_normals())
+    if "colors" in mesh.attributes:
+        shares = as_bytes(mesh.attributes["colors"])[:, :3] / 255
+        result.vertex_colors = open3d.utility.Vector3dVector(shares)
     return result

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.colors import as_bytes, with_alpha
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan
@@ -81,9 +82,13 @@ def _faces(lines: list[str]) -> Int:
 
 
 def write_off(mesh: Mesh, path: Path) -> None:
-    """Write positions with all digits of float64 and triangles; plain OFF has no normals."""
-    blocks = [f"OFF\n{len(mesh.vertices)} {len(mesh.faces)} 0\n"]
-    blocks += format_rows("%r %r %r\n", mesh.vertices)
+    """Write positions with all digits of float64 and triangles; as COFF where there are colours, without normals."""
+    colors = mesh.attributes.get("colors")
+    blocks = [f"{'OFF' if colors is None else 'COFF'}\n{len(mesh.vertices)} {len(mesh.faces)} 0\n"]
+    if colors is None:
+        blocks += format_rows("%r %r %r\n", mesh.vertices)
+    else:
+        blocks += format_rows("%r %r %r %d %d %d %d\n", np.hstack([mesh.vertices, with_alpha(as_bytes(colors))]))
     blocks += format_rows("3 %d %d %d\n", mesh.faces)
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(blocks)

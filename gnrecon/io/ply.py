@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, from_columns
-from gnrecon.io.ply_header import ORDERS, Element, Property, parse_header, too_short
+from gnrecon.io.ply_columns import vertex_columns
+from gnrecon.io.ply_header import ORDERS, PLY_TYPES, Element, Property, parse_header, too_short
 from gnrecon.io.polygons import fan
 from gnrecon.io.text import numbers
 from gnrecon.mesh import Mesh
@@ -161,20 +162,16 @@ def _indices(values: npt.NDArray[np.generic]) -> Int:
 
 
 def write_ply(mesh: Mesh, path: Path) -> None:
-    """Write binary little-endian PLY: double positions, float normals where the mesh has them, int faces."""
-    fields = [(name, "<f8") for name in ("x", "y", "z")]
-    if mesh.normals is not None:
-        fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
-    vertices = np.empty(len(mesh.vertices), np.dtype(fields))
-    for axis, name in enumerate(("x", "y", "z")):
-        vertices[name] = mesh.vertices[:, axis]
-        if mesh.normals is not None:
-            vertices[f"n{name}"] = mesh.normals[:, axis]
+    """Write binary little-endian PLY: double positions, float normals and all attributes of the mesh, int faces."""
+    columns = vertex_columns(mesh)
+    vertices = np.empty(len(mesh.vertices), np.dtype([(name, f"<{PLY_TYPES[kind]}") for name, kind, _ in columns]))
+    for name, _, values in columns:
+        vertices[name] = values
     faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
     faces["count"] = 3
     faces["corners"] = mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property {'double' if kind == '<f8' else 'float'} {name}" for name, kind in fields]
+    lines += [f"property {kind} {name}" for name, kind, _ in columns]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     with path.open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))

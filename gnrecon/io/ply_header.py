@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from gnrecon.errors import InputError
 
-_TYPES = {
+PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
@@ -56,10 +56,10 @@ def parse_header(data: bytes) -> tuple[str, list[Element], int]:
                 encoding = name
             case ["element", name, count] if count.isdecimal():
                 elements.append(Element(name, int(count)))
-            case ["property", "list", count_type, kind, name] if elements and {count_type, kind} <= _TYPES.keys():
-                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[count_type]))
-            case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].properties.append(Property(name, _TYPES[kind], None))
+            case ["property", "list", count_type, kind, name] if elements and {count_type, kind} <= PLY_TYPES.keys():
+                elements[-1].properties.append(Property(name, PLY_TYPES[kind], PLY_TYPES[count_type]))
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1].properties.append(Property(name, PLY_TYPES[kind], None))
             case _:
                 raise InputError(f"the PLY header line {line.strip()[:80]!r} is not understood.")
     if not encoding:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from gnrecon.cloud import PointCloud
+from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.io.contents import Contents
-from gnrecon.io.formats import READERS, SIGNATURES
+from gnrecon.io.formats import READERS, SIGNATURES, ZIPPED
 from gnrecon.mesh import Mesh
 
 
@@ -65,8 +66,10 @@ def read_reference(path: str | Path) -> Mesh | PointCloud:
 
 
 def _mesh(contents: Contents, path: Path) -> Mesh:
+    colors = contents.attributes.get("colors")
+    attributes = dict(contents.attributes) if colors is None else {**contents.attributes, "colors": as_bytes(colors)}
     try:
-        return Mesh(contents.points, contents.faces, contents.normals)
+        return Mesh(contents.points, contents.faces, contents.normals, attributes)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -109,6 +112,8 @@ def _check_file(path: Path, extension: str) -> None:
     if not head.strip():
         raise InputError(f"{path}: the file is empty.")
     kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
+    if kind == "ZIP archive" and extension in ZIPPED:
+        return
     if kind == extension or extension not in READERS:
         return
     if kind in READERS:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from gnrecon.atomic import atomic_write
 from gnrecon.errors import MeshError, UsageError
-from gnrecon.io.formats import WRITERS
+from gnrecon.io.formats import HOLDS, WRITERS
 from gnrecon.mesh import Mesh
 
 _NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
@@ -44,9 +46,21 @@ def write_mesh(
         raise MeshError("The mesh has vertices that are not finite, so it is not written.")
     if len(mesh.vertices) >= _INT32_LIMIT:
         raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices can name.")
+    held = {name: values for name, values in mesh.attributes.items() if HOLDS[extension](name, values)}
     with atomic_write(path, overwrite, verify) as temporary:
-        WRITERS[extension](mesh, temporary)
-    return _rounding(mesh) if extension == ".stl" else []
+        WRITERS[extension](replace(mesh, attributes=held), temporary)
+    return _lost(mesh, held, extension) + (_rounding(mesh) if extension == ".stl" else [])
+
+
+def holds(path: str | Path, name: str, values: npt.NDArray[np.generic]) -> bool:
+    """Whether the format that the path's extension names can hold such an attribute of vertices.
+
+    Raises
+    ------
+    UsageError
+        When the extension is no supported one.
+    """
+    return HOLDS[check_writable(path)](name, values)
 
 
 def check_writable(path: str | Path) -> str:
@@ -64,6 +78,15 @@ def check_writable(path: str | Path) -> str:
             f"A mesh cannot be written as {extension or 'a file without an extension'!r}; use {supported}."
         )
     return extension
+
+
+def _lost(mesh: Mesh, held: Mapping[str, npt.NDArray[np.generic]], extension: str) -> list[str]:
+    """Return a sentence about attributes that the format has no place for."""
+    lost = [name for name in mesh.attributes if name not in held]
+    if not lost:
+        return []
+    named = " and ".join(filter(None, [", ".join(lost[:-1]), lost[-1]]))
+    return [f"{extension[1:].upper()} cannot hold {named} of the vertices; PLY can."]
 
 
 def _rounding(mesh: Mesh) -> list[str]:
