@@ -184,7 +184,8 @@ def batch_command(
     folder: Annotated[Path, typer.Argument(help="Folder of scans.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the meshes.", rich_help_panel=OUTPUT)],
     mesh_format: Annotated[
-        str, typer.Option("--format", help="Format of the meshes: obj, ply, stl, off or glb.", rich_help_panel=OUTPUT)
+        str,
+        typer.Option("--format", help="Format of the meshes: obj, ply, stl, off, glb or 3mf.", rich_help_panel=OUTPUT),
     ] = "obj",
     fraction: Fraction = None,
     max_points: MaxPoints = None,

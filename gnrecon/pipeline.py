@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.export import Attribute, MeshFacts, Metrics, measure, require_sound, verify_file
 from gnrecon.fit import NeuralSDF, fit
 from gnrecon.ingest import IngestCounts, prepare
-from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
+from gnrecon.io import as_cloud, holds, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
@@ -74,7 +74,9 @@ class Reconstruction:
     interrupted: bool = False
 
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
-        """Write the mesh atomically, reading it back and verifying it first; return sentences about what was lost.
+        """Write the mesh atomically, reading it back and verifying it first.
+
+        Returns sentences about what the format could not hold, such as attributes or digits.
 
         Raises
         ------
@@ -83,7 +85,16 @@ class Reconstruction:
         OutputError
             When the file cannot be written.
         """
-        return write_mesh(self.mesh, path, overwrite, verify=_verify)
+        return write_mesh(self._fit_for(path), path, overwrite, verify=_verify)
+
+    def _fit_for(self, path: str | Path) -> Mesh:
+        """Leave out distances that nobody asked for where the format has no place for them."""
+        attributes = dict(self.mesh.attributes)
+        distances = attributes.pop("distance", None)
+        asked = self.report["options"]["attributes"] != "auto"
+        if distances is None or asked or holds(path, "distance", distances):
+            return self.mesh
+        return replace(self.mesh, attributes=attributes)
 
     def to_trimesh(self) -> Any:
         """Return the mesh as a `trimesh.Trimesh`."""

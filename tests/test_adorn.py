@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from scan_files import torus
 from gnrecon.adorn import wanted
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import UsageError
+from gnrecon.io import read_mesh
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 
 FAST = {"widths": (300,), "steps": 0, "resolution": 32}
@@ -88,3 +90,25 @@ def test_a_scan_with_distances_of_its_own_is_told_that_they_give_way(scan: Point
     assert mesh.attributes["distance"].max() < 1
     assert "The points' attribute 'distance' gives way to the distance from the points." in told.remarks
     assert wanted(PointCloud(scan.points, None, own), "auto") == ["distance"]
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".3mf", ".off", ".stl"])
+def test_what_was_carried_is_in_the_file_or_said_to_be_lost(
+    result: Reconstruction, tmp_path: Path, suffix: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    sentences = result.save(tmp_path / "out" / f"mesh{suffix}")
+    found = read_mesh(tmp_path / "out" / f"mesh{suffix}").attributes
+    carried = {"colors", "height", "half"}
+    lost = {".ply": set(), ".glb": set(), ".stl": carried}.get(suffix, carried - {"colors"})
+    # Nobody asked for the distance, so nobody is told where it is left out.
+    assert set(found) == carried - lost | ({"distance"} if not lost else set())
+    assert len(sentences) == bool(lost)
+    assert all(name in sentences[0] and "distance" not in sentences[0] for name in lost)
+    if "colors" in found:
+        assert np.array_equal(found["colors"][:, :3], result.mesh.attributes["colors"])
+
+
+def test_distances_that_were_asked_for_are_missed(scan: PointCloud, tmp_path: Path) -> None:
+    sentences = reconstruct(scan, attributes="distance", **FAST).save(tmp_path / "mesh.obj")
+    assert sentences == ["OBJ cannot hold distance of the vertices; PLY can."]

@@ -49,9 +49,9 @@ def _convert(obj: Any) -> PointCloud:
     if "trimesh" in libraries and hasattr(obj, "vertices"):
         has_faces = hasattr(obj, "faces") and len(obj.faces) > 0
         normals = np.array(obj.vertex_normals) if has_faces else None
-        colors = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
+        seen = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
         # A cloud without colours may say that it has some, and hold none.
-        return PointCloud(np.array(obj.vertices), normals, {"colors": colors} if len(colors) else {})
+        return PointCloud(np.array(obj.vertices), normals, {"colors": seen} if len(seen) else {})
     return _from_array(_array(obj))
 
 
