@@ -12,7 +12,7 @@ from functools import cached_property
 from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import PointCloud, Samples
 from gnrecon.errors import UsageError
-from gnrecon.export import Attribute, Neighbourhood, carry
+from gnrecon.export import Attribute, Neighbourhood, carry, curvatures
 from gnrecon.fit import NeuralSDF
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
@@ -99,4 +99,17 @@ def _carried(sources: Sources) -> Made:
     return attributes, [*sentences, "The points' attribute 'distance' gives way to the distance from the points."]
 
 
-MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried)
+def _curvature(sources: Sources) -> Made:
+    """Mean and Gauss curvature of the field's level sets through the vertices."""
+    if not sources.options.curvature:
+        return [], []
+    vertices = sources.mesh.vertices
+    mean, gauss = curvatures(sources.sdf.gradient(vertices), sources.sdf.hessian(vertices))
+    origin = "of the field's level set, from its gradient and second derivatives; per"
+    return [
+        Attribute("mean_curvature", mean, f"mean curvature {origin} file unit"),
+        Attribute("gauss_curvature", gauss, f"Gauss curvature {origin} squared file unit"),
+    ], []
+
+
+MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried, _curvature)

@@ -108,7 +108,13 @@ Attributes = Annotated[
 ]
 Output = Annotated[
     Path,
-    typer.Option("-o", "--output", help="Mesh to write: .obj, .ply, .stl, .off or .glb.", rich_help_panel=OUTPUT),
+    typer.Option("-o", "--output", help="Mesh to write: .obj, .ply, .stl, .off, .glb or .3mf.", rich_help_panel=OUTPUT),
+]
+Curvature = Annotated[
+    bool,
+    typer.Option(
+        "--curvature", help="Vertices carry the field's mean and Gauss curvature as well.", rich_help_panel=MESH
+    ),
 ]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
@@ -137,6 +143,7 @@ def reconstruct_command(
     threads: Threads = None,
     resolution: Resolution = 256,
     attributes: Attributes = "auto",
+    curvature: Curvature = False,
     reference: Annotated[
         Path | None,
         typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
@@ -173,6 +180,7 @@ def reconstruct_command(
         "threads": threads,
         "resolution": resolution,
         "attributes": attributes,
+        "curvature": curvature,
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(scan, output, reference, report, preview, save, overwrite)
@@ -202,6 +210,7 @@ def batch_command(
     threads: Threads = None,
     resolution: Resolution = 256,
     attributes: Attributes = "auto",
+    curvature: Curvature = False,
     reports: Annotated[
         bool,
         typer.Option(
@@ -233,6 +242,7 @@ def batch_command(
         "--attributes": attributes,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
+    passed += ["--curvature"] * curvature
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
     raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, quiet=quiet))
 
@@ -294,7 +304,7 @@ def mesh_command(
 
 @app.command("eval")
 def eval_command(
-    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF or GLB file.")],
+    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF, GLB or 3MF file.")],
     reference: Annotated[Path, typer.Option(help="Mesh or cloud to measure it against.")],
     samples: Annotated[int, typer.Option(help="Points drawn on each surface.")] = 100_000,
     seed: Seed = 0,
@@ -311,7 +321,7 @@ def eval_command(
 
 @app.command("check")
 def check_command(
-    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF or GLB file.")],
+    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF, GLB or 3MF file.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
     debug: Debug = False,
 ) -> None:

@@ -26,6 +26,9 @@ class Options:
     attributes : str
         Of the vertices: ``"auto"`` carries over all that the scan holds of its points (colours, labels, measured
         values) and adds ``distance``, to the nearest of them; ``"none"``; or names of these, separated by commas.
+    curvature : bool
+        Whether vertices carry ``mean_curvature``, positive where the surface is convex as a sphere is, and
+        ``gauss_curvature``, per file unit and per squared file unit.
     resolution : int
         Cells of the extraction along the longest side of the shape's box.
     widths, steps, normal_residual, optimiser, solver, search, seed, device
@@ -44,6 +47,7 @@ class Options:
     subsample: str = "random"
     outliers: str = "auto"
     attributes: str = "auto"
+    curvature: bool = False
     resolution: int = 256
     widths: tuple[int, ...] | None = None
     steps: int | None = None

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scan_files import torus
+from scan_files import TUBE, torus
 
 from gnrecon.adorn import wanted
 from gnrecon.cloud import PointCloud
@@ -112,3 +112,17 @@ def test_what_was_carried_is_in_the_file_or_said_to_be_lost(
 def test_distances_that_were_asked_for_are_missed(scan: PointCloud, tmp_path: Path) -> None:
     sentences = reconstruct(scan, attributes="distance", **FAST).save(tmp_path / "mesh.obj")
     assert sentences == ["OBJ cannot hold distance of the vertices; PLY can."]
+
+
+def test_curvature_of_a_torus(scan: PointCloud) -> None:
+    plain = PointCloud(scan.points, scan.normals)
+    result = reconstruct(plain, curvature=True, widths=(600,), steps=1, resolution=48)
+    found = result.mesh.attributes
+    assert list(found) == ["distance", "mean_curvature", "gauss_curvature"]
+    assert "per squared file unit" in result.report["attributes"][2]["origin"]
+    cosine = (np.hypot(*result.mesh.vertices[:, :2].T) - 1) / TUBE
+    out = 1 + TUBE * cosine
+    mean, gauss = (1 + 2 * TUBE * cosine) / (2 * TUBE * out), cosine / (TUBE * out)
+    assert np.median(np.abs(found["mean_curvature"] - mean)) < 0.05
+    assert np.median(np.abs(found["gauss_curvature"] - gauss)) < 0.15
+    assert np.corrcoef(found["gauss_curvature"], gauss)[0, 1] > 0.95

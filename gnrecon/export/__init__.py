@@ -2,6 +2,7 @@
 
 from gnrecon.export.attribute import Attribute
 from gnrecon.export.carry import carry
+from gnrecon.export.curvature import curvatures
 from gnrecon.export.definitions import Metrics
 from gnrecon.export.examine import Findings, examine
 from gnrecon.export.extract import extract
@@ -22,6 +23,7 @@ __all__ = [
     "Neighbourhood",
     "SignedDistance",
     "carry",
+    "curvatures",
     "examine",
     "extract",
     "measure",

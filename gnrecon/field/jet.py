@@ -67,6 +67,16 @@ class Jet:
             )
         ]
 
+    def hessian(self) -> Tensor:
+        """Return the second derivatives of f in space, of shape (N, 3, 3): D_v (W_1^T d_1) along each axis v."""
+        columns = []
+        for axis in torch.eye(3).to(self.gradient):
+            adjoint_tangents = self._along(axis.expand_as(self.gradient))[1]
+            columns.append(adjoint_tangents[0] @ self.layers[0][0])
+        hessian = torch.stack(columns, dim=2)
+        # Exactly symmetric, whatever the rounding.
+        return (hessian + hessian.mT) / 2
+
     def _along(self, v: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Return D_v a_l and D_v d_l of all layers, for directions v of shape (N, 3)."""
         tangents, z_tangents = [v], []

@@ -85,6 +85,18 @@ class NeuralSDF:
         ]
         return self._array(gradients, (0, 3))
 
+    def hessian(self, points: npt.ArrayLike) -> Float:
+        """Return second derivatives of the distance, of shape (N, 3, 3), per file unit, at `points`, of shape (N, 3).
+
+        They are evaluated in double precision, whatever the field's own.
+        """
+        x = self._unit(points)
+        theta = self.theta.to(torch.float64)
+        hessians = [
+            self.field.jet(theta, torch.as_tensor(x[rows]).to(theta)).hessian() for rows in self._batches(len(x))
+        ]
+        return self._array(hessians, (0, 3, 3)) / self.frame.scale
+
     def normals(self, points: npt.ArrayLike) -> Float:
         """Return outward unit normals of the level sets, of shape (N, 3), at `points`, of shape (N, 3)."""
         gradient = self.gradient(points)

@@ -175,3 +175,14 @@ def test_batches_cover_every_row_once(count: int, size: int) -> None:
     slices = list(batches(count, size))
     assert [row for part in slices for row in range(count)[part]] == list(range(count))
     assert all(part.stop - part.start <= size for part in slices)
+
+
+@each_field
+@few
+@seeds
+def test_second_derivatives_in_space(widths: tuple[int, ...], seed: int) -> None:
+    field, theta, x, _ = draw(seed, widths)
+    expected = vmap(jacrev(grad(plain_value, argnums=2), argnums=2), in_dims=(None, None, 0))(theta, widths, x)
+    found = field.jet(theta, x).hessian()
+    torch.testing.assert_close(found, expected, **EXACT)
+    assert torch.equal(found, found.mT)

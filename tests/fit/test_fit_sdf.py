@@ -222,3 +222,12 @@ def test_files_that_are_no_models(tmp_path: Path) -> None:
     for path in (tmp_path / "nothing.gnr", tmp_path):
         with pytest.raises(InputError, match="no file"):
             NeuralSDF.load(path)
+
+
+@pytest.mark.parametrize("frame", [UNIT, UTM], ids=["unit", "UTM"])
+def test_second_derivatives_agree_with_differences_of_gradients(frame: Frame) -> None:
+    sdf = random_field(frame=frame)
+    x = frame.to_world(points(30))
+    steps = 1e-4 * frame.scale * np.eye(3)
+    bends = np.stack([(sdf.gradient(x + s) - sdf.gradient(x - s)) / (2e-4 * frame.scale) for s in steps], axis=2)
+    assert np.allclose(sdf.hessian(x) * frame.scale, bends * frame.scale, rtol=0, atol=2e-3)
