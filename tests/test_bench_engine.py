@@ -21,7 +21,7 @@ from benchmarks.engine import kernel, million, ours
 from benchmarks.engine.baseline import DAMPING, Baseline, pretrained
 from benchmarks.engine.clock import Clock
 from benchmarks.engine.cost import OPERATIONS, WIDTHS, exponent, measure_cost, width_for
-from benchmarks.engine.loss import Sample, data_loss, posed
+from benchmarks.engine.loss import Sample, data_loss, eikonal_error, posed
 from benchmarks.engine.main import main as engine
 from benchmarks.engine.measurements import MEASUREMENTS, NEEDS_DATA, Plan, merged
 from benchmarks.engine.plot import draw
@@ -179,6 +179,22 @@ def test_our_fit_lowers_the_loss(sample: Sample) -> None:
     assert result["ours"]["losses"][-1] < 0.5 * result["ours"]["losses"][0]
     assert result["ours"]["seconds"] == sorted(result["ours"]["seconds"])
     assert result["is_lower_bound"]
+    assert "full eikonal weight" in text_of({"quality": {"rockerarm": result}})
+
+
+def test_the_eikonal_weight_falls_to_its_least_and_the_datas_do_not() -> None:
+    weights = [ours.weights_at(number) for number in range(1, 60)]
+    assert {of_data for of_data, _, _ in weights} == {of_normals for _, of_normals, _ in weights} == {1.0}
+    of_volume = [volume for _, _, volume in weights]
+    assert of_volume[0] < 1e-2
+    assert of_volume == sorted(of_volume, reverse=True)
+    assert of_volume[-1] == 1e-4
+
+
+def test_the_eikonal_error_is_a_mean_of_squares(sample: Sample) -> None:
+    theta = random_theta(3)
+    lengths = Siren(NET).value_and_gradient(theta, sample.volume)[1].norm(dim=1)
+    assert eikonal_error(Siren(NET), theta, sample) == pytest.approx(float(((lengths - 1) ** 2).mean()))
 
 
 def test_a_clock_does_not_count_its_pauses() -> None:

@@ -48,9 +48,10 @@ def posed(
     sample: Sample,
     precision: torch.dtype | None = None,
     keep_bytes: int = KEEP_BYTES,
+    weights: tuple[float, float, float] = WEIGHTS,
 ) -> FieldProblem:
     """Return the loss as a least-squares problem of all parameters at theta, of shape (p,)."""
-    data, normal, volume = WEIGHTS
+    data, normal, volume = weights
     terms = [
         Term("data", interface, sample.points, None, data),
         Term("normal", normal_projection, sample.points, sample.normals, normal),
@@ -64,3 +65,9 @@ def data_loss(field: Siren, theta: Tensor, sample: Sample) -> float:
     value, gradient = field.value_and_gradient(theta, sample.points)
     along = (gradient * sample.normals).sum(1)
     return float(0.5 * value.square().mean() + 0.5 * (along - 1.0).square().mean())
+
+
+def eikonal_error(field: Siren, theta: Tensor, sample: Sample) -> float:
+    """Return the mean of (|grad f| - 1)^2 in the volume at theta, of shape (p,)."""
+    _, gradient = field.value_and_gradient(theta, sample.volume)
+    return float((torch.linalg.vector_norm(gradient, dim=1) - 1.0).square().mean())

@@ -16,13 +16,12 @@ from torch import Tensor
 from benchmarks.engine.loss import Sample
 from gnrecon.cloud import Frame, Samples
 from gnrecon.field import Siren
-from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
+from gnrecon.fit.start import solve_last_layer
 from gnrecon.fit.terms import Term
-from gnrecon.linalg import Cholesky, identity
 from gnrecon.residuals import interface, normal_vector, signed_distance
 
-OMEGA = 4.0
+OMEGA = 6.0
 RIDGE = 1e-4
 POINTS = 3000
 NORMAL_WEIGHT, DISTANCE_WEIGHT = 0.1, 0.1
@@ -60,9 +59,4 @@ def solved_start(field: Siren, sample: Sample, seed: int = 0) -> Tensor:
         Term("normal", normal_vector, on, scene.normals[chosen], NORMAL_WEIGHT),
         Term("distance", signed_distance, scene.tensor(x), scene.tensor(distance), DISTANCE_WEIGHT),
     ]
-    none = torch.zeros(0, dtype=torch.long)
-    problem = FieldProblem(field, terms, sine_features(field, seed), (*(none for _ in field.widths), None))
-    # The last layer is zero, so that the step is the solution and the ridge draws it towards zero.
-    free = problem.free()
-    step = Cholesky().linearise(*problem.linearise(free), identity).solve(RIDGE)
-    return problem.whole(free + step.direction).to(sample.points)
+    return solve_last_layer(field, terms, sine_features(field, seed), RIDGE).to(sample.points)

@@ -107,6 +107,13 @@ def _quality_rows(label: str, quality: dict[str, Any]) -> Iterator[Row]:
     )
     yield "", f"seconds to {quality['final_loss']:.1e}", _seconds(quality["ours_seconds_to_final"]), "", ""
     yield "", "least loss", f"{quality['ours_best']:.2e}", f"{quality['baseline_best']:.2e}", ""
+    ours, baseline = (quality[side]["eikonal_error"] for side in ("ours", "baseline"))
+    if ours is not None and baseline is not None:
+        yield "", "mean (|grad f| - 1)^2 at the end", f"{ours:.2e}", f"{baseline:.2e}", ""
+    if "ours_at_full_eikonal_weight" in quality:
+        constrained = quality["ours_at_full_eikonal_weight"]
+        yield "", "least loss, full eikonal weight", f"{min(constrained['losses']):.2e}", "", ""
+        yield "", "its mean (|grad f| - 1)^2", f"{constrained['eikonal_error']:.2e}", "", ""
 
 
 def _kernel_rows(kernel: dict[str, Any]) -> Iterator[Row]:
