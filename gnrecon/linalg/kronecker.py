@@ -12,6 +12,7 @@ row,
 
     sum_n M_n^T B M_n = i^T diag(l.B l) i + i^T diag(l.B r) t + t^T diag(r.B l) i + t^T diag(r.B r) t.
 
+Where there are many rows, sums over some of them, drawn by their lengths (see `linalg.draw`), stand for those over all.
 With A = Q_a a Q_a^T and B = Q_b b Q_b^T the inverse of B (x) A + mu I is exact and cheap,
 
     V -> Q_b [(Q_b^T V Q_a) / (b a^T + mu)] Q_a^T.
@@ -29,7 +30,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gnrecon.linalg.jacobian import Jacobian, LayeredJacobian
+from gnrecon.linalg.draw import draw
+from gnrecon.linalg.jacobian import Block, Jacobian, LayeredJacobian
 from gnrecon.linalg.krylov import Apply
 from gnrecon.linalg.preconditioner import positive
 from gnrecon.linalg.rows import LayerRows
@@ -69,11 +71,12 @@ class PreparedKronecker:
 
 @dataclass(frozen=True)
 class Kronecker:
-    """Kronecker factors of each layer: O(M width^2) a turn to set up, O(width^3) in all, for any damping."""
+    """Kronecker factors of each layer: O(rows width^2) a turn to set up, O(width^3) in all, for any damping."""
 
     turns: int = 3
+    rows: int = 10_000
 
-    def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> PreparedKronecker:  # noqa: ARG002
+    def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> PreparedKronecker:
         """Find the factors.
 
         Raises
@@ -85,14 +88,27 @@ class Kronecker:
             raise ValueError(
                 "Kronecker factors are made of a layered Jacobian's outer products, which this one has not."
             )
-        widths = [layer.left.shape[1] for layer in next(iter(jacobian.blocks()))]
+        blocks = self._blocks(jacobian, generator)
+        widths = [layer.left.shape[1] for layer in blocks[0]]
         A, B = [], [torch.eye(out, dtype=metric.dtype, device=metric.device) for out in widths]
         for _ in range(self.turns):
-            A = _contracted(jacobian, B, _by_outputs)
-            B = _contracted(jacobian, A, _by_inputs)
+            A = _contracted(blocks, B, _by_outputs)
+            B = _contracted(blocks, A, _by_inputs)
         means = [float(metric[group].mean()) if group.stop > group.start else 1.0 for group in jacobian.groups]
         layers = [PreparedLayer(*_eigen(b), *_eigen(a), mean) for b, a, mean in zip(B, A, means, strict=True)]
         return PreparedKronecker(layers, jacobian.groups)
+
+    def _blocks(self, jacobian: LayeredJacobian, generator: torch.Generator) -> list[Block]:
+        if jacobian.rows <= self.rows:
+            return list(jacobian.blocks())
+        drawn, scales = draw(jacobian, self.rows, generator)
+        blocks: list[Block] = []
+        start = 0
+        for block in jacobian.sample(drawn).blocks():
+            stop = start + len(block[0])
+            blocks.append([layer.times(scales[start:stop].to(layer.left)) for layer in block])
+            start = stop
+        return blocks
 
     def describe(self) -> str:
         """Name it."""
@@ -115,10 +131,10 @@ def _by_inputs(layer: LayerRows) -> Sides:
     return ins, outs
 
 
-def _contracted(jacobian: LayeredJacobian, factors: list[Tensor], sides: Callable[[LayerRows], Sides]) -> list[Tensor]:
+def _contracted(blocks: list[Block], factors: list[Tensor], sides: Callable[[LayerRows], Sides]) -> list[Tensor]:
     """Return for each layer the factor that makes |G - B (x) A|_F least, given the other one."""
     sums = [factors[0].new_zeros(())] * len(factors)
-    for block in jacobian.blocks():
+    for block in blocks:
         for k, (layer, factor) in enumerate(zip(block, factors, strict=True)):
             given, wanted = sides(layer)
             for u, w in zip(given, wanted, strict=True):

@@ -22,8 +22,8 @@ from gnrecon.linalg import (
     Sketch,
     conjugate_gradients,
 )
+from gnrecon.linalg.draw import inclusion
 from gnrecon.linalg.krylov import Apply
-from gnrecon.linalg.sampled_gram import inclusion
 
 PRECONDITIONERS: dict[str, Preconditioner] = {
     "jacobi": Jacobi(),
@@ -34,6 +34,7 @@ PRECONDITIONERS: dict[str, Preconditioner] = {
     "sampled, all": SampledGram(1000),
     "sketch": Sketch(2.0),
     "kronecker": Kronecker(),
+    "kronecker, drawn": Kronecker(rows=15),
 }
 each = pytest.mark.parametrize("name", PRECONDITIONERS)
 
@@ -149,6 +150,17 @@ def test_kronecker_is_exact_for_a_kronecker_product(tangents: bool, damping: flo
     D = torch.cat([J.new_full((15,), 2.0), J.new_full((8,), 0.5)])
     P = as_matrix(at(Kronecker(), jacobian, D, damping), 23)
     torch.testing.assert_close(P, torch.linalg.inv(J.T @ J + damping * torch.diag(D)), rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_kronecker_factors_of_drawn_rows_are_near_those_of_all(seed: int) -> None:
+    jacobian, J = layered(seed, [(3000, True), (3000, False)], (3, 2))
+    D = torch.ones(J.shape[1], dtype=F64)
+    from_all = as_matrix(at(Kronecker(), jacobian, D, 1.0), J.shape[1])
+    from_few = as_matrix(at(Kronecker(rows=2000), jacobian, D, 1.0), J.shape[1])
+    assert not torch.equal(from_few, from_all)
+    # Of 2,000 rows, a sum of squares is known to about sqrt(2 / 2000) = 3 %, unless a scale is missing.
+    assert float((from_few @ torch.linalg.inv(from_all) - torch.eye(len(D), dtype=F64)).norm(2)) < 0.25
 
 
 def test_kronecker_factors_are_the_nearest_ones() -> None:
