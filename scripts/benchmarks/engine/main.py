@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +23,9 @@ from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 
 
+FILE_WIDTH = 120
+
+
 def main(arguments: Sequence[str], plan_of: Callable[..., Plan] = Plan) -> int:
     """Run the benchmark as the arguments say, at the scale that `plan_of` gives; return the exit code.
 
@@ -36,7 +40,8 @@ def main(arguments: Sequence[str], plan_of: Callable[..., Plan] = Plan) -> int:
     """
     chosen = _parser().parse_args(arguments)
     _check(chosen)
-    console = Console(highlight=False)
+    # Into a file or a pipe rich would write 80 columns, and cut figures off.
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else FILE_WIDTH)
     names = chosen.only or _possible(chosen.data, console)
     report: dict[str, Any] = provenance("engine", arguments) | {"threads": torch.get_num_threads()}
     with TemporaryDirectory(prefix="gnrecon-bench-") as temporary:
