@@ -22,7 +22,6 @@ from benchmarks.provenance import provenance
 from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 
-
 FILE_WIDTH = 120
 
 
