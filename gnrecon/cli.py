@@ -22,7 +22,7 @@ from gnrecon.version import __version__
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
 _CommandLineError: Any = typer.BadParameter.__mro__[2]
 
-COMMANDS = ("reconstruct", "batch", "mesh", "eval", "check", "doctor", "schema")
+COMMANDS = ("reconstruct", "batch", "mesh", "eval", "convert", "check", "doctor", "schema")
 DEFAULT_COMMAND = "reconstruct"
 
 app = typer.Typer(
@@ -317,6 +317,21 @@ def eval_command(
 
     del debug
     raise SystemExit(evaluate(mesh, reference, samples=samples, seed=seed, report=report, overwrite=overwrite))
+
+
+@app.command("convert")
+def convert_command(
+    source: Annotated[Path, typer.Argument(help="Mesh or cloud to read.")],
+    target: Annotated[Path, typer.Argument(help="File to write; its extension names the format.")],
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Write a mesh or a cloud in another format, unchanged; whatever the format cannot hold is named."""
+    from gnrecon.commands.convert import convert
+
+    del debug
+    raise SystemExit(convert(source, target, overwrite=overwrite, quiet=quiet))
 
 
 @app.command("check")

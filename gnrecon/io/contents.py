@@ -40,12 +40,14 @@ class Contents:
     normals : array of shape (N, 3), optional, as stored
     faces : integer array of shape (F, 3); empty for a bare cloud
     attributes : mapping of name to array of N rows
+    unread : what else the file holds, in words such as ``"texture coordinates"``
     """
 
     points: Float
     normals: Float | None = None
     faces: Int = field(default_factory=no_faces)
     attributes: Columns = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
 
 
 def _take(columns: dict[str, npt.NDArray[np.generic]], choices: tuple[tuple[str, ...], ...]) -> Columns | None:

@@ -17,7 +17,7 @@ from gnrecon.io.ply import read_ply, write_ply
 from gnrecon.io.stl import read_stl, write_stl
 from gnrecon.io.threemf import write_3mf
 from gnrecon.io.threemf_model import read_3mf
-from gnrecon.io.xyz import read_xyz
+from gnrecon.io.xyz import read_xyz, write_xyz
 from gnrecon.mesh import Mesh
 
 READERS: dict[str, Callable[[Path], Contents]] = {
@@ -42,6 +42,14 @@ WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".glb": write_glb,
     ".3mf": write_3mf,
 }
+
+CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
+    ".ply": write_ply,
+    ".xyz": write_xyz,
+    ".txt": write_xyz,
+    ".csv": write_xyz,
+}
+"""Writers of vertices without faces."""
 
 Values = npt.NDArray[np.generic]
 

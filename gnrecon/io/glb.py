@@ -27,6 +27,14 @@ _COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"
 
 _JSON = b"JSON"
 
+_UNREAD = {
+    b"TEXCOORD_0": "texture coordinates",
+    b"textures": "textures",
+    b"animations": "animations",
+    b"skins": "skins",
+}
+"""Words of the JSON that name what is left out."""
+
 
 def fits_glb(name: str, values: npt.NDArray[np.generic]) -> bool:
     """Whether glTF can hold an attribute: finite numbers of up to four columns that float32 tells apart."""
@@ -75,9 +83,14 @@ def read_glb(path: Path) -> Contents:
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = np.divide(directions, lengths, out=np.zeros_like(directions), where=lengths > 0)
     all_faces = np.concatenate(faces)
-    return Contents(
-        np.concatenate(vertices), directions if len(all_faces) else None, all_faces, _attributes(attributes)
-    )
+    given = directions if len(all_faces) else None
+    return Contents(np.concatenate(vertices), given, all_faces, _attributes(attributes), _unread(path.read_bytes()))
+
+
+def _unread(data: bytes) -> tuple[str, ...]:
+    """Name what else the file's JSON speaks of."""
+    text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    return tuple(name for word, name in _UNREAD.items() if b'"' + word + b'"' in text)
 
 
 def _renamed(data: bytes) -> bytes:

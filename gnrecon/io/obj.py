@@ -14,12 +14,24 @@ import numpy.typing as npt
 from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.polygons import fan
+from gnrecon.io.polygons import fan, not_triangles
 from gnrecon.io.text import format_rows, numbers, read_text
 from gnrecon.mesh import Mesh
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
+
+_UNREAD = {
+    "vt": "texture coordinates",
+    "usemtl": "materials",
+    "l": "lines",
+    "p": "points",
+    "curv": "free-form curves and surfaces",
+    "surf": "free-form curves and surfaces",
+    "o": "names of objects and groups",
+    "g": "names of objects and groups",
+}
+"""Kinds of lines that are left out, and what they hold."""
 
 
 def read_obj(path: Path) -> Contents:
@@ -40,12 +52,18 @@ def read_obj(path: Path) -> Contents:
     counts, corners = _corners(lines)
     if not len(counts):
         given = normals[:, :3] if len(normals) == len(points) else None
-        return Contents(points, given, no_faces(), colors)
+        return Contents(points, given, no_faces(), colors, _unread(lines))
     corner_vertices = _indices([word.partition("/")[0] for word in corners], lines, counts, "v")
     if corner_vertices.max() >= len(points):
         raise InputError(f"a face names vertex {corner_vertices.max() + 1}, but there are {len(points)}.")
     given = _normals(corners, corner_vertices, normals, lines, counts, len(points))
-    return Contents(points, given, fan(counts, corner_vertices), colors)
+    return Contents(points, given, fan(counts, corner_vertices), colors, _unread(lines) + not_triangles(counts))
+
+
+def _unread(lines: list[str]) -> tuple[str, ...]:
+    """Name what other kinds of lines hold."""
+    kinds = {word for word in (line.partition(" ")[0] for line in lines) if word in _UNREAD}
+    return tuple(dict.fromkeys(name for word, name in _UNREAD.items() if word in kinds))
 
 
 def _rows(lines: list[str], kind: str) -> Float:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gnrecon.colors import as_bytes, with_alpha
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.polygons import fan
+from gnrecon.io.polygons import fan, not_triangles
 from gnrecon.io.text import format_rows, meaningful_lines, numbers, read_text
 from gnrecon.mesh import Mesh
 
@@ -47,12 +47,9 @@ def read_off(path: Path) -> Contents:
         raise InputError(f"NOFF vertices need 6 numbers each, but hold {table.shape[1]}.")
     first_color = 6 if has_normals else 3
     colors = {"colors": table[:, first_color : first_color + 4]} if has_colors and table.shape[1] > first_color else {}
-    return Contents(
-        np.ascontiguousarray(table[:, :3]),
-        table[:, 3:6] if has_normals else None,
-        _faces(lines[vertex_count : vertex_count + face_count]),
-        colors,
-    )
+    faces, unread = _faces(lines[vertex_count : vertex_count + face_count])
+    points = np.ascontiguousarray(table[:, :3])
+    return Contents(points, table[:, 3:6] if has_normals else None, faces, colors, unread)
 
 
 def _vertices(lines: list[str]) -> npt.NDArray[np.float64]:
@@ -66,11 +63,11 @@ def _vertices(lines: list[str]) -> npt.NDArray[np.float64]:
     return values.reshape(-1, columns)
 
 
-def _faces(lines: list[str]) -> Int:
-    """Return the triangles of rows ``n i1 ... in [colour]``."""
+def _faces(lines: list[str]) -> tuple[Int, tuple[str, ...]]:
+    """Return the triangles of rows ``n i1 ... in [colour]``, and the names of what is not kept of them."""
     if not lines:
-        return no_faces()
-    counts, corners = [], []
+        return no_faces(), ()
+    counts, corners, colored = [], [], False
     for line in lines:
         words = line.split()
         count = int(words[0]) if words[0].isdecimal() else -1
@@ -78,7 +75,10 @@ def _faces(lines: list[str]) -> Int:
             raise InputError(f"the face row {line[:60]!r} is not a count and as many vertex indices.")
         counts.append(count)
         corners += words[1 : count + 1]
-    return fan(np.array(counts, np.int64), numbers(corners).astype(np.int64))
+        colored |= len(words) > count + 1
+    sides = np.array(counts, np.int64)
+    unread = ("colours of faces",) * colored + not_triangles(sides)
+    return fan(sides, numbers(corners).astype(np.int64)), unread
 
 
 def write_off(mesh: Mesh, path: Path) -> None:

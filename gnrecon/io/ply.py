@@ -8,7 +8,7 @@ differing size, or accept a file that ends too early; that is why the walker is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.ply_columns import vertex_columns
 from gnrecon.io.ply_header import ORDERS, PLY_TYPES, Element, Property, parse_header, too_short
-from gnrecon.io.polygons import fan
+from gnrecon.io.polygons import fan, not_triangles
 from gnrecon.io.text import numbers
 from gnrecon.mesh import Mesh
 
@@ -57,7 +57,18 @@ def read_ply(path: Path) -> Contents:
         raise InputError("the PLY header declares no vertex element.")
     polygons = rows["face"].lists if "face" in rows else {}
     corners = polygons.get("vertex_indices", polygons.get("vertex_index"))
-    return from_columns(rows["vertex"].scalars, None if corners is None else fan(*corners))
+    contents = from_columns(rows["vertex"].scalars, None if corners is None else fan(*corners))
+    return replace(contents, unread=_unread(elements) + (() if corners is None else not_triangles(corners[0])))
+
+
+def _unread(elements: list[Element]) -> tuple[str, ...]:
+    """Name all that the header declares and this reader leaves out."""
+    found = [f"the element {one.name}" for one in elements if one.name not in ("vertex", "face") and one.count]
+    for element in elements:
+        names = {prop.name for prop in element.properties if element.name == "face" or prop.count_type}
+        if element.count and element.name in ("vertex", "face"):
+            found += [f"{name} of each {element.name}" for name in sorted(names - {"vertex_indices", "vertex_index"})]
+    return tuple(found)
 
 
 def _walk(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
@@ -162,7 +173,7 @@ def _indices(values: npt.NDArray[np.generic]) -> Int:
 
 
 def write_ply(mesh: Mesh, path: Path) -> None:
-    """Write binary little-endian PLY: double positions, float normals and all attributes of the mesh, int faces."""
+    """Write binary little-endian PLY: double positions, float normals, all attributes, and int faces if any."""
     columns = vertex_columns(mesh)
     vertices = np.empty(len(mesh.vertices), np.dtype([(name, f"<{PLY_TYPES[kind]}") for name, kind, _ in columns]))
     for name, _, values in columns:
@@ -172,7 +183,9 @@ def write_ply(mesh: Mesh, path: Path) -> None:
     faces["corners"] = mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     lines += [f"property {kind} {name}" for name, kind, _ in columns]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    if len(faces):  # a file without the element is a cloud to every reader
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    lines += ["end_header", ""]
     with path.open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
         vertices.tofile(file)

@@ -23,3 +23,13 @@ def fan(counts: Int, corners: Int) -> Int:
     first = (np.cumsum(counts) - counts)[polygon]
     k = np.arange(len(polygon)) - (np.cumsum(triangles) - triangles)[polygon]
     return np.column_stack([corners[first], corners[first + k + 1], corners[first + k + 2]])
+
+
+def not_triangles(counts: Int) -> tuple[str, ...]:
+    """Say what `fan` does not keep of polygons with so many corners, of shape (P,); nothing for triangles."""
+    larger, smaller = int((counts > 3).sum()), int((counts < 3).sum())
+    sentences = (
+        (larger, f"{larger} polygons of more than three corners as such (they are cut into triangles)"),
+        (smaller, f"{smaller} polygons of less than three corners"),
+    )
+    return tuple(sentence for count, sentence in sentences if count)

@@ -59,10 +59,21 @@ def read_reference(path: str | Path) -> Mesh | PointCloud:
     InputError
         As `read_cloud` does.
     """
+    return read_any(path)[0]
+
+
+def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
+    """Read a mesh where the file has faces, else a cloud; and name what else the file holds, which is not read.
+
+    Raises
+    ------
+    InputError
+        As `read_cloud` does.
+    """
     contents = _read(Path(path), None)
     if len(contents.faces):
-        return _mesh(contents, Path(path))
-    return PointCloud(contents.points, contents.normals, contents.attributes)
+        return _mesh(contents, Path(path)), contents.unread
+    return PointCloud(contents.points, contents.normals, contents.attributes), contents.unread
 
 
 def _mesh(contents: Contents, path: Path) -> Mesh:

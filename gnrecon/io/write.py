@@ -1,4 +1,4 @@
-"""Writing a mesh, in the format that the file's extension names, atomically."""
+"""Writing a mesh or a cloud, in the format that the file's extension names, atomically."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.atomic import atomic_write
+from gnrecon.cloud import PointCloud
 from gnrecon.errors import MeshError, UsageError
-from gnrecon.io.formats import HOLDS, WRITERS
+from gnrecon.io.contents import no_faces
+from gnrecon.io.formats import CLOUD_WRITERS, HOLDS, WRITERS
 from gnrecon.mesh import Mesh
 
 _NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
@@ -50,6 +52,34 @@ def write_mesh(
     with atomic_write(path, overwrite, verify) as temporary:
         WRITERS[extension](replace(mesh, attributes=held), temporary)
     return _lost(mesh, held, extension) + (_rounding(mesh) if extension == ".stl" else [])
+
+
+def write_cloud(
+    cloud: PointCloud, path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
+) -> None:
+    """Write points with their normals and all their attributes, colours as 8-bit numbers.
+
+    Parameters
+    ----------
+    cloud : in file units
+    path : target; its extension names the format
+    overwrite, verify : as of `write_mesh`
+
+    Raises
+    ------
+    UsageError
+        When a cloud cannot be written with that extension.
+    OutputError
+        When the file cannot be written.
+    """
+    extension = Path(path).suffix.lower()
+    if extension not in CLOUD_WRITERS:
+        supported = ", ".join(suffix[1:] for suffix in CLOUD_WRITERS)
+        raise UsageError(
+            f"Points cannot be written as {extension or 'a file without an extension'!r}; use {supported}."
+        )
+    with atomic_write(path, overwrite, verify) as temporary:
+        CLOUD_WRITERS[extension](Mesh(cloud.points, no_faces(), cloud.normals, cloud.attributes), temporary)
 
 
 def holds(path: str | Path, name: str, values: npt.NDArray[np.generic]) -> bool:

@@ -1,4 +1,4 @@
-"""Columns of numbers in text: XYZ, PTS, TXT, CSV, separated by blanks, commas, semicolons or tabs.
+"""Columns of numbers in text: XYZ, PTS, TXT, CSV, separated by blanks, commas, semicolons or tabs; read and written.
 
 Columns are named by a header line (``x,y,z,nx,ny,nz`` or ``//X Y Z Intensity``), or else guessed from their number:
 three directions of unit length are normals, the others as scanners commonly write them. A first line that is one bare
@@ -16,7 +16,9 @@ import numpy.typing as npt
 
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, from_columns
+from gnrecon.io.ply_columns import vertex_columns
 from gnrecon.io.text import read_text
+from gnrecon.mesh import Mesh
 
 Float = npt.NDArray[np.float64]
 
@@ -126,3 +128,19 @@ def _guess(table: Float) -> list[str]:
     else:
         names = {1: ["intensity"], 3: _COLOR, 4: ["intensity", *_COLOR]}.get(extra, [])
     return ["x", "y", "z", *names, *(f"column_{i + 1}" for i in range(3 + len(names), table.shape[1]))]
+
+
+def write_xyz(cloud: Mesh, path: Path) -> None:
+    """Write the vertices with all their columns, and a line that names them: commented out unless the file is a CSV.
+
+    Numbers have the digits that read back as the same ones.
+    """
+    columns = vertex_columns(cloud)
+    comma = path.suffix.lower() == ".csv"
+    separator = "," if comma else " "
+    words = ["%d" if values.dtype.kind in "biu" else "%r" for _, _, values in columns]
+    # One column at a time keeps integers of any size exact.
+    cells = [[word % number for number in values.tolist()] for word, (_, _, values) in zip(words, columns, strict=True)]
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.write(("" if comma else "# ") + separator.join(name for name, _, _ in columns) + "\n")
+        file.writelines(separator.join(row) + "\n" for row in zip(*cells, strict=True))
