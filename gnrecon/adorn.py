@@ -101,15 +101,17 @@ def _carried(sources: Sources) -> Made:
 
 def _curvature(sources: Sources) -> Made:
     """Mean and Gauss curvature of the field's level sets through the vertices."""
-    if not sources.options.curvature:
-        return [], []
-    vertices = sources.mesh.vertices
-    mean, gauss = curvatures(sources.sdf.gradient(vertices), sources.sdf.hessian(vertices))
+    return (curvature_of(sources.mesh, sources.sdf) if sources.options.curvature else []), []
+
+
+def curvature_of(mesh: Mesh, sdf: NeuralSDF) -> list[Attribute]:
+    """Return mean and Gauss curvature of the field's level sets through a mesh's vertices."""
+    mean, gauss = curvatures(sdf.gradient(mesh.vertices), sdf.hessian(mesh.vertices))
     origin = "of the field's level set, from its gradient and second derivatives; per"
     return [
         Attribute("mean_curvature", mean, f"mean curvature {origin} file unit"),
         Attribute("gauss_curvature", gauss, f"Gauss curvature {origin} squared file unit"),
-    ], []
+    ]
 
 
 MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried, _curvature)

@@ -280,6 +280,7 @@ def mesh_command(
         str,
         typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=MESH),
     ] = "auto",
+    curvature: Curvature = False,
     threads: Threads = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -298,7 +299,7 @@ def mesh_command(
         None if shell is None else parse_length(shell, units),
         None if crop is None else np.array(parse_box(crop)),
     )
-    options = {"resolution": resolution, "attributes": attributes, "threads": threads}
+    options = {"resolution": resolution, "attributes": attributes, "curvature": curvature, "threads": threads}
     raise SystemExit(remesh(model, output, options, shape, overwrite=overwrite, quiet=quiet))
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gnrecon.adorn import wanted
+from gnrecon.adorn import curvature_of, wanted
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import ExitCode
 from gnrecon.export import Neighbourhood, require_sound, verify_file
 from gnrecon.files import require_files
 from gnrecon.fit import NeuralSDF
-from gnrecon.io import check_writable, write_mesh
+from gnrecon.io import check_writable, holds, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 from gnrecon.pipeline import limited
@@ -45,7 +45,7 @@ def remesh(
     check_writable(output)
     require_files([model], [output], overwrite)
     chosen = Options.of(**options)
-    distance = "distance" in wanted(PointCloud(np.empty((0, 3))), chosen.attributes)
+    wanted(PointCloud(np.empty((0, 3))), chosen.attributes)  # a misspelt name is refused before the work
     console = Console(stderr=True, quiet=quiet)
     with shown(console, verbose=False) as progress, limited(chosen.threads):
         stages = Stages(progress.stage)
@@ -54,9 +54,9 @@ def remesh(
         mesh, remarks = shaped(sdf, chosen, shape, stages=stages, advance=progress.advance)
         with stages("verify"):
             facts = require_sound(mesh)
-        if distance:
+        if shape.levels == (0.0,):  # elsewhere, neither the points nor the field say anything of the surface
             with stages("attributes"):
-                mesh = _with_distance(mesh, sdf, shape)
+                mesh = _adorned(mesh, sdf, chosen, output)
         progress.stage("write")
         losses = write_mesh(mesh, output, overwrite, verify=_verify)
     summary = summarise(output, facts.as_dict(), stages.resources())
@@ -65,11 +65,17 @@ def remesh(
     return ExitCode.OK
 
 
-def _with_distance(mesh: Mesh, sdf: NeuralSDF, shape: Shape) -> Mesh:
-    """Tell each vertex how far it lies from the model's points, where the mesh is the surface that they lie on."""
-    if sdf.data is None or shape.levels != (0.0,):
-        return mesh
-    return mesh.with_attributes({"distance": Neighbourhood(sdf.data).distances(mesh.vertices)})
+def _adorned(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path) -> Mesh:
+    """Tell each vertex how far it lies from the model's points, and how the field is curved there, where asked for.
+
+    Distances that nobody asked for by name are left out where the format has no place for them.
+    """
+    made = {one.name: one.values for one in (curvature_of(mesh, sdf) if options.curvature else [])}
+    if options.attributes != "none" and sdf.data is not None:
+        distances = Neighbourhood(sdf.data).distances(mesh.vertices)
+        if options.attributes != "auto" or holds(output, "distance", distances):
+            made["distance"] = distances
+    return mesh.with_attributes(made)
 
 
 def _verify(path: Path) -> None:

@@ -66,6 +66,27 @@ def test_a_finer_mesh_of_the_same_field(model: Path, folder: Path, tmp_path: Pat
     assert facts.faces > 2 * len(read_mesh(folder / "ring.obj").faces)
 
 
+def test_vertices_carry_their_distance_and_curvature(model: Path, tmp_path: Path, command: CommandLine) -> None:
+    words = ("mesh", model, "--resolution", 32, "--quiet", "-o")
+    assert command(*words, tmp_path / "a.ply", "--curvature").returncode == 0
+    mesh = read_mesh(tmp_path / "a.ply")
+    assert set(mesh.attributes) == {"distance", "mean_curvature", "gauss_curvature"}
+    data = NeuralSDF.load(model).data
+    nearest = np.linalg.norm(mesh.vertices[::50, None] - data[None], axis=2).min(axis=1)
+    assert np.allclose(mesh.attributes["distance"][::50], nearest)
+    # Outermost, a torus is curved as its tube and as its own circle, innermost as its tube and against its circle.
+    ring = np.linalg.norm(mesh.vertices[:, :2], axis=1)
+    assert np.median(mesh.attributes["gauss_curvature"][ring > 1.25]) > 0
+    assert np.median(mesh.attributes["gauss_curvature"][ring < 0.75]) < 0
+    assert command(*words, tmp_path / "b.ply", "--attributes", "none").returncode == 0
+    assert read_mesh(tmp_path / "b.ply").attributes == {}
+    words = (*words[:-2], "-o")
+    assert "cannot hold distance" not in command(*words, tmp_path / "a.obj").stderr
+    assert "cannot hold distance" in command(*words, tmp_path / "b.obj", "--attributes", "distance").stderr
+    assert command(*words, tmp_path / "c.ply", "--offset", "0.1").returncode == 0
+    assert read_mesh(tmp_path / "c.ply").attributes == {}
+
+
 @pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
 def test_offset_shell_and_crop_at_once(model: Path, tmp_path: Path, command: CommandLine, suffix: str) -> None:
     shape = ("--offset", "-20mm", "--units", "m", "--shell", "0.1", "--crop", "-2,-2,-2,2,2,0")
