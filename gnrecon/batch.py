@@ -23,11 +23,12 @@ SUMMARY = "summary.json"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scan: exit code 0, the mesh and its report, or the code and the sentence that says why not."""
+    """What became of one scan: exit code 0 and the files, or the code and the sentence that says why not."""
 
     scan: str
     mesh: str
     report: str
+    page: str
     exit_code: int
     message: str
     seconds: float
@@ -40,6 +41,7 @@ def run_batch(
     arguments: Sequence[str],
     *,
     reports: bool = False,
+    pages: bool = False,
     quiet: bool = False,
 ) -> int:
     """Reconstruct every readable file of `folder` into `output` and return the exit code.
@@ -53,6 +55,7 @@ def run_batch(
     mesh_format : extension of the meshes, without the dot
     arguments : passed on to ``gnrecon reconstruct``
     reports : whether a JSON report is written beside each mesh, under its name with ``.report.json``
+    pages : whether a page is written beside each mesh, under its name with ``.html``
 
     Raises
     ------
@@ -74,7 +77,7 @@ def run_batch(
     try:
         for number, (scan, target) in enumerate(zip(scans, targets, strict=True), 1):
             console.print(f"[{number}/{len(scans)}] {scan}", highlight=False, markup=False)
-            outcomes.append(_one(scan, target, arguments, reports))
+            outcomes.append(_one(scan, target, arguments, reports, pages))
             interrupted = outcomes[-1].exit_code == ExitCode.INTERRUPTED
             if interrupted:
                 break
@@ -116,11 +119,13 @@ def _make(output: Path) -> None:
         raise OutputError(f"The folder {output} cannot be made: {error.strerror or error}.") from error
 
 
-def _one(scan: Path, target: Path, arguments: Sequence[str], reports: bool) -> Outcome:
+def _one(scan: Path, target: Path, arguments: Sequence[str], reports: bool, pages: bool) -> Outcome:
     """Run one scan; its last line on stderr is the sentence to report."""
     report = str(target.with_suffix(".report.json")) if reports else ""
+    page = str(target.with_suffix(".html")) if pages else ""
     command = [sys.executable, "-m", "gnrecon", "reconstruct", str(scan), "-o", str(target), "--quiet", *arguments]
     command += ["--report", report] if reports else []
+    command += ["--html", page] if pages else []
     start = time.perf_counter()
     # No standard input, and output by pipe: nothing of one scan can end up in the batch's own streams.
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
@@ -129,7 +134,7 @@ def _one(scan: Path, target: Path, arguments: Sequence[str], reports: bool) -> O
     message = lines[-1].removeprefix("gnrecon: ") if lines and done.returncode else ""
     if done.returncode < 0:
         message = f"Killed by {signal.Signals(-done.returncode).name}."
-    files = (str(target), report) if done.returncode == 0 else ("", "")
+    files = (str(target), report, page) if done.returncode == 0 else ("", "", "")
     return Outcome(str(scan), *files, done.returncode, message, seconds)
 
 

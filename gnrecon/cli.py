@@ -7,6 +7,7 @@ else to stderr. Each foreseen failure ends in one sentence and the exit code of 
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Sequence
@@ -126,6 +127,7 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show a traceback on failur
 
 @app.command(DEFAULT_COMMAND)
 def reconstruct_command(
+    context: typer.Context,
     scan: Annotated[Path, typer.Argument(help="PLY, PCD, XYZ, PTS, TXT, CSV, OBJ, OFF or STL file.")],
     output: Output,
     fraction: Fraction = None,
@@ -156,6 +158,13 @@ def reconstruct_command(
         Path | None,
         typer.Option(help="Fitted field to write, a .gnr file that gnrecon mesh reads.", rich_help_panel=OUTPUT),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            help="Page to write: the model in 3-D with all that is known of it, in one HTML file.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -183,8 +192,8 @@ def reconstruct_command(
         "curvature": curvature,
     }
     del debug  # read from the arguments by `main`, which handles failures
-    files = Files(scan, output, reference, report, preview, save, overwrite)
-    raise SystemExit(run(files, options, quiet=quiet, verbose=verbose))
+    files = Files(scan, output, reference, report, preview, save, html, overwrite)
+    raise SystemExit(run(files, options, command=context.obj, quiet=quiet, verbose=verbose))
 
 
 @app.command("batch")
@@ -217,6 +226,10 @@ def batch_command(
             "--reports", help="Write a JSON report beside each mesh: NAME.report.json.", rich_help_panel=OUTPUT
         ),
     ] = False,
+    pages: Annotated[
+        bool,
+        typer.Option("--pages", help="Write a page beside each mesh, see --html: NAME.html.", rich_help_panel=OUTPUT),
+    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -244,7 +257,7 @@ def batch_command(
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
     passed += ["--curvature"] * curvature
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
-    raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, quiet=quiet))
+    raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, pages=pages, quiet=quiet))
 
 
 @app.command("mesh")
@@ -388,13 +401,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if words == ["--version"]:
         print(f"gnrecon {__version__}")
         sys.exit(0)
+    command = shlex.join(["gnrecon", *words])
     if words and words[0] not in (*COMMANDS, "-h", "--help"):
         words.insert(0, DEFAULT_COMMAND)
     # On a busy machine, threads that spin while they wait cost several times what they gain.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # A polite kill must unwind, so that temporary files are removed.
     signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(_guarded(words))
+    sys.exit(_guarded(words, command))
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
@@ -402,10 +416,10 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
     raise SystemExit(128 + number)
 
 
-def _guarded(words: list[str]) -> int:
-    """Run the words and turn every failure into a sentence and an exit code."""
+def _guarded(words: list[str], command: str) -> int:
+    """Run the words and turn every failure into a sentence and an exit code; `command` is what was typed."""
     try:
-        result: Any = app(words, standalone_mode=False)
+        result: Any = app(words, standalone_mode=False, obj=command)
         # Newer versions of typer turn Ctrl-C into this value and say nothing; `run` and `run_batch` raise theirs.
         if result == ExitCode.INTERRUPTED:
             raise KeyboardInterrupt

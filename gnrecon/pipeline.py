@@ -18,8 +18,8 @@ import torch
 from gnrecon.adorn import Sources, adorn, wanted
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.export import Attribute, MeshFacts, Metrics, measure, require_sound, verify_file
-from gnrecon.fit import NeuralSDF, fit
+from gnrecon.export import Attribute, MeshFacts, Metrics, measure, require_sound, verify_file, vertex_error
+from gnrecon.fit import Misfit, NeuralSDF, fit
 from gnrecon.ingest import IngestCounts, prepare
 from gnrecon.io import as_cloud, holds, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
@@ -180,6 +180,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
         sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total), progress.advance)
+        residuals = Misfit.of(sdf, samples)
     progress.remark(solution.status)
     # The field's own points, so that a saved field makes the same mesh again.
     mesh, actions = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
@@ -195,7 +196,10 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     if truth is not None:
         with stages("measure"):
             metrics = measure(mesh, truth, seed=options.seed, advance=progress.advance)
-    report = _report(source, options, stages, counts, solution, sdf, facts, actions, attributes, metrics)
+            if options.attributes != "none":
+                error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
+                mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
+    report = _report(source, options, stages, counts, solution, residuals, sdf, facts, actions, attributes, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
 
 
@@ -241,6 +245,7 @@ def _report(
     stages: Stages,
     counts: IngestCounts,
     solution: Solution,
+    residuals: Misfit,
     sdf: NeuralSDF,
     facts: MeshFacts,
     actions: list[str],
@@ -249,6 +254,7 @@ def _report(
 ) -> dict[str, Any]:
     found = {
         "schema_version": SCHEMA_VERSION,
+        "command": None,
         "input": str(source) if isinstance(source, str | Path) else type(source).__name__,
         "options": options.as_dict(),
         "versions": versions(),
@@ -260,6 +266,7 @@ def _report(
             "interrupted": solution.interrupted,
             "parameters": len(sdf.theta),
             "history": [vars(record) for record in solution.history],
+            "residuals": residuals.as_dict(),
         },
         "mesh": facts.as_dict(),
         "actions": actions,

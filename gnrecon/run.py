@@ -18,6 +18,7 @@ from gnrecon.export import render
 from gnrecon.files import require_files
 from gnrecon.io import check_writable, read_cloud
 from gnrecon.optim import Record
+from gnrecon.page import page_text
 from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
 
@@ -47,6 +48,7 @@ class Files:
     report: Path | None = None
     preview: Path | None = None
     model: Path | None = None
+    html: Path | None = None
     overwrite: bool = False
 
     def check(self) -> None:
@@ -66,13 +68,17 @@ class Files:
             raise UsageError(f"The preview is a PNG picture, so it cannot be called {self.preview}.")
         if self.model is not None and self.model.suffix.lower() != ".gnr":
             raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
+        if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
+            raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
         inputs = [path for path in (self.scan, self.reference) if path is not None]
-        targets = [path for path in (self.output, self.report, self.preview, self.model) if path is not None]
-        require_files(inputs, targets, self.overwrite)
+        asked = (self.output, self.report, self.preview, self.model, self.html)
+        require_files(inputs, [path for path in asked if path is not None], self.overwrite)
 
 
-def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: bool = False) -> int:
-    """Reconstruct one scan and return the exit code.
+def run(
+    files: Files, options: dict[str, Any], *, command: str | None = None, quiet: bool = False, verbose: bool = False
+) -> int:
+    """Reconstruct one scan and return the exit code; `command` is the line that asked for it, for the report.
 
     Raises
     ------
@@ -83,6 +89,7 @@ def run(files: Files, options: dict[str, Any], *, quiet: bool = False, verbose: 
     console = Console(stderr=True, quiet=quiet)
     with shown(console, verbose) as progress:
         result = reconstruct(files.scan, reference=files.reference, progress=progress, **options)
+        result.report["command"] = command
         progress.stage("write")
         warnings = _write(files, result)
     summary = summarise(files.output, result.report["mesh"], result.report["resources"])
@@ -109,6 +116,9 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
         if files.model is not None:
             model = stack.enter_context(atomic_write(files.model, files.overwrite))
             result.sdf.save(model, overwrite=True)
+        if files.html is not None:
+            page = stack.enter_context(atomic_write(files.html, files.overwrite))
+            page.write_text(page_text(result.report, result.mesh, read_cloud(files.scan)), encoding="utf-8")
         return result.save(files.output, files.overwrite)
 
 

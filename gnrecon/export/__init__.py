@@ -1,11 +1,14 @@
 """From a field to a verified mesh: extract, project, repair, verify, measure, draw, and attributes."""
 
+from gnrecon.export.ambient import vertex_sky
 from gnrecon.export.attribute import Attribute
 from gnrecon.export.carry import carry
 from gnrecon.export.curvature import curvatures
-from gnrecon.export.definitions import Metrics
+from gnrecon.export.definitions import DISTANCES, Metrics
+from gnrecon.export.error import vertex_error
 from gnrecon.export.examine import Findings, examine
 from gnrecon.export.extract import extract
+from gnrecon.export.lighten import lighten
 from gnrecon.export.metrics import measure
 from gnrecon.export.neighbours import Neighbourhood
 from gnrecon.export.picture import render
@@ -16,6 +19,7 @@ from gnrecon.export.stray import remove_stray
 from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
 
 __all__ = [
+    "DISTANCES",
     "Attribute",
     "Findings",
     "MeshFacts",
@@ -26,6 +30,7 @@ __all__ = [
     "curvatures",
     "examine",
     "extract",
+    "lighten",
     "measure",
     "project",
     "remove_stray",
@@ -34,4 +39,6 @@ __all__ = [
     "require_sound",
     "verify",
     "verify_file",
+    "vertex_error",
+    "vertex_sky",
 ]

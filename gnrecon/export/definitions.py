@@ -59,7 +59,7 @@ class Metrics:
 
     def as_dict(self) -> dict[str, object]:
         """All numbers by name, with the distances relative to the radius under ``relative``; ready for JSON."""
-        return {**asdict(self), "relative": {name: getattr(self, name) / self.radius for name in _DISTANCES}}
+        return {**asdict(self), "relative": {name: getattr(self, name) / self.radius for name in DISTANCES}}
 
     def describe(self) -> list[str]:
         """One line a number: its value, the value relative to the radius, and its definition."""
@@ -67,7 +67,7 @@ class Metrics:
         lines = [
             f"{name:24}{getattr(self, name):12.6g}{getattr(self, name) / self.radius:12.4e} of the radius  "
             f"{meaning.format(target=target)}"
-            for name, meaning in _DISTANCES.items()
+            for name, meaning in DISTANCES.items()
         ]
         if self.normal_consistency is not None:
             meaning = "mean |cosine| of a sample's normal and the nearest one's, mean of both ways"
@@ -78,7 +78,7 @@ class Metrics:
         return lines
 
 
-_DISTANCES = {
+DISTANCES = {
     "reference_to_mesh_mean": "mean distance of the reference's samples to the mesh",
     "mesh_to_reference_mean": "mean distance of the mesh's samples to the reference's {target}",
     "chamfer_mean": "half the sum of the two means",

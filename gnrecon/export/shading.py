@@ -53,19 +53,8 @@ def shade(normals: Float, color: Float, axes: Float, sky: Float | float) -> Floa
     return result
 
 
-def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float) -> Float:
-    """Share of the sky seen from surface points, as an image, smoothed over about a pixel.
-
-    Parameters
-    ----------
-    scene : open3d's ray-casting scene of the surface
-    points, normals : arrays of shape (N, 3)
-        At the pixels that show the surface.
-    hit : boolean array of shape (H, W)
-        Which pixels these are.
-    reach : float
-        How near something must be to cover the sky.
-    """
+def open_sky(scene: Any, points: Float, normals: Float, reach: float) -> Float:
+    """Share of the sky, of shape (N,), that surface points with unit normals see, as in `sky_share`."""
     from open3d import core
 
     seen = np.zeros(len(points))
@@ -79,8 +68,25 @@ def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float)
         covered = scene.test_occlusions(core.Tensor.from_numpy(rays), tnear=0.0, tfar=reach).numpy()
         total[rows] += weight[rows]
         seen[rows] += weight[rows] * ~covered
+    share: Float = seen / np.maximum(total, 1e-9)
+    return share
+
+
+def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float) -> Float:
+    """Share of the sky seen from surface points, as an image, smoothed over about a pixel.
+
+    Parameters
+    ----------
+    scene : open3d's ray-casting scene of the surface
+    points, normals : arrays of shape (N, 3)
+        At the pixels that show the surface.
+    hit : boolean array of shape (H, W)
+        Which pixels these are.
+    reach : float
+        How near something must be to cover the sky.
+    """
     image = np.zeros(hit.shape)
-    image[hit] = seen / np.maximum(total, 1e-9)
+    image[hit] = open_sky(scene, points, normals, reach)
     # Averaging over the surface's own pixels alone keeps the outline free of a halo.
     smooth = gaussian_filter(image, 1.2) / np.maximum(gaussian_filter(hit.astype(np.float64), 1.2), 1e-9)
     return np.asarray(smooth)

@@ -1,7 +1,8 @@
 """From samples to a fitted signed distance field."""
 
+from gnrecon.fit.misfit import Misfit
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
 
-__all__ = ["FitOptions", "NeuralSDF", "fit"]
+__all__ = ["FitOptions", "Misfit", "NeuralSDF", "fit"]

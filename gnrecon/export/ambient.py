@@ -1,0 +1,33 @@
+"""How much of the sky each vertex of a mesh sees, for viewers that cannot cast rays themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from gnrecon.cloud import Float
+from gnrecon.export.nearest import ray_scene
+from gnrecon.export.shading import open_sky
+from gnrecon.export.solid import centre_and_size
+from gnrecon.mesh import Mesh
+
+REACH = 0.7
+"""How near something must be to cover the sky, in halves of the mesh's longest side."""
+
+PASSES = 2
+"""How often a vertex takes the mean of itself and its neighbours: some dozen rays alone would leave grain."""
+
+
+def vertex_sky(mesh: Mesh) -> Float:
+    """Return the share of the sky that each vertex sees, of shape (V,), from 0 to 1, smoothed over its neighbours."""
+    centre, size = centre_and_size(mesh)
+    unit = (mesh.vertices - centre) / size
+    share = open_sky(ray_scene(unit, mesh.faces), unit, mesh.vertex_normals(), REACH)
+    start, end = mesh.faces[:, [0, 1, 2]].reshape(-1), mesh.faces[:, [1, 2, 0]].reshape(-1)
+    own = np.arange(len(share))
+    rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])
+    near = coo_array((np.ones(len(rows)), (rows, columns)), shape=2 * (len(share),)).tocsr()
+    count = near.sum(axis=1)
+    for _ in range(PASSES):
+        share = near @ share / count
+    return share

@@ -1,0 +1,82 @@
+"""A lighter copy of a mesh, for looking at: fewer faces by quadric edge collapse, attributes included.
+
+Edges are collapsed in the order of the error that this makes, by the quadrics of Garland and Heckbert (1997), as
+open3d does it. Nothing is promised of the copy's topology. Its vertices take their attributes from their nearest
+places on the original surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.cloud import Float
+from gnrecon.export.nearest import Surface
+from gnrecon.export.solid import centre_and_size
+from gnrecon.mesh import Mesh
+
+
+def lighten(mesh: Mesh, faces: int) -> Mesh:
+    """Return the mesh with at most about `faces` faces, its normals and attributes interpolated.
+
+    A mesh that has so few is returned as it is.
+    """
+    if len(mesh.faces) <= faces:
+        return mesh
+    import open3d
+
+    # Quadrics are products of coordinates, so that they want numbers about one in size.
+    centre, size = centre_and_size(mesh)
+    places = open3d.utility.Vector3dVector((mesh.vertices - centre) / size)
+    heavy = open3d.geometry.TriangleMesh(places, open3d.utility.Vector3iVector(mesh.faces))
+    light = heavy.simplify_quadric_decimation(faces)
+    vertices, triangles = centre + size * np.asarray(light.vertices), np.asarray(light.triangles)
+    feet, nearest = Surface(mesh).nearest(vertices)
+    corners, weights = mesh.faces[nearest], barycentric(mesh.corners[nearest], feet)
+    normals = interpolate(mesh.vertex_normals(), corners, weights)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return Mesh(vertices, triangles, normals, _carried(mesh.attributes, corners, weights))
+
+
+def barycentric(corners: Float, places: Float) -> Float:
+    """Return the shares of triangles' corners in places within them, of shape (N, 3); a third each without an area.
+
+    Parameters
+    ----------
+    corners : array of shape (N, 3, 3)
+    places : array of shape (N, 3)
+    """
+    to = corners - places[:, None]
+    areas = np.stack([np.cross(to[:, (k + 1) % 3], to[:, (k + 2) % 3]) for k in range(3)], axis=1)
+    sizes = np.linalg.norm(areas, axis=2) + np.finfo(np.float64).tiny
+    weights: Float = sizes / sizes.sum(axis=1, keepdims=True)
+    return weights
+
+
+def interpolate(values: npt.NDArray[np.generic], corners: npt.NDArray[np.int64], weights: Float) -> Float:
+    """Return values of shape (N, ...) at places in faces, from the values of vertices, of shape (V, ...).
+
+    Parameters
+    ----------
+    values : array of shape (V,) or (V, C)
+    corners : integer array of shape (N, 3)
+        Vertices of the face that each place lies in.
+    weights : array of shape (N, 3)
+        Barycentric coordinates.
+    """
+    mixed: Float = np.einsum("nk,nk...->n...", weights, values[corners].astype(np.float64))
+    return mixed
+
+
+def _carried(
+    attributes: Mapping[str, npt.NDArray[np.generic]], corners: npt.NDArray[np.int64], weights: Float
+) -> dict[str, npt.NDArray[np.generic]]:
+    """Interpolated attributes in their own types; whole numbers are rounded."""
+    carried: dict[str, npt.NDArray[np.generic]] = {}
+    for name, values in attributes.items():
+        mixed = interpolate(values, corners, weights)
+        whole = np.issubdtype(values.dtype, np.integer)
+        carried[name] = (np.round(mixed) if whole else mixed).astype(values.dtype)
+    return carried

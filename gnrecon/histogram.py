@@ -1,0 +1,59 @@
+"""Counts of values in equal bins, with what lies beyond them on either side."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How values spread.
+
+    Parameters
+    ----------
+    low, high : float
+        Where the first bin begins and the last one ends, in the values' unit.
+    counts : tuple of float
+        Values, or their weight, in each of the equal bins; the last bin holds its upper end too.
+    below, above : float
+        Likewise for what lies outside of the bins.
+    """
+
+    low: float
+    high: float
+    counts: tuple[float, ...]
+    below: float = 0.0
+    above: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        values: npt.NDArray[np.floating[Any]],
+        low: float,
+        high: float,
+        bins: int = 48,
+        weights: npt.NDArray[np.floating[Any]] | None = None,
+    ) -> Histogram:
+        """Count `values`, of shape (N,), each as one or by its weight, of shape (N,); NaN is not counted."""
+        weights = np.ones(len(values)) if weights is None else weights
+        counts = np.histogram(values, bins=bins, range=(low, high), weights=weights)[0]
+        below, above = float(weights[values < low].sum()), float(weights[values > high].sum())
+        return cls(float(low), float(high), tuple(counts.tolist()), below, above)
+
+    @property
+    def edges(self) -> npt.NDArray[np.float64]:
+        """Borders of the bins, of shape (bins + 1,)."""
+        return np.linspace(self.low, self.high, len(self.counts) + 1)
+
+    @property
+    def total(self) -> float:
+        """All that was counted, in the bins and beyond."""
+        return sum(self.counts) + self.below + self.above
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as plain values, ready for JSON."""
+        return {**asdict(self), "counts": list(self.counts)}
