@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gnrecon.ingest import prepare
     from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
     from gnrecon.options import Options
+    from gnrecon.page import write_page
     from gnrecon.pipeline import Progress, Reconstruction, reconstruct
     from gnrecon.schema import report_schema
     from gnrecon.shaping import Shape, shaped
@@ -43,6 +44,7 @@ _ROOMS = {
     "gnrecon.ingest": ("prepare",),
     "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
     "gnrecon.options": ("Options",),
+    "gnrecon.page": ("write_page",),
     "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
     "gnrecon.schema": ("report_schema",),
     "gnrecon.shaping": ("Shape", "shaped"),
@@ -88,6 +90,7 @@ __all__ = [
     "to_trimesh",
     "verify",
     "write_mesh",
+    "write_page",
 ]
 
 

@@ -152,7 +152,8 @@ def reconstruct_command(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=OUTPUT)] = None,
     preview: Annotated[
-        Path | None, typer.Option(help="PNG picture of scan and mesh to write.", rich_help_panel=OUTPUT)
+        Path | None,
+        typer.Option(help="PNG picture to write: the scan, and the mesh from four sides.", rich_help_panel=OUTPUT),
     ] = None,
     save: Annotated[
         Path | None,

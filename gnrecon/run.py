@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 from gnrecon.atomic import atomic_write
 from gnrecon.errors import ExitCode, UsageError
-from gnrecon.export import render
+from gnrecon.export import render_sheet
 from gnrecon.files import require_files
 from gnrecon.io import check_writable, read_cloud
 from gnrecon.optim import Record
@@ -105,6 +105,7 @@ def run(
 
 def _write(files: Files, result: Reconstruction) -> list[str]:
     """Write the mesh, and with it what was asked for besides; all of them or none."""
+    cloud = None if files.preview is None and files.html is None else read_cloud(files.scan)
     with ExitStack() as stack:
         # The side files are complete under their temporary names before the mesh receives its own.
         if files.report is not None:
@@ -112,13 +113,13 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
             report.write_text(json.dumps(result.report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         if files.preview is not None:
             picture = stack.enter_context(atomic_write(files.preview, files.overwrite))
-            render(result.mesh, picture, size=(1200, 600), points=read_cloud(files.scan))
+            render_sheet(result.mesh, picture, points=cloud)
         if files.model is not None:
             model = stack.enter_context(atomic_write(files.model, files.overwrite))
             result.sdf.save(model, overwrite=True)
         if files.html is not None:
             page = stack.enter_context(atomic_write(files.html, files.overwrite))
-            page.write_text(page_text(result.report, result.mesh, read_cloud(files.scan)), encoding="utf-8")
+            page.write_text(page_text(result.report, result.mesh, cloud), encoding="utf-8")
         return result.save(files.output, files.overwrite)
 
 

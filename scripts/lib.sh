@@ -43,26 +43,43 @@ is_ready() { [ -x "$venv/bin/python" ] && [ "$(cat -- "$venv/ready.$1" 2>/dev/nu
 # Prints the Debian packages that the Python $1 finds missing, in one line.
 missing_packages() { "$1" -I "$repository/gnrecon/system_packages.py" | paste -sd ' '; }
 
+# Whether apt-get is there and may be used.
+may_install() { command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; }; }
+
+# Installs the Debian packages that are named.
+apt_install() {
+    local as_root=()
+    [ "$(id -u)" = 0 ] || as_root=(sudo -n)
+    # A failed update is no failure yet: the lists at hand may do.
+    "${as_root[@]}" apt-get -q update >>"$log" 2>&1 </dev/null || true
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -q -o DPkg::Lock::Timeout=300 \
+        install -y --no-install-recommends "$@" >>"$log" 2>&1 </dev/null
+}
+
 install_system_packages() {
-    local packages as_root=()
+    local packages
     packages=$(missing_packages "$1") || fail "$1 cannot run $repository/gnrecon/system_packages.py."
     [ -n "$packages" ] || return 0
     command -v apt-get >/dev/null ||
         fail "The system packages $packages (named as in Debian) are missing, and there is no apt-get to install them."
-    if [ "$(id -u)" != 0 ]; then
-        as_root=(sudo -n)
-        sudo -n true 2>/dev/null ||
-            fail "System packages are missing; install them with: sudo apt-get install -y $packages"
-    fi
+    may_install || fail "System packages are missing; install them with: sudo apt-get install -y $packages"
     say "installing the system packages $packages"
-    # A failed update is no failure yet: the lists at hand may do.
-    "${as_root[@]}" apt-get -q update >>"$log" 2>&1 </dev/null || true
     # shellcheck disable=SC2086  # a list of words
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -q -o DPkg::Lock::Timeout=300 \
-        install -y --no-install-recommends $packages >>"$log" 2>&1 </dev/null ||
+    apt_install $packages ||
         fail_with_log "System packages could not be installed by: sudo apt-get install -y $packages"
     packages=$(missing_packages "$1")
     [ -z "$packages" ] || fail "What $packages should bring is still missing after apt-get installed them."
+}
+
+# The tests look at the HTML page in a browser. Where there is none they are skipped, so a failure here is none.
+install_browser() {
+    local name
+    for name in chromium chromium-browser google-chrome chrome; do
+        ! command -v "$name" >/dev/null || return 0
+    done
+    may_install || return 0
+    say "installing chromium, in which the tests look at the HTML page"
+    apt_install chromium || say "chromium could not be installed; the tests that need a browser will be skipped"
 }
 
 make_environment() {
@@ -77,6 +94,7 @@ make_environment() {
     { mkdir -p -- "$venv" && : >"$log"; } 2>/dev/null || fail "$venv cannot be made: $repository is not writable."
     rm -f -- "$venv"/ready.*
     install_system_packages "$python"
+    [ "$extra" != test ] || install_browser
     say "setting up $venv (once, some minutes)"
     [ -x "$venv/bin/python" ] || "$python" -m venv -- "$venv" >>"$log" 2>&1 ||
         fail_with_log "No virtual environment could be made"

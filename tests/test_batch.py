@@ -38,11 +38,19 @@ def test_bad_files_are_named_and_stop_nothing(tmp_path: Path) -> None:
     (scans / "void.ply").touch()
     (scans / "letter.txt").write_text("Dear reader,\nthis is a letter.\n")
     (scans / "README.md").write_text("No extension of a scan, so it is passed over.\n")
-    done = gnrecon("batch", scans, "-o", meshes, *FAST_WORDS, "--format", "off", "--reports")
+    done = gnrecon("batch", scans, "-o", meshes, *FAST_WORDS, "--format", "off", "--reports", "--pages")
     assert done.returncode == ExitCode.BATCH, done.stderr
     assert done.stdout == ""
     assert "2 of 5 scans reconstructed" in done.stderr
-    written = ["plate.off", "plate.report.json", "ring.off", "ring.report.json", "summary.json"]
+    written = [
+        "plate.html",
+        "plate.off",
+        "plate.report.json",
+        "ring.html",
+        "ring.off",
+        "ring.report.json",
+        "summary.json",
+    ]
     assert sorted(path.name for path in meshes.iterdir()) == written
     assert verify_file(meshes / "ring.off").genus == 1
     assert verify_file(meshes / "plate.off").genus == 0
@@ -53,9 +61,10 @@ def test_bad_files_are_named_and_stop_nothing(tmp_path: Path) -> None:
     report = json.loads(Path(str(scan["ring.ply"]["report"])).read_text())
     assert report["input"] == str(scans / "ring.ply")
     jsonschema.validate(report, report_schema())
+    assert "of genus 1" in Path(str(scan["ring.ply"]["page"])).read_text(encoding="utf-8")
     for name, cause in (("torn.ply", "declares 1200"), ("void.ply", "is empty"), ("letter.txt", "neither numbers")):
         assert scan[name]["exit_code"] == ExitCode.INPUT
-        assert (scan[name]["mesh"], scan[name]["report"]) == ("", "")
+        assert (scan[name]["mesh"], scan[name]["report"], scan[name]["page"]) == ("", "", "")
         assert f"{scans / name}: " in str(scan[name]["message"])
         assert cause in str(scan[name]["message"])
 
@@ -64,7 +73,9 @@ def test_a_folder_of_good_scans_alone(tmp_path: Path) -> None:
     write_good(tmp_path)
     done = gnrecon("batch", tmp_path, "-o", tmp_path / "meshes", "--quiet", *FAST_WORDS)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert {(scan["exit_code"], scan["report"]) for scan in summary(tmp_path / "meshes").values()} == {(0, "")}
+    assert {(scan["exit_code"], scan["report"], scan["page"]) for scan in summary(tmp_path / "meshes").values()} == {
+        (0, "", "")
+    }
     assert verify_file(tmp_path / "meshes" / "ring.obj").genus == 1
 
 

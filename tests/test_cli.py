@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from markupsafe import escape
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
 
 from gnrecon.cli import main
@@ -118,6 +120,8 @@ def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -
         (("-o", "{out}/mesh.obj", "--widths", "32;32"), "'32;32' is not a list of whole numbers"),
         (("-o", "{out}/mesh.obj", "--smoothness", "1"), "No such option: --smoothness"),
         (("-o", "{out}/mesh.obj", "--preview", "{out}/picture.jpg"), "picture.jpg"),
+        (("-o", "{out}/mesh.obj", "--html", "{out}/page.pdf"), "page.pdf"),
+        (("-o", "{out}/mesh.obj", "--html", "{out}/mesh.obj"), "so it cannot be called"),
         (("-o", "{out}/mesh.obj", "--report", "{out}/mesh.obj"), "named twice"),
         (("-o", "{scan}", "--overwrite"), "named twice"),
     ],
@@ -161,22 +165,28 @@ def assert_torus(path: Path) -> None:
 def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> None:
     from PIL import Image
 
-    files = ("--report", out / "report.json", "--preview", out / "picture.png")
-    done = gnrecon(scan, "-o", out / "mesh.ply", "--reference", scan, *files, *FAST_WORDS)
+    files = ("--report", out / "report.json", "--preview", out / "picture.png", "--html", out / "page.html")
+    words = (scan, "-o", out / "mesh.ply", "--reference", scan, *files, *FAST_WORDS)
+    done = gnrecon(*words)
     assert done.returncode == 0, done.stderr
     assert_torus(out / "mesh.ply")
     report = json.loads((out / "report.json").read_text())
     assert report["input"] == str(scan)
+    assert report["command"] == shlex.join(["gnrecon", *map(str, words)])
     assert report["mesh"]["genus"] == 1
+    assert "error" in [attribute["name"] for attribute in report["attributes"]]
+    page = (out / "page.html").read_text(encoding="utf-8")
+    for shown in ("of genus 1 in 1 component", 'data-to="error"', 'data-set="points"', escape(report["command"])):
+        assert shown in page
     printed = dict(line.split()[:2] for line in done.stdout.splitlines())
     for name in ("chamfer_mean", "hausdorff", "f_score"):
         assert float(printed[name]) == pytest.approx(report["metrics"][name], rel=1e-4)
     assert 0 < report["metrics"]["chamfer_mean"] < 0.1
     with Image.open(out / "picture.png") as picture:
         assert picture.format == "PNG"
-        assert picture.size == (1200, 600)
+        assert picture.size == (1200, 960)
     assert "genus 1, closed and manifold" in done.stderr
-    assert names(out) == ["mesh.ply", "picture.png", "report.json"]
+    assert names(out) == ["mesh.ply", "page.html", "picture.png", "report.json"]
 
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "stl", "glb"])

@@ -170,6 +170,7 @@ def test_the_field_is_a_signed_distance_near_the_surface(scan: Cloud, result: Re
 def test_the_report_holds_everything_as_plain_values(scan: Cloud, result: Reconstruction) -> None:
     report = json.loads(json.dumps(result.report, allow_nan=False))
     assert report["schema_version"] == SCHEMA_VERSION
+    assert report["command"] is None
     assert report["input"] == "ndarray"
     assert report["options"]["widths"] == [300]
     assert {"gnrecon", "python", "platform", "torch", "numpy"} <= set(report["versions"])
@@ -181,6 +182,9 @@ def test_the_report_holds_everything_as_plain_values(scan: Cloud, result: Recons
     assert report["fit"]["parameters"] == 300 * 3 + 300 + 300 + 1
     assert [record["step"] for record in report["fit"]["history"]] == [1]
     assert report["fit"]["status"] == "Stopped at the limit of 1 steps."
+    assert report["fit"]["residuals"]["points"] == report["ingest"]["kept"]
+    assert 0 < report["fit"]["residuals"]["distance"]["rms"] < 0.02 * RADIUS
+    assert 0 < report["fit"]["residuals"]["angle"]["rms"] < 10
     facts = report["mesh"]
     assert facts["genus"] == 1
     assert facts["closed"]
@@ -214,6 +218,8 @@ def test_a_reference_gives_metrics(tmp_path: Path, scan: Cloud, result: Reconstr
     assert again.metrics.hausdorff < 1e-4 * RADIUS
     assert again.metrics.f_score == 1.0
     assert json.loads(json.dumps(again.report["metrics"]))["f_score"] == 1.0
+    assert np.abs(again.mesh.attributes["error"]).max() < 1e-4 * RADIUS
+    assert again.report["attributes"][-1]["name"] == "error"
     of_mesh = reconstruct(*scan, reference=result.mesh, **TINY)
     assert of_mesh.metrics == measure(of_mesh.mesh, result.mesh)
 

@@ -15,6 +15,7 @@ from gnrecon.export.picture import render
 from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.repair import repair
+from gnrecon.export.sheet import render_sheet
 from gnrecon.export.stray import remove_stray
 from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
 
@@ -35,6 +36,7 @@ __all__ = [
     "project",
     "remove_stray",
     "render",
+    "render_sheet",
     "repair",
     "require_sound",
     "verify",

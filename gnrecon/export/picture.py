@@ -95,7 +95,7 @@ def render(
     light = np.concatenate(strips, axis=1)
     image: Image = to_bytes(light.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3).mean(axis=(1, 3)))
     if path is not None:
-        _write(image, Path(path))
+        write_image(image, Path(path))
     return image
 
 
@@ -145,7 +145,14 @@ def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
     return draw_points(cloud.points, normals, min(0.55 * spacing, 0.02), camera, color, _background(camera))
 
 
-def _write(image: Image, path: Path) -> None:
+def write_image(image: Image, path: Path) -> None:
+    """Write an image of shape (H, W, 3) as PNG, atomically; an older file is replaced.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
     from PIL import Image as Pillow
 
     from gnrecon.atomic import atomic_write

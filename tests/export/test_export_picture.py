@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, sphere, union
+from analytic_fields import UTM, Field, Function, sphere, union
 
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import OutputError, UsageError
-from gnrecon.export import extract, project, render
+from gnrecon.export import extract, project, render, render_sheet
 from gnrecon.export.camera import VIEWS, Camera
 from gnrecon.mesh import Mesh
 
@@ -21,6 +21,10 @@ SIZE = (120, 90)
 def ball() -> Mesh:
     field = Field(sphere(), frame=UTM)
     return project(extract(field, resolution=24), field)
+
+
+def box(half: tuple[float, float, float], center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Function:
+    return lambda x: (np.abs(x - np.array(center)) - np.array(half)).max(axis=1)
 
 
 def drawn(image: np.ndarray) -> np.ndarray:
@@ -124,3 +128,33 @@ def test_what_cannot_be_drawn_is_said(ball: Mesh, tmp_path: Path) -> None:
         render(ball, size=(1, 10), views=["front", "top"])
     with pytest.raises(OutputError):
         render(ball, tmp_path / "missing" / "ball.png", size=(8, 8))
+
+
+def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(tmp_path: Path) -> None:
+    """A bar along x with a short arm towards +z at its right end: every side has its own outline."""
+    field = Field(union(box((0.8, 0.2, 0.15)), box((0.12, 0.2, 0.5), (0.68, 0, 0.4))), frame=UTM)
+    mesh = extract(field, resolution=32)
+    image = render_sheet(mesh, tmp_path / "sheet.png", points=PointCloud(mesh.vertices))
+    from PIL import Image
+
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "sheet.png")), image)
+    assert image.shape == (960, 1200, 3)
+    shown = drawn(image)
+    sides = [shown[560:920, left : left + 400] for left in (0, 400, 800)]
+    spans = [np.array([np.ptp(np.nonzero(side.any(axis=axis))[0]) for axis in (0, 1)]) for side in sides]
+    shapes = [wide / tall for wide, tall in spans]
+    # Along y one sees 1.6 by 1.05, along x 0.4 by 1.05, along z 1.6 by 0.4.
+    assert shapes[0] == pytest.approx(1.6 / 1.05, rel=0.15)
+    assert shapes[1] == pytest.approx(0.4 / 1.05, rel=0.25)
+    assert shapes[2] == pytest.approx(1.6 / 0.4, rel=0.25)
+    front = sides[0]
+    assert front[: len(front) // 2, 200:].sum() > 5 * front[: len(front) // 2, :200].sum(), "the arm is on the right"
+    blue = image[:524, :600].astype(int)
+    assert (blue[..., 2] - blue[..., 0]).max() > 30, "the scan is on the left"
+    # Words stand in the feet, and only there.
+    for foot, panels in ((image[524:560], 2), (image[924:960], 3)):
+        dark = foot.min(axis=2) < 150
+        assert all(part.any() for part in np.array_split(dark, panels, axis=1))
+    alone = render_sheet(mesh)
+    assert alone.shape == image.shape
+    assert not (alone[..., 2].astype(int) - alone[..., 0] > 30).any()

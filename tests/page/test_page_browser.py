@@ -159,8 +159,9 @@ def test_dragging_turns_the_model_and_the_pointer_reads_values(opened: Browser) 
     assert x > 9
     assert abs(y) < 0.1
     assert z > 3.5
-    for kind, x in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
-        opened.ask("Input.dispatchMouseEvent", type=kind, x=middle[0] + x, y=middle[1], button="left", clickCount=1)
+    for kind, way in (("mousePressed", 0), ("mouseMoved", -90), ("mouseReleased", -90)):
+        place = {"x": middle[0] + way, "y": middle[1] + way}
+        opened.ask("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **place)
     opened.wait_for("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
     assert difference(before, opened.canvas()) > 3
 
