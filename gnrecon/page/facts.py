@@ -42,6 +42,8 @@ INGEST = {
 }
 """Counts of ingest in their order, in words."""
 
+YES = {True: "yes", False: "no"}
+
 
 def title(report: Report) -> str:
     """Name of the scan."""
@@ -102,7 +104,6 @@ def remarks(report: Report) -> list[str]:
 def surface(report: Report) -> list[Fact]:
     """The mesh's counts and sizes."""
     mesh = report["mesh"]
-    yes = {True: "yes", False: "no"}
     facts = [
         Fact("Vertices", count(mesh["vertices"])),
         Fact("Triangles", count(mesh["faces"])),
@@ -114,7 +115,7 @@ def surface(report: Report) -> list[Fact]:
     facts.append(Fact("Area", figure(mesh["area"], 6), "file units²"))
     if mesh["closed"]:
         facts.append(Fact("Volume", figure(mesh["volume"], 6), "file units³"))
-    return [*facts, *(Fact(word.capitalize(), yes[mesh[word]]) for word in ("closed", "manifold", "oriented"))]
+    return [*facts, *(Fact(word.capitalize(), YES[mesh[word]]) for word in ("closed", "manifold", "oriented"))]
 
 
 def metrics(report: Report) -> list[tuple[Fact, str]]:
@@ -162,7 +163,8 @@ def versions(report: Report) -> list[Fact]:
     facts = [Fact(name, version) for name, version in (report.get("versions") or {}).items()]
     resources = report.get("resources")
     if resources:
-        device = resources["device_name"] or f"{resources['device']}, {resources['threads']} threads"
+        threads = resources["threads"]
+        device = resources["device_name"] or f"{resources['device']}, {threads} thread{'' if threads == 1 else 's'}"
         facts.append(Fact("device", device))
     return facts
 
@@ -170,6 +172,8 @@ def versions(report: Report) -> list[Fact]:
 def _value(value: Any) -> str:
     if value is None:
         return "not given"
+    if isinstance(value, bool):
+        return YES[value]
     return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
