@@ -130,31 +130,31 @@ def test_what_cannot_be_drawn_is_said(ball: Mesh, tmp_path: Path) -> None:
         render(ball, tmp_path / "missing" / "ball.png", size=(8, 8))
 
 
-def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(tmp_path: Path) -> None:
-    """A bar along x with a short arm towards +z at its right end: every side has its own outline."""
+def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bar along x with an arm towards +z at its right end: every side has its own outline."""
+    from PIL import Image
+
+    for name, value in (("WIDTH", 600), ("TALL", 240), ("LOW", 180)):
+        monkeypatch.setattr(f"gnrecon.export.sheet.{name}", value)
     field = Field(union(box((0.8, 0.2, 0.15)), box((0.12, 0.2, 0.5), (0.68, 0, 0.4))), frame=UTM)
     mesh = extract(field, resolution=32)
     image = render_sheet(mesh, tmp_path / "sheet.png", points=PointCloud(mesh.vertices))
-    from PIL import Image
-
     assert np.array_equal(np.asarray(Image.open(tmp_path / "sheet.png")), image)
-    assert image.shape == (960, 1200, 3)
-    shown = drawn(image)
-    sides = [shown[560:920, left : left + 400] for left in (0, 400, 800)]
-    spans = [np.array([np.ptp(np.nonzero(side.any(axis=axis))[0]) for axis in (0, 1)]) for side in sides]
-    shapes = [wide / tall for wide, tall in spans]
+    assert image.shape == (240 + 36 + 180 + 36, 600, 3)
+    row = drawn(image)[276:456]
+    sides = [row[:, left : left + 200] for left in (0, 200, 400)]
+    spans = [[np.ptp(np.nonzero(side.any(axis=axis))[0]) for axis in (0, 1)] for side in sides]
     # Along y one sees 1.6 by 1.05, along x 0.4 by 1.05, along z 1.6 by 0.4.
-    assert shapes[0] == pytest.approx(1.6 / 1.05, rel=0.15)
-    assert shapes[1] == pytest.approx(0.4 / 1.05, rel=0.25)
-    assert shapes[2] == pytest.approx(1.6 / 0.4, rel=0.25)
-    front = sides[0]
-    assert front[: len(front) // 2, 200:].sum() > 5 * front[: len(front) // 2, :200].sum(), "the arm is on the right"
-    blue = image[:524, :600].astype(int)
-    assert (blue[..., 2] - blue[..., 0]).max() > 30, "the scan is on the left"
-    # Words stand in the feet, and only there.
-    for foot, panels in ((image[524:560], 2), (image[924:960], 3)):
-        dark = foot.min(axis=2) < 150
-        assert all(part.any() for part in np.array_split(dark, panels, axis=1))
+    for (wide, tall), expected in zip(spans, (1.6 / 1.05, 0.4 / 1.05, 1.6 / 0.4), strict=True):
+        assert wide / tall == pytest.approx(expected, rel=0.25)
+    assert sides[0][:60, 100:].sum() > 5 * sides[0][:60, :100].sum(), "the arm is on the right"
+    blue = image[:240].astype(int)
+    assert (blue[:, :300, 2] - blue[:, :300, 0]).max() > 30 > (blue[:, 300:, 2] - blue[:, 300:, 0]).max()
+    for foot, panels in ((image[240:276], 2), (image[456:], 3)):
+        words = foot.min(axis=2) < 170
+        assert all(part.any() for part in np.array_split(words, panels, axis=1))
     alone = render_sheet(mesh)
     assert alone.shape == image.shape
     assert not (alone[..., 2].astype(int) - alone[..., 0] > 30).any()
