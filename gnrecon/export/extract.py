@@ -9,6 +9,7 @@ from the values at the edge's two ends.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ import numpy.typing as npt
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import MeshError
-from gnrecon.export.band import CHUNK, Band, narrow_band
+from gnrecon.export.band import Band, narrow_band
 from gnrecon.export.lattice import Int, Lattice
+from gnrecon.export.leaves import CHUNK, Values
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.mesh import Mesh
 
@@ -67,33 +69,51 @@ def extract(
     """
     lattice = Lattice.over(field, resolution, bounds, batch)
     band = narrow_band(lattice, None if data is None else lattice.nodes(data), part(advance, 0.0, EVALUATED))
-    keys, places, faces = [], [], []
-    count = 0
-    chunks = band.chunks()
-    for number, chunk in enumerate(chunks, 1):
-        piece = _march(band, chunk)
-        if piece is not None:
-            keys.append(piece[0])
-            places.append(piece[1])
-            faces.append(piece[2] + count)
-            count += len(piece[0])
-            advance(EVALUATED + (1.0 - EVALUATED) * number / len(chunks))
-    advance(1.0)
-    if not keys:
+    pieces = _march_all(band, part(advance, EVALUATED, 1.0))
+    del band
+    if not pieces:
         raise MeshError(
             f"The field has no zero level among the {' x '.join(str(n + 1) for n in lattice.cells)} points of its box, "
             f"so there is no surface to mesh."
         )
-    _, first, inverse = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
-    vertices = lattice.world(np.concatenate(places)[first])
-    return Mesh(vertices, inverse[np.concatenate(faces)])
+    return _stitched(lattice, pieces)
 
 
-def _march(band: Band, chunk: Int) -> tuple[Int, Float, Int] | None:
-    """Run marching cubes on one chunk: names, lattice coordinates and faces, or None where nothing crosses."""
+@dataclass(frozen=True)
+class Piece:
+    """The surface within one chunk.
+
+    Parameters
+    ----------
+    names : integer array of shape (V,)
+        Of the vertices: the same in every chunk that has them.
+    places : array of shape (V, 3), lattice coordinates
+    faces : integer array of shape (F, 3)
+        Rows of the above.
+    """
+
+    names: Int
+    places: Float
+    faces: npt.NDArray[np.int32]
+
+
+def _march_all(band: Band, advance: Advance) -> list[Piece]:
+    pieces = []
+    chunks = band.leaves.mixed_chunks()
+    for number, chunk in enumerate(chunks, 1):
+        piece = _march(band, chunk)
+        if piece is not None:
+            pieces.append(piece)
+            advance(number / len(chunks))
+    advance(1.0)
+    return pieces
+
+
+def _march(band: Band, chunk: Int) -> Piece | None:
+    """Run marching cubes on one chunk; None where nothing crosses."""
     from skimage import measure
 
-    values = band.nodes(chunk)
+    values = band.leaves.nodes(band.leaves.rows(chunk))
     if not (values.min() < 0 < values.max()):
         return None
     marching_cubes: Any = measure.marching_cubes
@@ -108,12 +128,29 @@ def _march(band: Band, chunk: Int) -> tuple[Int, Float, Int] | None:
     nodes += chunk * CHUNK
     sides = band.lattice.cells + 1
     names = ((nodes[:, 0] * sides[1] + nodes[:, 1]) * sides[2] + nodes[:, 2]) * 4 + axis
-    return names, places + chunk * CHUNK, faces.astype(np.int64)
+    return Piece(names, places + chunk * CHUNK, faces.astype(np.int32))
 
 
-def _crossings(values: Float, nodes: Int, axis: npt.NDArray[np.intp]) -> Float:
+def _crossings(values: Values, nodes: Int, axis: npt.NDArray[np.intp]) -> Float:
     """Where along its edge, from 0 to 1, the linear interpolant vanishes."""
-    low = values[tuple(nodes.T)]
+    low = values[tuple(nodes.T)].astype(np.float64)
     high = values[tuple((nodes + np.eye(3, dtype=np.int64)[axis]).T)]
     crossings: Float = low / (low - high)
     return crossings
+
+
+def _stitched(lattice: Lattice, pieces: list[Piece]) -> Mesh:
+    """Join the pieces by the names of their vertices; the list is emptied, because both would take twice the memory."""
+    _, first, inverse = np.unique(
+        np.concatenate([piece.names for piece in pieces]), return_index=True, return_inverse=True
+    )
+    vertices = np.empty((len(first), 3))
+    faces = np.empty((sum(len(piece.faces) for piece in pieces), 3), dtype=np.int64)
+    done = start = 0
+    while pieces:
+        piece = pieces.pop(0)
+        rows = slice(start, start + len(piece.names))
+        vertices[inverse[rows]] = lattice.world(piece.places)
+        faces[done : done + len(piece.faces)] = inverse[rows][piece.faces]
+        done, start = done + len(piece.faces), rows.stop
+    return Mesh(vertices, faces)

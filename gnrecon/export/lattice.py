@@ -97,11 +97,11 @@ class Lattice:
         closed: Float = np.maximum(out / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
         return closed
 
-    def slopes(self, nodes: npt.NDArray[np.floating] | Int) -> Float:
-        """Length of the gradient, of shape (N,), at lattice coordinates of shape (N, 3)."""
+    def gradients(self, nodes: npt.NDArray[np.floating] | Int) -> Float:
+        """Gradient of the field, of shape (N, 3), at lattice coordinates of shape (N, 3)."""
         inside = np.clip(nodes, 0, self.cells)
-        parts = [
-            np.linalg.norm(self.field.gradient(self.world(inside[start : start + self.batch])), axis=1)
-            for start in range(0, len(nodes), self.batch)
-        ]
-        return np.concatenate(parts)
+        out = np.empty((len(nodes), 3))
+        for start in range(0, len(nodes), self.batch):
+            rows = slice(start, start + self.batch)
+            out[rows] = self.field.gradient(self.world(inside[rows]))
+        return out

@@ -73,17 +73,20 @@ class NeuralSDF:
     def sdf(self, points: npt.ArrayLike) -> Float:
         """Return signed distances, of shape (N,), at `points`, of shape (N, 3), all in file units."""
         x = self._unit(points)
-        values = [self.field.value(self.theta, self._tensor(x[rows])) for rows in self._batches(len(x))]
-        return self.frame.scale * self._array(values, (0,))
+        # Written in place: results kept apart would lie between the batches' large arrays, and hold their memory.
+        values = np.empty(len(x))
+        for rows in self._batches(len(x)):
+            values[rows] = self.field.value(self.theta, self._tensor(x[rows])).cpu().numpy()
+        return self.frame.scale * values
 
     def gradient(self, points: npt.ArrayLike) -> Float:
         """Return the gradient of the distance, of shape (N, 3), at `points`, of shape (N, 3); it has no unit."""
         x = self._unit(points)
         # The frame's scale enters value and coordinate alike and cancels.
-        gradients = [
-            self.field.value_and_gradient(self.theta, self._tensor(x[rows]))[1] for rows in self._batches(len(x))
-        ]
-        return self._array(gradients, (0, 3))
+        gradients = np.empty((len(x), 3))
+        for rows in self._batches(len(x)):
+            gradients[rows] = self.field.value_and_gradient(self.theta, self._tensor(x[rows]))[1].cpu().numpy()
+        return gradients
 
     def hessian(self, points: npt.ArrayLike) -> Float:
         """Return second derivatives of the distance, of shape (N, 3, 3), per file unit, at `points`, of shape (N, 3).
@@ -92,10 +95,10 @@ class NeuralSDF:
         """
         x = self._unit(points)
         theta = self.theta.to(torch.float64)
-        hessians = [
-            self.field.jet(theta, torch.as_tensor(x[rows]).to(theta)).hessian() for rows in self._batches(len(x))
-        ]
-        return self._array(hessians, (0, 3, 3)) / self.frame.scale
+        hessians = np.empty((len(x), 3, 3))
+        for rows in self._batches(len(x)):
+            hessians[rows] = self.field.jet(theta, torch.as_tensor(x[rows]).to(theta)).hessian().cpu().numpy()
+        return hessians / self.frame.scale
 
     def normals(self, points: npt.ArrayLike) -> Float:
         """Return outward unit normals of the level sets, of shape (N, 3), at `points`, of shape (N, 3)."""
@@ -112,10 +115,3 @@ class NeuralSDF:
 
     def _batches(self, count: int) -> list[slice]:
         return list(batches(count, max(256, _BATCH_BYTES // (8 * max(self.field.widths)))))
-
-    @staticmethod
-    def _array(parts: list[Tensor], empty: tuple[int, ...]) -> Float:
-        if not parts:
-            return np.zeros(empty)
-        array: Float = torch.cat(parts).cpu().numpy().astype(np.float64)
-        return array

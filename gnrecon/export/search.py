@@ -1,0 +1,216 @@
+"""Where the zero level may pass: blocks of cells, searched from coarse to fine.
+
+A function whose slope is at most L has no zero in a block of half diagonal d around c when |f(c)| > L d. The coarse
+blocks divide the box into some 50 to 100 along its longest side, whatever the resolution is; those that may hold a
+zero are halved until they are leaves. L is measured close by: the length of the gradient at the centre, and by how much
+the gradients of the neighbouring centres say that it varies up to the corners, with a quarter more. A place where the
+field is steep or bends costs evaluations there, then, and not everywhere. All other blocks keep nothing but the sign of
+their centre, and what a field still hides between the centres is found by propagation, see `band`.
+
+Where the data is known, only coarse blocks near it are searched; what lies farther off is found by propagation, which
+follows the surface from there: sheets in free space, where a field is steep, cost little then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.cloud import Float
+from gnrecon.export.lattice import Int, Lattice
+from gnrecon.export.leaves import LEAF, Leaves
+
+MOST_BLOCKS = 96
+"""Most coarse blocks along the longest side."""
+
+MARGIN = 1.25
+"""Bound on the slope, as a multiple of what was measured."""
+
+REACH = 2.0
+"""How far beyond a data point the surface is searched, in cells."""
+
+BATCH = 4096
+"""Blocks that are split at once: memory does not grow with the resolution then."""
+
+_SAMPLES = 2048
+_CHILDREN = np.stack(np.meshgrid(*3 * [np.arange(2)], indexing="ij"), axis=-1).reshape(-1, 3)
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Cubes of `size` cells a side.
+
+    Parameters
+    ----------
+    size : int
+    places : integer array of shape (N, 3)
+        In units of the size: block (i, j, k) begins at node ``size * (i, j, k)``.
+    """
+
+    size: int
+    places: Int
+
+    @property
+    def centers(self) -> Float:
+        """Lattice coordinates of the centres, of shape (N, 3)."""
+        return np.asarray((self.places + 0.5) * self.size, dtype=np.float64)
+
+    @property
+    def half_diagonal(self) -> float:
+        """In cells."""
+        return float(self.size * np.sqrt(3) / 2)
+
+    def may_vanish(self, values: Float, slopes: Float | float) -> Mask:
+        """Which may hold a zero, of shape (N,), from values at the centres, in cells, and measured slopes."""
+        # The closing of the field at its box has slope one.
+        return np.asarray(np.abs(values) <= np.maximum(MARGIN * slopes, 1.0) * self.half_diagonal)
+
+    def within(self, lattice: Lattice) -> Mask:
+        """Which have a node of the lattice, of shape (N,)."""
+        return np.asarray((self.places * self.size <= lattice.cells).all(axis=1))
+
+    def split(self) -> Blocks:
+        """The eight children of each, one parent's after the other's."""
+        return Blocks(self.size // 2, (self.places[:, None] * 2 + _CHILDREN).reshape(-1, 3))
+
+    def __getitem__(self, rows: slice | Mask) -> Blocks:
+        return Blocks(self.size, self.places[rows])
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """The coarse blocks of a whole box.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        In the order of a grid of shape `grid`.
+    grid : tuple of three int
+    values : array of shape (N,)
+        The field at the centres, in cells.
+    steepest : float
+        A high percentile of the gradient's length: half of the samples nearest to the surface, half all over the box.
+    typical : float
+        The median of the gradient's length where the surface may pass.
+    """
+
+    blocks: Blocks
+    grid: tuple[int, ...]
+    values: Float
+    steepest: float
+    typical: float
+
+    @classmethod
+    def of(cls, lattice: Lattice) -> Coarse:
+        """Evaluate the field at the centres of coarse blocks, and its gradient at some of them.
+
+        Raises
+        ------
+        MeshError
+            When the field is not finite somewhere.
+        """
+        size = LEAF
+        while lattice.cells.max() > MOST_BLOCKS * size:
+            size *= 2
+        grid = lattice.cells // size + 1
+        places = np.stack(np.meshgrid(*map(np.arange, grid), indexing="ij"), axis=-1).reshape(-1, 3)
+        blocks = Blocks(size, places)
+        values = lattice.values(blocks.centers, 1.0)
+        nearest = np.argsort(np.abs(values), kind="stable")[:_SAMPLES]
+        spread = np.arange(0, len(values), -(-len(values) // _SAMPLES))
+        samples = np.union1d(nearest, spread)
+        slopes = np.linalg.norm(lattice.gradients(blocks.centers[samples]), axis=1)
+        crossed = np.abs(values[samples]) <= slopes * blocks.half_diagonal
+        typical = float(np.median(slopes[crossed] if crossed.any() else slopes))
+        return cls(blocks, tuple(grid), values, float(np.percentile(slopes, 99.5)), typical)
+
+
+def search(lattice: Lattice, coarse: Coarse, leaves: Leaves, data: Float | None) -> Iterator[tuple[float, Int]]:
+    """Yield the leaves, of shape (N, 3), that may hold a zero, by parts, each with the share of the work done after it.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    coarse : Coarse
+        Of the same lattice.
+    leaves : Leaves
+        Receives the blocks without a zero whose centres are inside.
+    data : array of shape (N, 3), lattice coordinates, optional
+        Points near which the surface is searched; everywhere when None.
+
+    Raises
+    ------
+    MeshError
+        When the field is not finite somewhere.
+    """
+    blocks, values = coarse.blocks, coarse.values
+    kept = blocks.may_vanish(values, coarse.steepest)
+    if data is not None:
+        kept[kept] = _near(data, blocks[kept], lattice)
+    slopes = _slopes(lattice, blocks, kept, (1, *coarse.grid))
+    kept &= blocks.may_vanish(values, slopes)
+    leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
+    blocks, slopes = blocks[kept], slopes[kept]
+    for start in range(0, len(slopes), BATCH):
+        rows = slice(start, start + BATCH)
+        yield min(1.0, rows.stop / len(slopes)), _descend(lattice, leaves, blocks[rows], slopes[rows])
+
+
+def _descend(lattice: Lattice, leaves: Leaves, blocks: Blocks, slopes: Float) -> Int:
+    """Leaves within the given blocks, in which slopes of shape (N,) were measured."""
+    while blocks.size > LEAF:
+        blocks = blocks.split()
+        values = lattice.values(blocks.centers, 1.0)
+        kept = blocks.may_vanish(values, slopes.repeat(8)) & blocks.within(lattice)
+        if blocks.size > LEAF:
+            slopes = _slopes(lattice, blocks, kept, (-1, 2, 2, 2))
+            kept &= blocks.may_vanish(values, slopes)
+            slopes = slopes[kept]
+        else:
+            kept &= np.abs(values) <= MARGIN * _variation(values)
+        leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
+        blocks = blocks[kept]
+    return blocks.places
+
+
+def _slopes(lattice: Lattice, blocks: Blocks, chosen: Mask, shape: tuple[int, ...]) -> Float:
+    """Greatest slopes in the chosen blocks, of shape (N,), by the gradients at their centres and at neighbouring ones.
+
+    `shape` arranges the blocks as grids of neighbours, of shape (G, A, B, C). From a centre to a corner the gradient
+    changes by half of its differences between neighbours along the three axes. It is 0 for blocks that are not chosen.
+    """
+    gradients = np.full((len(chosen), 3), np.nan)
+    gradients[chosen] = lattice.gradients(blocks.centers[chosen])
+    grid = gradients.reshape(*shape, 3)
+    slopes = np.linalg.norm(grid, axis=-1)
+    for axis in (1, 2, 3):
+        steps = np.linalg.norm(np.diff(grid, axis=axis), axis=-1)
+        none = np.full_like(slopes.take([0], axis=axis), np.nan)
+        before, after = (np.concatenate(pair, axis=axis) for pair in ((none, steps), (steps, none)))
+        slopes += 0.5 * np.nan_to_num(np.fmax(before, after))
+    return np.asarray(np.nan_to_num(slopes).reshape(-1), dtype=np.float64)
+
+
+def _variation(values: Float) -> Float:
+    """By how much the field varies from the centre of a block to its corners, from the centres of eight siblings.
+
+    Along each axis that is half of the greatest difference between siblings, whose centres lie a block's length apart.
+    """
+    siblings = values.reshape(-1, 2, 2, 2)
+    steps = sum(np.abs(np.diff(siblings, axis=axis)).reshape(-1, 4).max(axis=1) for axis in (1, 2, 3))
+    return np.asarray(0.5 * steps).repeat(8)
+
+
+def _near(data: Float, blocks: Blocks, lattice: Lattice) -> Mask:
+    """Which blocks, of shape (N,), have data within their reach, or lie at the border of the box."""
+    from scipy.spatial import cKDTree
+
+    # A block at the border also holds nodes beyond it, which are outside whatever its centre is.
+    outer = ((blocks.places == 0) | ((blocks.places + 1) * blocks.size >= lattice.cells)).any(axis=1)
+    distance = cKDTree(data).query(blocks.centers, distance_upper_bound=blocks.half_diagonal + REACH)[0]
+    return np.asarray(outer | np.isfinite(distance))
