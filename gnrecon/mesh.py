@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,8 +64,10 @@ class Mesh:
     @property
     def face_vectors(self) -> Float:
         """Area vectors of the faces, of shape (F, 3): along the normal, as long as the area."""
-        a, b, c = np.moveaxis(self.corners, 1, 0)
-        return 0.5 * np.cross(b - a, c - a)
+        vectors = np.empty((len(self.faces), 3))
+        for rows in parts(len(self.faces)):
+            vectors[rows] = area_vectors(self.vertices, self.faces[rows])
+        return vectors
 
     @property
     def area(self) -> float:
@@ -77,9 +79,12 @@ class Mesh:
         """Signed enclosed volume by the divergence theorem; positive when the faces look outward."""
         if not len(self.faces):
             return 0.0
-        # Measured from the mesh's own corner, because far-off coordinates would cancel badly.
-        a, b, c = np.moveaxis(self.corners - self.vertices[0], 1, 0)
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+        total = 0.0
+        for rows in parts(len(self.faces)):
+            # Measured from the mesh's own corner, because far-off coordinates would cancel badly.
+            a, b, c = np.moveaxis(self.vertices[self.faces[rows]] - self.vertices[0], 1, 0)
+            total += float(np.einsum("ij,ij->", a, np.cross(b, c)))
+        return total / 6.0
 
     @property
     def euler_characteristic(self) -> int:
@@ -92,10 +97,11 @@ class Mesh:
         if self.normals is not None:
             return self.normals
         sums = np.zeros_like(self.vertices)
+        vectors = self.face_vectors
         for corner in range(3):
-            np.add.at(sums, self.faces[:, corner], self.face_vectors)
-        lengths: Float = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        return sums / lengths
+            np.add.at(sums, self.faces[:, corner], vectors)
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        return sums
 
     def with_vertices(self, vertices: Float) -> Mesh:
         """Return the same faces, normals and attributes over moved vertices, of shape (V, 3)."""
@@ -104,3 +110,15 @@ class Mesh:
     def with_attributes(self, attributes: Mapping[str, npt.NDArray[np.generic]]) -> Mesh:
         """Return the same mesh with these attributes, each of V rows, added to what it carries."""
         return replace(self, attributes={**self.attributes, **attributes})
+
+
+def area_vectors(vertices: Float, faces: Int) -> Float:
+    """Area vectors, of shape (F, 3), of faces of shape (F, 3): along the normal, as long as the area."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    vectors: Float = 0.5 * np.cross(b - a, c - a)
+    return vectors
+
+
+def parts(count: int, size: int = 1 << 18) -> Iterator[slice]:
+    """Yield slices that cover `count` rows: by parts, what is computed of millions takes little memory beside them."""
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))

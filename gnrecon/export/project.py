@@ -15,12 +15,17 @@ from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.protocol import SignedDistance
-from gnrecon.mesh import Mesh
+from gnrecon.mesh import Mesh, area_vectors, parts
 
 Mask = npt.NDArray[np.bool_]
 
 TURN, COLLAPSE = 0.3, 1e-3
 """Least cosine between a face's old and new normal, and least new area as a share of the old."""
+
+CLOSE = 1e-8
+"""Distance, as a share of the limit, below which a vertex is on the zero level and takes no further step."""
+
+_TINY = np.finfo(np.float64).tiny
 
 
 def project(
@@ -62,8 +67,7 @@ def project(
     if steps < 0:
         raise UsageError(f"The number of Newton steps is {steps}, but cannot be negative.")
     if limit is None:
-        edges = np.diff(mesh.corners, axis=1, append=mesh.corners[:, :1])
-        limit = 0.5 * float(np.median(np.linalg.norm(edges, axis=2)))
+        limit = 0.5 * float(np.median(edge_lengths(mesh)))
     if not limit > 0:
         raise UsageError(f"The limit is {limit} file units, but must be positive.")
     moved = np.empty_like(mesh.vertices)
@@ -74,13 +78,24 @@ def project(
         moved[rows], value[rows], gradient[rows] = _newton(mesh.vertices[rows], field, steps, limit)
         advance(min(start + batch, len(moved)) / len(moved))
     back = _undo_turned(mesh, moved)
-    lengths = np.linalg.norm(gradient, axis=1, keepdims=True)
-    normals = np.divide(gradient, lengths, out=np.zeros_like(gradient), where=lengths > 0)
-    result = mesh.with_vertices(np.where(back[:, None], mesh.vertices, moved))
-    by_faces = Mesh(result.vertices, result.faces).vertex_normals()
-    # On a cap, and where the field folds, the gradient is not the surface's normal.
-    unfit = (np.abs(value) > limit) | (np.einsum("ij,ij->i", normals, by_faces) <= 0)
-    return Mesh(result.vertices, result.faces, np.where(unfit[:, None], by_faces, normals))
+    moved[back] = mesh.vertices[back]
+    result = Mesh(moved, mesh.faces)
+    normals = result.vertex_normals()
+    for rows in parts(len(moved)):
+        unit = gradient[rows] / np.maximum(np.linalg.norm(gradient[rows], axis=1, keepdims=True), _TINY)
+        # On a cap, and where the field folds, the gradient is not the surface's normal.
+        fit = (np.abs(value[rows]) <= limit) & (np.einsum("ij,ij->i", unit, normals[rows]) > 0)
+        normals[rows][fit] = unit[fit]
+    return Mesh(moved, mesh.faces, normals)
+
+
+def edge_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
+    """Lengths of the faces' sides, of shape (3 F,)."""
+    lengths = np.empty((len(mesh.faces), 3), dtype=np.float32)
+    for rows in parts(len(mesh.faces)):
+        corners = mesh.vertices[mesh.faces[rows]]
+        lengths[rows] = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    return lengths.reshape(-1)
 
 
 def _newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tuple[Float, Float, Float]:
@@ -89,16 +104,19 @@ def _newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tu
     value, gradient = field.sdf(points), field.gradient(points)
     low, high = field.bounds
     for _ in range(steps):
-        squares = np.maximum(np.einsum("ij,ij->i", gradient, gradient), np.finfo(np.float64).tiny)
-        trial = points - (value / squares)[:, None] * gradient
-        near = (np.linalg.norm(trial - start, axis=1) <= limit) & ((trial >= low) & (trial <= high)).all(axis=1)
-        rows = np.flatnonzero(near)
+        slopes = np.linalg.norm(gradient, axis=1)
+        # From one side of the limit to the other is twice the limit; where the field is flat there is no step.
+        rows = np.flatnonzero((np.abs(value) > CLOSE * limit * slopes) & (np.abs(value) <= 2 * limit * slopes))
+        trial = points[rows] - (value[rows] / slopes[rows])[:, None] * (gradient[rows] / slopes[rows][:, None])
+        near = np.linalg.norm(trial - start[rows], axis=1) <= limit
+        near &= ((trial >= low) & (trial <= high)).all(axis=1)
+        rows, trial = rows[near], trial[near]
         if not len(rows):
             break
-        trial_value = field.sdf(trial[rows])
+        trial_value = field.sdf(trial)
         better = np.abs(trial_value) < np.abs(value[rows])
         rows = rows[better]
-        points[rows], value[rows] = trial[rows], trial_value[better]
+        points[rows], value[rows] = trial[better], trial_value[better]
         gradient[rows] = field.gradient(points[rows])
     return points, value, gradient
 
@@ -108,16 +126,20 @@ def _undo_turned(mesh: Mesh, moved: Float) -> Mask:
 
     Every round returns at least one more vertex, and a face whose three vertices have stayed is as before, so it ends.
     """
-    old = mesh.face_vectors
-    squares = np.einsum("ij,ij->i", old, old)
     back = np.zeros(len(moved), dtype=bool)
     while True:
-        new = mesh.with_vertices(np.where(back[:, None], mesh.vertices, moved)).face_vectors
-        along = np.einsum("ij,ij->i", old, new)
-        areas = np.linalg.norm(new, axis=1)
-        bad = (along < TURN * areas * np.sqrt(squares)) | (areas < COLLAPSE * np.sqrt(squares))
+        now = np.where(back[:, None], mesh.vertices, moved)
         again = np.zeros_like(back)
-        again[mesh.faces[bad]] = True
+        for rows in parts(len(mesh.faces)):
+            faces = mesh.faces[rows]
+            again[faces[_spoilt(area_vectors(mesh.vertices, faces), area_vectors(now, faces))]] = True
         if not (again & ~back).any():
             return back
         back |= again
+
+
+def _spoilt(old: Float, new: Float) -> Mask:
+    """Which faces, of shape (F,), have turned over or collapsed, by their old and new area vectors."""
+    along = np.einsum("ij,ij->i", old, new)
+    before, after = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
+    return np.asarray((along < TURN * after * before) | (after < COLLAPSE * before))

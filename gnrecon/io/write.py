@@ -49,9 +49,14 @@ def write_mesh(
     if len(mesh.vertices) >= _INT32_LIMIT:
         raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices can name.")
     held = {name: values for name, values in mesh.attributes.items() if HOLDS[extension](name, values)}
-    with atomic_write(path, overwrite, verify) as temporary:
-        WRITERS[extension](replace(mesh, attributes=held), temporary)
-    return _lost(mesh, held, extension) + (_rounding(mesh) if extension == ".stl" else [])
+    rounding = _rounding(mesh) if extension == ".stl" else []
+    try:
+        with atomic_write(path, overwrite, verify) as temporary:
+            WRITERS[extension](replace(mesh, attributes=held), temporary)
+    except MeshError as error:
+        # Rounding is then the likely reason.
+        raise MeshError("; ".join([str(error).removesuffix("."), *rounding]).removesuffix(".") + ".") from error
+    return _lost(mesh, held, extension) + rounding
 
 
 def write_cloud(
