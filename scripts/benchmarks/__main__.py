@@ -21,6 +21,7 @@ class Benchmark:
 BENCHMARKS = {
     "paper": Benchmark("benchmarks.paper", "the paper's two shapes, gnrecon beside screened Poisson"),
     "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
+    "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),
 }
 
 
