@@ -6,14 +6,15 @@ To add an attribute, write a function from `Sources` to attributes and sentences
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import PointCloud, Samples
+from gnrecon.cloud import Float, PointCloud, Samples
 from gnrecon.errors import UsageError
 from gnrecon.export import Attribute, Neighbourhood, carry, curvatures
 from gnrecon.fit import NeuralSDF
+from gnrecon.io import holds
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 
@@ -30,6 +31,10 @@ class Sources:
         The field that it was extracted from.
     cloud : PointCloud
         The scan as it was read.
+    around : Neighbourhood
+        Of its points.
+    distances : array of shape (V,)
+        From each vertex to the nearest of them, in file units.
     samples : Samples
         What the fit saw of it.
     options : Options
@@ -38,14 +43,14 @@ class Sources:
     mesh: Mesh
     sdf: NeuralSDF
     cloud: PointCloud
+    around: Neighbourhood
+    distances: Float
     samples: Samples
     options: Options
 
-    @cached_property
-    def around(self) -> Neighbourhood:
-        """The scanned points, as a search tree."""
-        return Neighbourhood(self.cloud.points)
 
+UNASKED = ("distance", "error")
+"""What vertices carry without being asked to, and without a scan that holds it."""
 
 Made = tuple[list[Attribute], list[str]]
 """Attributes, and sentences about what could not be made."""
@@ -81,12 +86,28 @@ def wanted(cloud: PointCloud, attributes: str) -> list[str]:
     return names
 
 
+def fitting(mesh: Mesh, path: Path, attributes: str) -> Mesh:
+    """Leave out what nobody asked for where the format that the path names has no place for it.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    path : file to write
+    attributes : what was asked for, as in `Options`
+    """
+    if attributes != "auto":
+        return mesh
+    kept = {
+        name: values for name, values in mesh.attributes.items() if name not in UNASKED or holds(path, name, values)
+    }
+    return replace(mesh, attributes=kept)
+
+
 def _distance(sources: Sources) -> Made:
     """How far each vertex lies from the nearest scanned point, in file units."""
     if "distance" not in wanted(sources.cloud, sources.options.attributes):
         return [], []
-    distances = sources.around.distances(sources.mesh.vertices)
-    return [Attribute("distance", distances, "distance to the nearest point as read, file units")], []
+    return [Attribute("distance", sources.distances, "distance to the nearest point as read, file units")], []
 
 
 def _carried(sources: Sources) -> Made:

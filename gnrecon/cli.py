@@ -117,6 +117,14 @@ Curvature = Annotated[
         "--curvature", help="Vertices carry the field's mean and Gauss curvature as well.", rich_help_panel=MESH
     ),
 ]
+Trim = Annotated[
+    str | None,
+    typer.Option(
+        help="Cut off what is farther from all points than this, in file units or, as 3s, in their spacings; leaves "
+        "the mesh open.",
+        rich_help_panel=MESH,
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -146,6 +154,7 @@ def reconstruct_command(
     resolution: Resolution = 256,
     attributes: Attributes = "auto",
     curvature: Curvature = False,
+    trim: Trim = None,
     reference: Annotated[
         Path | None,
         typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
@@ -191,6 +200,7 @@ def reconstruct_command(
         "resolution": resolution,
         "attributes": attributes,
         "curvature": curvature,
+        "trim": trim,
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(scan, output, reference, report, preview, save, html, overwrite)
@@ -221,6 +231,7 @@ def batch_command(
     resolution: Resolution = 256,
     attributes: Attributes = "auto",
     curvature: Curvature = False,
+    trim: Trim = None,
     reports: Annotated[
         bool,
         typer.Option(
@@ -254,6 +265,7 @@ def batch_command(
         "--threads": threads,
         "--resolution": resolution,
         "--attributes": attributes,
+        "--trim": trim,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
     passed += ["--curvature"] * curvature

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from gnrecon.errors import UsageError
 from gnrecon.fit.options import FitOptions
+
+_REACH = re.compile(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(s?)\s*", re.IGNORECASE)
+"""A distance, in file units or followed by an s in spacings of the points."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,9 @@ class Options:
         ``gauss_curvature``, per file unit and per squared file unit.
     resolution : int
         Cells of the extraction along the longest side of the shape's box.
+    trim : float or str, optional
+        Distance from the nearest point beyond which the surface is cut off, in file units, or in spacings of the
+        points as in ``"3s"``; the mesh is then open. By default nothing is cut.
     widths, steps, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
@@ -49,6 +57,7 @@ class Options:
     attributes: str = "auto"
     curvature: bool = False
     resolution: int = 256
+    trim: float | str | None = None
     widths: tuple[int, ...] | None = None
     steps: int | None = None
     normal_residual: str = FitOptions.normals
@@ -70,6 +79,7 @@ class Options:
             raise UsageError(f"The widths must be a sequence such as (2000,), not {self.widths!r}.")
         if not all(name.strip() for name in self.attributes.split(",")):
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
+        self.trim_at(spacing=1.0)
         self.fit()
 
     @classmethod
@@ -91,6 +101,22 @@ class Options:
         """Return the arguments of `gnrecon.ingest.prepare`."""
         names = ("outliers", "fraction", "max_points", "subsample", "seed")
         return {name: getattr(self, name) for name in names}
+
+    def trim_at(self, spacing: float) -> float | None:
+        """Return the distance beyond which the surface is cut off, in the unit of the points' spacing.
+
+        Raises
+        ------
+        UsageError
+            When it is no positive length.
+        """
+        if self.trim is None:
+            return None
+        match = _REACH.fullmatch(str(self.trim))
+        reach = float(match[1]) if match else 0.0
+        if match is None or not 0 < reach < math.inf:
+            raise UsageError(f"The trim must be a positive distance, such as 2.5 or 3s (spacings), not {self.trim!r}.")
+        return reach * spacing if match[2] else reach
 
     def fit(self) -> FitOptions:
         """Return the options of the fit."""

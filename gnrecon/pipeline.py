@@ -8,20 +8,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
 import torch
 
-from gnrecon.adorn import Sources, adorn, wanted
+from gnrecon.adorn import Sources, adorn, fitting, wanted
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.export import Attribute, MeshFacts, Metrics, measure, require_sound, verify_file, vertex_error
+from gnrecon.export import (
+    Attribute,
+    Invented,
+    MeshFacts,
+    Metrics,
+    Neighbourhood,
+    Trimming,
+    invented,
+    measure,
+    require_bordered,
+    require_sound,
+    trim,
+    verify_file,
+    vertex_error,
+)
 from gnrecon.fit import Misfit, NeuralSDF, fit
 from gnrecon.ingest import IngestCounts, prepare
-from gnrecon.io import as_cloud, holds, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
+from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
@@ -56,7 +70,7 @@ class Reconstruction:
     Parameters
     ----------
     mesh : Mesh
-        Closed, oriented 2-manifold, in file units.
+        Closed, oriented 2-manifold, in file units; with borders where it was trimmed.
     sdf : NeuralSDF
     report : dict
         Options, versions, stages, counts, fit history, mesh facts and metrics as plain values, ready for JSON;
@@ -81,20 +95,14 @@ class Reconstruction:
         Raises
         ------
         MeshError
-            When the mesh as read back is no closed, oriented 2-manifold.
+            When the mesh as read back is no closed, oriented 2-manifold; of a trimmed one, no oriented edge-manifold.
         OutputError
             When the file cannot be written.
         """
-        return write_mesh(self._fit_for(path), path, overwrite, verify=_verify)
-
-    def _fit_for(self, path: str | Path) -> Mesh:
-        """Leave out distances that nobody asked for where the format has no place for them."""
-        attributes = dict(self.mesh.attributes)
-        distances = attributes.pop("distance", None)
-        asked = self.report["options"]["attributes"] != "auto"
-        if distances is None or asked or holds(path, "distance", distances):
-            return self.mesh
-        return replace(self.mesh, attributes=attributes)
+        # Only trimming makes a mesh open; it was verified as what it is, and so is the file.
+        bordered = not self.report["mesh"]["closed"]
+        mesh = fitting(self.mesh, Path(path), self.report["options"]["attributes"])
+        return write_mesh(mesh, path, overwrite, verify=lambda written: _verify(written, bordered))
 
     def to_trimesh(self) -> Any:
         """Return the mesh as a `trimesh.Trimesh`."""
@@ -186,11 +194,20 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     mesh, actions = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
     for sentence in actions:
         progress.remark(sentence)
+    around = Neighbourhood(cloud.points)
+    spacing, trimming = around.spacing(), None
+    reach = options.trim_at(spacing)
+    if reach is not None:
+        with stages("trim"):
+            mesh, trimming = trim(mesh, around.distances(mesh.vertices), reach)
     with stages("verify"):
-        facts = require_sound(mesh)
+        facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with stages("attributes"):
-        mesh, attributes, remarks = adorn(Sources(mesh, sdf, cloud, samples, options), progress.advance)
-    for sentence in remarks:
+        distances = around.distances(mesh.vertices)
+        unsupported = invented(mesh, distances, spacing)
+        sources = Sources(mesh, sdf, cloud, around, distances, samples, options)
+        mesh, attributes, remarks = adorn(sources, progress.advance)
+    for sentence in [*(unsupported if trimming is None else trimming).describe(), *remarks]:
         progress.remark(sentence)
     metrics = None
     if truth is not None:
@@ -199,7 +216,8 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
             if options.attributes != "none":
                 error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
-    report = _report(source, options, stages, counts, solution, residuals, sdf, facts, actions, attributes, metrics)
+    surface = _surface(facts, unsupported, trimming)
+    report = _report(source, options, stages, counts, solution, residuals, sdf, surface, actions, attributes, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
 
 
@@ -228,8 +246,8 @@ def _reference(reference: Any) -> Mesh | PointCloud | None:
     return read_reference(reference) if isinstance(reference, str | Path) else reference
 
 
-def _verify(path: Path) -> None:
-    verify_file(path)
+def _verify(path: Path, bordered: bool) -> None:
+    verify_file(path, bordered)
 
 
 def _out_of_memory(error: Exception) -> MemoryLimitError:
@@ -237,6 +255,15 @@ def _out_of_memory(error: Exception) -> MemoryLimitError:
         f"There is not enough memory ({str(error).splitlines()[0] if str(error) else 'allocation failed'}); "
         f"use fewer points (--max-points) or a coarser mesh (--resolution)."
     )
+
+
+def _surface(facts: MeshFacts, unsupported: Invented, trimming: Trimming | None) -> dict[str, Any]:
+    """What the mesh is and what was cut off it, as plain values; an open one has no volume."""
+    guarantee = "closed, oriented 2-manifold" if facts.closed else "oriented edge-manifold with borders"
+    mesh = {**facts.as_dict(), **unsupported.as_dict(), "guarantee": guarantee}
+    if not facts.closed:
+        mesh["volume"] = None
+    return {"mesh": mesh, "trim": None if trimming is None else trimming.as_dict()}
 
 
 def _report(
@@ -247,7 +274,7 @@ def _report(
     solution: Solution,
     residuals: Misfit,
     sdf: NeuralSDF,
-    facts: MeshFacts,
+    surface: dict[str, Any],
     actions: list[str],
     attributes: list[Attribute],
     metrics: Metrics | None,
@@ -268,7 +295,7 @@ def _report(
             "history": [vars(record) for record in solution.history],
             "residuals": residuals.as_dict(),
         },
-        "mesh": facts.as_dict(),
+        **surface,
         "actions": actions,
         "attributes": [{"name": one.name, "origin": one.origin} for one in attributes],
         "metrics": None if metrics is None else metrics.as_dict(),

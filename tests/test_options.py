@@ -29,6 +29,11 @@ from gnrecon.options import Options
         ({"search": "golden"}, "one of auto, damping, geodesic, line, not 'golden'"),
         ({"solver": "gauss"}, "solver must be one of auto, cholesky, qr, .*, not 'gauss'"),
         ({"optimiser": "sgd"}, "optimiser must be one of gn, adam, lbfgs, not 'sgd'"),
+        ({"trim": "3m"}, "trim must be a positive distance, such as 2.5 or 3s .spacings., not '3m'"),
+        ({"trim": 0}, "trim must be a positive distance, .* not 0"),
+        ({"trim": "-1s"}, "trim must be a positive distance"),
+        ({"trim": float("inf")}, "trim must be a positive distance"),
+        ({"trim": "1e999"}, "trim must be a positive distance"),
         ({"detail": 3}, "no option 'detail'; the options are fraction, max_points"),
     ],
 )
@@ -58,6 +63,12 @@ def test_ingest_receives_its_options() -> None:
     parameters = inspect.signature(prepare).parameters
     for name, value in Options().ingest().items():
         assert parameters[name].default == value, name
+
+
+def test_trimming_is_in_file_units_or_spacings() -> None:
+    reaches = {None: None, 2.5: 2.5, "2.5": 2.5, "3s": 0.6, " .5 S ": 0.1, 4: 4, "1e-1": 0.1}
+    for given, expected in reaches.items():
+        assert Options(trim=given).trim_at(spacing=0.2) == pytest.approx(expected)
 
 
 def test_options_are_plain_values() -> None:

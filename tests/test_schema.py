@@ -15,7 +15,7 @@ import pytest
 from scan_files import gnrecon, torus, write_scan
 
 import gnrecon as package
-from gnrecon.export import MeshFacts, Metrics
+from gnrecon.export import Invented, MeshFacts, Metrics, Trimming
 from gnrecon.ingest import IngestCounts
 from gnrecon.optim import Record
 from gnrecon.options import Options
@@ -30,6 +30,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "thinned": {"steps": 0, "max_points": None, "fraction": 0.5, "subsample": "voxel", "threads": 1},
     "gauss-newton": {"steps": 2},
     "line": {"steps": 2, "search": "line", "solver": "qr"},
+    "trimmed": {"steps": 0, "trim": "3s", "curvature": True},
     "adam": {"steps": 3, "optimiser": "adam"},
     "lbfgs": {"steps": 1, "optimiser": "lbfgs"},
     "deep": {"steps": 3, "widths": (16, 16), "max_points": None},
@@ -157,7 +158,8 @@ def test_everything_is_described(path: str, schema: dict[str, Any]) -> None:
     [
         ("options", [field.name for field in fields(Options)]),
         ("ingest", [field.name for field in fields(IngestCounts)]),
-        ("mesh", [field.name for field in fields(MeshFacts)]),
+        ("mesh", [*(field.name for field in [*fields(MeshFacts), *fields(Invented)]), "guarantee"]),
+        ("trim", [field.name for field in fields(Trimming)]),
         ("metrics", [*(field.name for field in fields(Metrics)), "relative"]),
         ("fit.history[]", [field.name for field in fields(Record)]),
     ],

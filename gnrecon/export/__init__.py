@@ -8,6 +8,7 @@ from gnrecon.export.definitions import DISTANCES, Metrics
 from gnrecon.export.error import vertex_error
 from gnrecon.export.examine import Findings, examine
 from gnrecon.export.extract import extract
+from gnrecon.export.invented import Invented, invented
 from gnrecon.export.lighten import lighten
 from gnrecon.export.metrics import measure
 from gnrecon.export.neighbours import Neighbourhood
@@ -17,20 +18,24 @@ from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.repair import repair
 from gnrecon.export.sheet import render_sheet
 from gnrecon.export.stray import remove_stray
-from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
+from gnrecon.export.trim import Trimming, trim
+from gnrecon.export.verify import MeshFacts, require_bordered, require_sound, verify, verify_file
 
 __all__ = [
     "DISTANCES",
     "Attribute",
     "Findings",
+    "Invented",
     "MeshFacts",
     "Metrics",
     "Neighbourhood",
     "SignedDistance",
+    "Trimming",
     "carry",
     "curvatures",
     "examine",
     "extract",
+    "invented",
     "lighten",
     "measure",
     "project",
@@ -38,7 +43,9 @@ __all__ = [
     "render",
     "render_sheet",
     "repair",
+    "require_bordered",
     "require_sound",
+    "trim",
     "verify",
     "verify_file",
     "vertex_error",

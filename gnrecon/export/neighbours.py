@@ -25,6 +25,11 @@ from gnrecon.mesh import Int
 COUNT = 8
 """Points that are averaged: about the first ring around a point of an even scan."""
 
+_RING = 6
+"""Points whose circle tells the spacing."""
+
+_QUERIES = 20_000
+
 BATCH = 100_000
 """Places that are asked for at once."""
 
@@ -66,6 +71,21 @@ class Neighbourhood:
     def distances(self, places: Float) -> Float:
         """Distance to the nearest point, of shape (V,), from places of shape (V, 3); file units."""
         return np.asarray(self._tree.query(places - self._centre)[0], dtype=np.float64)
+
+    def spacing(self) -> float:
+        """Typical distance between neighbouring points, in file units; 0 for a single one.
+
+        It is the side of the square that a point has to itself on a surface, by the circle around it that holds its
+        nearest others: the median over at most 20,000 evenly chosen points. On an even grid it is the grid's step.
+        """
+        count = min(_RING, self._tree.n - 1)
+        if not count:
+            return 0.0
+        some = self._tree.data[:: -(-self._tree.n // _QUERIES)]
+        radii = self._tree.query(some, [count + 1])[0][:, 0]
+        # A point that has others at its very place says nothing of the distance to the next.
+        apart = radii[radii > 0]
+        return float(np.sqrt(np.pi / count) * np.median(apart)) if len(apart) else 0.0
 
     def near(self, places: Float, count: int = COUNT) -> Iterator[Neighbours]:
         """Yield the nearest points of places, of shape (V, 3), some places at a time."""

@@ -100,10 +100,7 @@ def require_sound(mesh: Mesh) -> MeshFacts:
     MeshError
         Naming the first thing that is wrong.
     """
-    broken = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
-    if broken:
-        raise MeshError(f"The mesh has {broken} vertices that are not finite.")
-    facts = verify(mesh)
+    facts = _facts_of_finite(mesh)
     failed = failures(facts)
     if not failed:
         error = refusal(to_solid(mesh, merge=False))
@@ -113,33 +110,59 @@ def require_sound(mesh: Mesh) -> MeshFacts:
     return facts
 
 
-def verify_file(path: str | Path) -> MeshFacts:
-    """Read a mesh back from its file and require it to be sound; STL corners are joined by position.
+def require_bordered(mesh: Mesh) -> MeshFacts:
+    """Return the facts of a mesh that may be open: an oriented edge-manifold, whose edges have one face or two.
+
+    Raises
+    ------
+    MeshError
+        Naming the first thing that is wrong.
+    """
+    facts = _facts_of_finite(mesh)
+    failed = failures(facts, bordered=True)
+    if failed:
+        raise MeshError(f"The mesh {failed[0]}.")
+    return facts
+
+
+def verify_file(path: str | Path, bordered: bool = False) -> MeshFacts:
+    """Read a mesh back from its file and require it to be sound, or bordered; STL corners are joined by position.
 
     Raises
     ------
     InputError
         When the file cannot be read.
     MeshError
-        When what it holds does not bound a solid; the sentence names the file.
+        When what it holds is not as required; the sentence names the file.
     """
     from gnrecon.io import read_mesh
 
     try:
-        return require_sound(read_mesh(Path(path)))
+        return (require_bordered if bordered else require_sound)(read_mesh(Path(path)))
     except MeshError as error:
         raise MeshError(f"{path}, read back: {error}") from error
 
 
-def failures(facts: MeshFacts) -> list[str]:
-    """Say all that keeps a mesh from bounding a solid, as ends of a sentence that begins with "The mesh"."""
+def _facts_of_finite(mesh: Mesh) -> MeshFacts:
+    broken = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    if broken:
+        raise MeshError(f"The mesh has {broken} vertices that are not finite.")
+    return verify(mesh)
+
+
+def failures(facts: MeshFacts, bordered: bool = False) -> list[str]:
+    """Say all that keeps a mesh from bounding a solid, or, where it may have borders, from being an edge-manifold.
+
+    Each is the end of a sentence that begins with "The mesh".
+    """
+    solid = not bordered
     sentences = (
         (facts.faces == 0, "is empty"),
         (facts.degenerate_faces > 0, f"has {facts.degenerate_faces} faces that name a vertex twice"),
-        (not facts.closed, f"is open: {facts.boundary_edges} edges have only one face"),
+        (solid and not facts.closed, f"is open: {facts.boundary_edges} edges have only one face"),
         (facts.crowded_edges > 0, f"has {facts.crowded_edges} edges shared by more than two faces"),
         (facts.turned_edges > 0, f"is not consistently oriented: faces disagree across {facts.turned_edges} edges"),
-        (facts.split_vertices > 0, f"has {facts.split_vertices} vertices where several fans of faces touch"),
-        (facts.volume <= 0, f"is inside out: its volume is {facts.volume:.6g}"),
+        (solid and facts.split_vertices > 0, f"has {facts.split_vertices} vertices where several fans of faces touch"),
+        (solid and facts.volume <= 0, f"is inside out: its volume is {facts.volume:.6g}"),
     )
     return [sentence for failed, sentence in sentences if failed]

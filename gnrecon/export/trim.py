@@ -1,0 +1,180 @@
+"""Cut a surface off where no data supports it.
+
+Vertices farther than a reach D from every scanned point are cut away, and faces that the border crosses are cut along
+the line where the distance, interpolated linearly along edges, is D. The distance is smoothed over the surface first,
+over a third of D, because a line at a distance from single points is ragged. A crossing keeps a tenth of its edge away
+from both ends, so that no face becomes a sliver. Two kinds of small change are not made: a patch that would leave a
+hole of less than D^2 stays, because the points around it support it well enough; and a piece of less than 4 pi D^2, a
+disc of radius 2 D, that would be left over by itself goes too: the crumb around a few stray points.
+
+A closed, oriented 2-manifold cut in this way is an oriented 2-manifold with borders: every vertex that stays keeps all
+its faces, and every new one lies on an edge between two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gnrecon.cloud import Float
+from gnrecon.errors import UsageError
+from gnrecon.export.diffuse import diffused, vertex_areas
+from gnrecon.export.topology import Mask
+from gnrecon.mesh import Int, Mesh
+
+CLEAR = 0.1
+"""How far a crossing stays from the ends of its edge, as a share of the edge."""
+
+WIDTH = 1 / 3
+"""Standard deviation of the smoothing, in reaches."""
+
+HOLE, CRUMB = 1.0, 4 * np.pi
+"""Areas, in squared reaches, below which a hole is not cut and a piece not kept."""
+
+
+@dataclass(frozen=True)
+class Trimming:
+    """What was cut off.
+
+    Parameters
+    ----------
+    distance : float
+        The reach, in file units.
+    area_share : float
+        Of the whole surface, that was cut off.
+    crumbs, filled : int
+        Small pieces that went too; small holes that were not cut.
+    """
+
+    distance: float
+    area_share: float
+    crumbs: int
+    filled: int
+
+    def as_dict(self) -> dict[str, float | int]:
+        """All of it by name, ready for JSON."""
+        return asdict(self)
+
+    def describe(self) -> list[str]:
+        """Sentences for the user."""
+        if not self.area_share:
+            return [f"Nothing was cut: no part of the surface lies farther than {self.distance:.6g} from every point."]
+        crumbs = f", with {self.crumbs} small leftover pieces" if self.crumbs else ""
+        filled = f" {self.filled} smaller gaps were left closed." if self.filled else ""
+        return [
+            f"Cut off {self.area_share:.1%} of the surface, farther than {self.distance:.6g} from every "
+            f"point{crumbs}.{filled}",
+            "The mesh is open: an oriented edge-manifold with borders, which bounds no solid.",
+        ]
+
+
+def trim(mesh: Mesh, distances: Float, reach: float) -> tuple[Mesh, Trimming]:
+    """Cut off what is farther than `reach` from data; return the same mesh where nothing is.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        An oriented 2-manifold; normals and attributes are interpolated at the cut.
+    distances : array of shape (V,)
+        From each vertex to the nearest scanned point, in file units.
+    reach : float
+        Positive, in file units.
+
+    Raises
+    ------
+    UsageError
+        When nothing would be left.
+    """
+    areas = vertex_areas(mesh)
+    smooth = diffused(mesh, distances, WIDTH * reach)
+    near, filled = _without_small(mesh, smooth <= reach, areas, HOLE * reach**2, of=False)
+    near, crumbs = _without_small(mesh, near, areas, CRUMB * reach**2, of=True)
+    if not near.any():
+        raise UsageError(
+            f"Trimming at {reach:.6g} leaves nothing: the surface lies {distances.min():.6g} or more from every point."
+        )
+    if near.all():
+        return mesh, Trimming(reach, 0.0, 0, filled)
+    result = _cut(mesh, near, smooth, reach)
+    return result, Trimming(reach, 1 - result.area / mesh.area, crumbs, filled)
+
+
+def _without_small(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:
+    """Change sides of vertex patches on the side `of` with less than an area; whole components and the largest stay."""
+    start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
+    same = near[start] == near[end]
+    size = len(near)
+    links = coo_array((np.ones(same.sum(), dtype=np.int8), (start[same], end[same])), shape=(size, size))
+    count, labels = connected_components(links, directed=False)
+    area = np.bincount(labels, areas, minlength=count)
+    bordered = np.zeros(count, dtype=bool)
+    bordered[labels[start[~same]]] = True
+    bordered[labels[end[~same]]] = True
+    side = np.zeros(count, dtype=bool)
+    side[labels] = near == of
+    small = side & bordered & (area < least)
+    if of and not (side & ~small).any() and small.any():
+        small[np.flatnonzero(small)[area[small].argmax()]] = False
+    return np.where(small[labels], not of, near), int(small.sum())
+
+
+def _cut(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
+    """The part of a mesh around its near vertices, ending where the distance is the reach."""
+    flags = near[mesh.faces]
+    count = flags.sum(axis=1)
+    # The one corner that is alone on its side comes first.
+    single = np.flatnonzero((count == 1) | (count == 2))
+    alone = np.where(count[single] == 1, flags[single].argmax(axis=1), flags[single].argmin(axis=1))
+    a, b, c = np.take_along_axis(mesh.faces[single], (alone[:, None] + np.arange(3)) % 3, axis=1).T
+    ends, which = np.unique(np.sort(np.stack([a, b, a, c], axis=1).reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+    low, high = ends.T
+    share = np.clip((reach - distances[low]) / (distances[high] - distances[low]), CLEAR, 1 - CLEAR)
+    full = _with_points_between(mesh, low, high, share)
+    ab, ac = (len(near) + which.reshape(-1, 2)).T
+    tip = count[single] == 1
+    corners = full.vertices
+    shorter = np.linalg.norm(corners[ab] - corners[c], axis=1) < np.linalg.norm(corners[b] - corners[ac], axis=1)
+    one, other = ~tip & shorter, ~tip & ~shorter
+    pieces = [
+        mesh.faces[count == 3],
+        np.stack([a, ab, ac], axis=1)[tip],
+        np.stack([ab, b, c], axis=1)[one],
+        np.stack([ab, c, ac], axis=1)[one],
+        np.stack([ab, b, ac], axis=1)[other],
+        np.stack([b, c, ac], axis=1)[other],
+    ]
+    return _used(full, np.concatenate(pieces))
+
+
+def _with_points_between(mesh: Mesh, low: Int, high: Int, share: Float) -> Mesh:
+    """The mesh with further vertices, each at a share of the way between two."""
+    vertices = _between(mesh.vertices, low, high, share)
+    normals = None
+    if mesh.normals is not None:
+        normals = _between(mesh.normals, low, high, share)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    attributes = {name: _between(values, low, high, share) for name, values in mesh.attributes.items()}
+    return Mesh(vertices, mesh.faces, normals, attributes)
+
+
+def _between(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt.NDArray[Any]:
+    """The values followed by those between two rows: interpolated numbers, and the nearer row of what is no number."""
+    if values.dtype.kind == "f":
+        weight = share.reshape(-1, *[1] * (values.ndim - 1))
+        mixed = (1 - weight) * values[low] + weight * values[high]
+    else:
+        mixed = values[np.where(share < 0.5, low, high)]
+    return np.concatenate([values, mixed.astype(values.dtype)])
+
+
+def _used(mesh: Mesh, faces: Int) -> Mesh:
+    """The given faces with the vertices that they use."""
+    used, corners = np.unique(faces, return_inverse=True)
+    normals = None if mesh.normals is None else mesh.normals[used]
+    attributes = {name: values[used] for name, values in mesh.attributes.items()}
+    return Mesh(mesh.vertices[used], corners.reshape(-1, 3), normals, attributes)
