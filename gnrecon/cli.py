@@ -117,6 +117,14 @@ Curvature = Annotated[
         "--curvature", help="Vertices carry the field's mean and Gauss curvature as well.", rich_help_panel=MESH
     ),
 ]
+UncertaintyOption = Annotated[
+    bool,
+    typer.Option(
+        "--uncertainty",
+        help="Let vertices carry sigma, the standard deviation of their position along the normal, in file units.",
+        rich_help_panel=MESH,
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -146,6 +154,7 @@ def reconstruct_command(
     resolution: Resolution = 256,
     attributes: Attributes = "auto",
     curvature: Curvature = False,
+    uncertainty: UncertaintyOption = False,
     reference: Annotated[
         Path | None,
         typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
@@ -191,6 +200,7 @@ def reconstruct_command(
         "resolution": resolution,
         "attributes": attributes,
         "curvature": curvature,
+        "uncertainty": uncertainty,
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(scan, output, reference, report, preview, save, html, overwrite)
@@ -221,6 +231,7 @@ def batch_command(
     resolution: Resolution = 256,
     attributes: Attributes = "auto",
     curvature: Curvature = False,
+    uncertainty: UncertaintyOption = False,
     reports: Annotated[
         bool,
         typer.Option(
@@ -256,7 +267,7 @@ def batch_command(
         "--attributes": attributes,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
-    passed += ["--curvature"] * curvature
+    passed += ["--curvature"] * curvature + ["--uncertainty"] * uncertainty
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
     raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, pages=pages, quiet=quiet))
 

@@ -19,7 +19,7 @@ from gnrecon.adorn import Sources, adorn, wanted
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.export import Attribute, MeshFacts, Metrics, measure, require_sound, verify_file, vertex_error
-from gnrecon.fit import Misfit, NeuralSDF, fit
+from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, fit
 from gnrecon.ingest import IngestCounts, prepare
 from gnrecon.io import as_cloud, holds, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
@@ -65,6 +65,8 @@ class Reconstruction:
         Distances to the reference, where one was given.
     interrupted : bool
         Whether the fit was stopped early by Ctrl-C; the mesh then shows the best field until then.
+    uncertainty : Uncertainty, optional
+        Standard deviations of the surface, where they were asked for.
     """
 
     mesh: Mesh
@@ -72,6 +74,7 @@ class Reconstruction:
     report: dict[str, Any]
     metrics: Metrics | None = None
     interrupted: bool = False
+    uncertainty: Uncertainty | None = None
 
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
@@ -189,7 +192,8 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     with stages("verify"):
         facts = require_sound(mesh)
     with stages("attributes"):
-        mesh, attributes, remarks = adorn(Sources(mesh, sdf, cloud, samples, options), progress.advance)
+        sources = Sources(mesh, sdf, cloud, samples, options)
+        mesh, attributes, remarks = adorn(sources, progress.advance)
     for sentence in remarks:
         progress.remark(sentence)
     metrics = None
@@ -200,7 +204,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
                 error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
     report = _report(source, options, stages, counts, solution, residuals, sdf, facts, actions, attributes, metrics)
-    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
+    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty)
 
 
 def _require_device(device: str) -> None:

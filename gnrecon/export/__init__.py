@@ -16,6 +16,7 @@ from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.repair import repair
 from gnrecon.export.sheet import render_sheet
+from gnrecon.export.sparsely import sparsely
 from gnrecon.export.stray import remove_stray
 from gnrecon.export.verify import MeshFacts, require_sound, verify, verify_file
 
@@ -39,6 +40,7 @@ __all__ = [
     "render_sheet",
     "repair",
     "require_sound",
+    "sparsely",
     "verify",
     "verify_file",
     "vertex_error",

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from gnrecon.cloud import Float
 from gnrecon.mesh import Mesh
 
-MOST = 10_000
+MOST = 20_000
 """Vertices at which the quantity is computed."""
 
 NEAREST = 4
@@ -39,7 +39,6 @@ def sparsely(quantity: Callable[[Float], Float], mesh: Mesh, most: int = MOST, s
         return quantity(mesh.vertices)
     chosen = np.sort(np.random.default_rng(seed).permutation(len(mesh.vertices))[:most])
     known = np.log(np.maximum(quantity(mesh.vertices[chosen]), np.finfo(np.float64).tiny))
-    # Areas are no use here: a mesh may hold the same surface in few faces or many.
     centred = mesh.vertices - mesh.vertices.mean(axis=0)
     spacing = np.median(cKDTree(centred[chosen]).query(centred[chosen], 2)[0][:, 1])
     places = np.concatenate([centred, TURN * spacing * mesh.vertex_normals()], axis=1)

@@ -1,13 +1,15 @@
 """The rows of the data in a fit's Jacobian, for what is asked of a fit once it is done.
 
-One interface row (f = 0) and the rows of the normal's residual a point, unweighted, in the free parameters alone:
-all of a network of up to `MOST_PARAMETERS` of them; of a larger one the last layer and, where that is narrow, as many
-evenly spaced units of the layers before it as there is room for. The features of a wide last layer span the field by
-themselves: the uncertainty is then the same with all parameters (docs/uncertainty.md).
+One interface row (f = 0) and the rows of the normal's residual a point, weighted as in the fit (`loss`), so that
+residuals are positions in radii. Their columns are the free parameters: all of a network of up to `MOST_PARAMETERS` of
+them; of a larger one the last layer and, where that is narrow, as many evenly spaced units of the layers before it as
+there is room for. The features of a wide last layer span the field by themselves: the uncertainty is the same with all
+parameters (docs/uncertainty.md).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +25,8 @@ MOST_PARAMETERS = 3000
 WIDE = 600
 """Units of a last layer that spans the field by itself."""
 
+KEPT_BYTES = 200_000_000
+
 
 @dataclass(frozen=True)
 class DataRows:
@@ -34,6 +38,7 @@ class DataRows:
     theta : all parameters, of shape (p,)
     points, normals : of shape (N, 3), unit coordinates
     normal_residual : the fit's residual of the normals
+    normal_weight : of its square beside that of the interface
     """
 
     field: Siren
@@ -41,26 +46,27 @@ class DataRows:
     points: Tensor
     normals: Tensor
     normal_residual: Residual
+    normal_weight: float
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def terms(self, rows: Tensor) -> tuple[Term, Term]:
-        """Return interface and normals at some of the points, weighted so that each row counts as it is."""
-        points, count = self.points[rows], float(len(rows))
-        return (
-            Term("interface", interface, points, None, count),
-            Term("normal", self.normal_residual, points, self.normals[rows], count),
-        )
-
-    def linearise(self, term: Term) -> tuple[LayeredJacobian, Tensor]:
-        """Return a term's J in the free parameters and its residuals r."""
-        problem = FieldProblem(self.field, [term], self.theta, free_units(self.field, self.theta.device))
-        return problem.linearise(problem.free())
+    def linearise(self, rows: Tensor | None = None) -> tuple[LayeredJacobian, Tensor]:
+        """Return J in the free parameters, and r, at some of the points or all; of few points, interface rows first."""
+        points, normals = (self.points, self.normals) if rows is None else (self.points[rows], self.normals[rows])
+        # The fit's terms are means over their points; here each row counts as it is.
+        count = float(len(points))
+        normal = Term("normal", self.normal_residual, points, normals, count * self.normal_weight)
+        return self._linearise([Term("interface", interface, points, None, count), normal])
 
     def values(self, points: Tensor) -> LayeredJacobian:
         """Return the derivatives of f at points, of shape (N, 3), by the free parameters."""
-        return self.linearise(Term("value", interface, points, None, float(len(points))))[0]
+        return self._linearise([Term("value", interface, points, None, float(len(points)))])[0]
+
+    def _linearise(self, terms: Sequence[Term]) -> tuple[LayeredJacobian, Tensor]:
+        units = free_units(self.field, self.theta.device)
+        problem = FieldProblem(self.field, terms, self.theta, units, keep_bytes=KEPT_BYTES)
+        return problem.linearise(problem.free())
 
 
 def free_units(field: Siren, device: torch.device) -> tuple[Tensor | None, ...] | None:
@@ -69,5 +75,9 @@ def free_units(field: Siren, device: torch.device) -> tuple[Tensor | None, ...] 
         return None
     room = MOST_PARAMETERS - field.widths[-1] - 1 if field.widths[-1] < WIDE else 0
     of_each = max(room, 0) // sum(into + 1 for _, into in field.layout.shapes[:-1])
-    hidden = [torch.arange(min(of_each, width), device=device) * width // max(of_each, 1) for width in field.widths]
-    return (*(units.unique() for units in hidden), None)
+    counts = [min(of_each, width) for width in field.widths]
+    hidden = [
+        torch.arange(count, device=device) * width // max(count, 1)
+        for count, width in zip(counts, field.widths, strict=True)
+    ]
+    return (*hidden, None)

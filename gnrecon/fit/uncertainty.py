@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.cloud import Float, Samples
@@ -26,6 +27,7 @@ from gnrecon.field.siren import batches
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
+from gnrecon.fit.loss import normal_weight
 from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
 from gnrecon.fit.sdf import NeuralSDF
 
@@ -46,14 +48,14 @@ class Uncertainty:
     sdf : the fitted field
     rows : the data that it was fitted to
     whitener : of shape (p, p), single precision, with C = W^T W for the covariance C of the free parameters
-    noise : of the points along the normal, file units, and of the normals, in radians, with which the data fits
+    noise : of the points along the normal with which they and their normals fit together, file units
     factor : c, by which errors at left-out points exceed what C alone says
     """
 
     sdf: NeuralSDF
     rows: DataRows
     whitener: Tensor
-    noise: tuple[float, float]
+    noise: float
     factor: float
 
     @classmethod
@@ -75,13 +77,15 @@ class Uncertainty:
         """
         rng = np.random.default_rng(seed)
         chosen = np.sort(rng.permutation(len(samples))[:MOST_POINTS])
-        points, normals = (torch.as_tensor(values[chosen]).to(sdf.theta) for values in (samples.points, samples.normals))
+        points, normals = (
+            torch.as_tensor(values[chosen]).to(sdf.theta) for values in (samples.points, samples.normals)
+        )
         residual = NORMAL_RESIDUALS[sdf.options.get("normals", FitOptions.normals)]
-        rows = DataRows(sdf.field, sdf.theta, points, normals, residual)
+        weight = normal_weight(_spacing(samples.points))
+        rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)
         factor = calibration(rows, posterior, seed)
-        noise = (factor * posterior.noise[0] * sdf.frame.scale, factor * posterior.noise[1])
-        return cls(sdf, rows, posterior.whitener.float(), noise, factor)
+        return cls(sdf, rows, posterior.whitener().float(), posterior.noise * sdf.frame.scale, factor)
 
     def sigma(self, points: npt.ArrayLike) -> Float:
         """Return the standard deviation of the surface, of shape (N,), at points on it, of shape (N, 3); file units.
@@ -93,11 +97,18 @@ class Uncertainty:
         parts = [self._sigma(x[rows]) for rows in batches(len(x), BATCH)]
         return np.concatenate([np.zeros(0), *parts])
 
+    def describe(self) -> str:
+        """Return the noise and the factor as a phrase."""
+        return f"noise {self.noise:.3g}, calibrated by {self.factor:.3g} where data is left out"
+
     def _sigma(self, x: Tensor) -> Float:
         # Rows are made in double precision: frequencies are high, and phases must be exact before they are rounded.
-        variances = [
-            (chunk.float() @ self.whitener.T).square().sum(1) for chunk in self.rows.values(x).dense()
-        ]
+        variances = [(chunk.float() @ self.whitener.T).square().sum(1) for chunk in self.rows.values(x).dense()]
         slope = self.sdf.field.value_and_gradient(self.sdf.theta, x)[1].norm(dim=1).clamp_min(LEAST_SLOPE)
         sigma: Float = (torch.cat(variances).sqrt().double() / slope).cpu().numpy()
         return self.factor * self.sdf.frame.scale * sigma
+
+
+def _spacing(points: Float) -> float:
+    """Return the median distance from a point to its nearest neighbour, as the fit's weights take it."""
+    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
