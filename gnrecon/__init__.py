@@ -19,7 +19,7 @@ from gnrecon.version import __version__
 
 if TYPE_CHECKING:
     from gnrecon.export import examine, extract, measure, project, remove_stray, render, repair, require_sound, verify
-    from gnrecon.fit import FitOptions, NeuralSDF, fit
+    from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
     from gnrecon.ingest import prepare
     from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
     from gnrecon.options import Options
@@ -40,7 +40,7 @@ _ROOMS = {
         "require_sound",
         "verify",
     ),
-    "gnrecon.fit": ("FitOptions", "NeuralSDF", "fit"),
+    "gnrecon.fit": ("FitOptions", "NeuralSDF", "Uncertainty", "fit"),
     "gnrecon.ingest": ("prepare",),
     "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
     "gnrecon.options": ("Options",),
@@ -68,6 +68,7 @@ __all__ = [
     "Reconstruction",
     "Samples",
     "Shape",
+    "Uncertainty",
     "UsageError",
     "__version__",
     "as_cloud",

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float, PointCloud, Samples
-from gnrecon.errors import UsageError
-from gnrecon.export import Attribute, Neighbourhood, carry, curvatures
-from gnrecon.fit import NeuralSDF
+from gnrecon.errors import FitError, UsageError
+from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
+from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.io import holds
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
@@ -48,6 +49,16 @@ class Sources:
     samples: Samples
     options: Options
 
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """That of the field, where it was asked for and can be had."""
+        if not self.options.uncertainty:
+            return None
+        try:
+            return Uncertainty.of(self.sdf, self.samples, self.options.seed)
+        except FitError:
+            return None
+
 
 UNASKED = ("distance", "error")
 """What vertices carry without being asked to, and without a scan that holds it."""
@@ -65,7 +76,9 @@ def adorn(sources: Sources, advance: Advance = unheard) -> tuple[Mesh, list[Attr
         made, remarks = maker(sources)
         attributes += made
         sentences += remarks
-    return sources.mesh.with_attributes({one.name: one.values for one in attributes}), attributes, sentences
+    by_name = {one.name: one for one in attributes}
+    mesh = sources.mesh.with_attributes({name: one.values for name, one in by_name.items()})
+    return mesh, list(by_name.values()), sentences
 
 
 def wanted(cloud: PointCloud, attributes: str) -> list[str]:
@@ -135,4 +148,17 @@ def curvature_of(mesh: Mesh, sdf: NeuralSDF) -> list[Attribute]:
     ]
 
 
-MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried, _curvature)
+def _sigma(sources: Sources) -> Made:
+    """The standard deviation of each vertex's position along the normal, in file units."""
+    if not sources.options.uncertainty:
+        return [], []
+    uncertainty = sources.uncertainty
+    if uncertainty is None:
+        return [], ["There is no sigma, because the data does not determine the field's parameters."]
+    carried = "sigma" in wanted(sources.cloud, sources.options.attributes)
+    remarks = ["The points' attribute 'sigma' gives way to the standard deviation of the surface."] * carried
+    sigma = sparsely(uncertainty.sigma, sources.mesh)
+    return [Attribute("sigma", sigma, f"Laplace approximation, {uncertainty.describe()}")], remarks
+
+
+MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried, _curvature, _sigma)

@@ -125,6 +125,14 @@ Trim = Annotated[
         rich_help_panel=MESH,
     ),
 ]
+UncertaintyOption = Annotated[
+    bool,
+    typer.Option(
+        "--uncertainty",
+        help="Let vertices carry sigma, the standard deviation of their position along the normal, in file units.",
+        rich_help_panel=MESH,
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -155,6 +163,7 @@ def reconstruct_command(
     attributes: Attributes = "auto",
     curvature: Curvature = False,
     trim: Trim = None,
+    uncertainty: UncertaintyOption = False,
     reference: Annotated[
         Path | None,
         typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
@@ -201,6 +210,7 @@ def reconstruct_command(
         "attributes": attributes,
         "curvature": curvature,
         "trim": trim,
+        "uncertainty": uncertainty,
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(scan, output, reference, report, preview, save, html, overwrite)
@@ -232,6 +242,7 @@ def batch_command(
     attributes: Attributes = "auto",
     curvature: Curvature = False,
     trim: Trim = None,
+    uncertainty: UncertaintyOption = False,
     reports: Annotated[
         bool,
         typer.Option(
@@ -268,7 +279,7 @@ def batch_command(
         "--trim": trim,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
-    passed += ["--curvature"] * curvature
+    passed += ["--curvature"] * curvature + ["--uncertainty"] * uncertainty
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
     raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, pages=pages, quiet=quiet))
 

@@ -34,6 +34,8 @@ class Options:
     curvature : bool
         Whether vertices carry ``mean_curvature``, positive where the surface is convex as a sphere is, and
         ``gauss_curvature``, per file unit and per squared file unit.
+    uncertainty : bool
+        Whether vertices carry ``sigma``, the standard deviation of their position along the normal, see `Uncertainty`.
     resolution : int
         Cells of the extraction along the longest side of the shape's box.
     trim : float or str, optional
@@ -56,6 +58,7 @@ class Options:
     outliers: str = "auto"
     attributes: str = "auto"
     curvature: bool = False
+    uncertainty: bool = False
     resolution: int = 256
     trim: float | str | None = None
     widths: tuple[int, ...] | None = None

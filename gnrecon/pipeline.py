@@ -33,7 +33,7 @@ from gnrecon.export import (
     verify_file,
     vertex_error,
 )
-from gnrecon.fit import Misfit, NeuralSDF, fit
+from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, fit
 from gnrecon.ingest import IngestCounts, prepare
 from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
@@ -79,6 +79,8 @@ class Reconstruction:
         Distances to the reference, where one was given.
     interrupted : bool
         Whether the fit was stopped early by Ctrl-C; the mesh then shows the best field until then.
+    uncertainty : Uncertainty, optional
+        Standard deviations of the surface, where they were asked for.
     """
 
     mesh: Mesh
@@ -86,6 +88,7 @@ class Reconstruction:
     report: dict[str, Any]
     metrics: Metrics | None = None
     interrupted: bool = False
+    uncertainty: Uncertainty | None = None
 
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
@@ -218,7 +221,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
     surface = _surface(facts, unsupported, trimming)
     report = _report(source, options, stages, counts, solution, residuals, sdf, surface, actions, attributes, metrics)
-    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted)
+    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty)
 
 
 def _require_device(device: str) -> None:

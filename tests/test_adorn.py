@@ -12,7 +12,7 @@ from scan_files import TUBE, torus
 
 from gnrecon.adorn import wanted
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
+from gnrecon.errors import FitError, UsageError
 from gnrecon.io import read_mesh
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 
@@ -126,3 +126,35 @@ def test_curvature_of_a_torus(scan: PointCloud) -> None:
     assert np.median(np.abs(found["mean_curvature"] - mean)) < 0.05
     assert np.median(np.abs(found["gauss_curvature"] - gauss)) < 0.15
     assert np.corrcoef(found["gauss_curvature"], gauss)[0, 1] > 0.95
+
+
+@pytest.fixture(scope="module")
+def doubtful(scan: PointCloud) -> Reconstruction:
+    """With an attribute of the points that has the name of the surface's standard deviation."""
+    own = PointCloud(scan.points, scan.normals, {"sigma": scan.points[:, 2]})
+    told = Told()
+    found = reconstruct(own, progress=told, uncertainty=True, **FAST)
+    assert "The points' attribute 'sigma' gives way to the standard deviation of the surface." in told.remarks
+    return found
+
+
+def test_sigma_is_there_when_asked_for(result: Reconstruction, doubtful: Reconstruction) -> None:
+    assert "sigma" not in result.mesh.attributes
+    assert result.uncertainty is None
+    assert doubtful.uncertainty is not None
+    exact = doubtful.uncertainty.sigma(doubtful.mesh.vertices)
+    np.testing.assert_array_equal(doubtful.mesh.attributes["sigma"], exact)
+    assert (exact > 0).all()
+    (origin,) = [one["origin"] for one in doubtful.report["attributes"] if one["name"] == "sigma"]
+    assert doubtful.uncertainty.describe() in origin
+
+
+def test_a_sigma_that_cannot_be_had_is_a_sentence(scan: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise FitError("No factor.")
+
+    monkeypatch.setattr("gnrecon.adorn.Uncertainty.of", refuse)
+    told = Told()
+    found = reconstruct(scan, progress=told, uncertainty=True, **FAST)
+    assert "sigma" not in found.mesh.attributes
+    assert any(remark.startswith("There is no sigma") for remark in told.remarks)

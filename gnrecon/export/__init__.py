@@ -17,6 +17,7 @@ from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.repair import repair
 from gnrecon.export.sheet import render_sheet
+from gnrecon.export.sparsely import sparsely
 from gnrecon.export.stray import remove_stray
 from gnrecon.export.trim import Trimming, trim
 from gnrecon.export.verify import MeshFacts, require_bordered, require_sound, verify, verify_file
@@ -45,6 +46,7 @@ __all__ = [
     "repair",
     "require_bordered",
     "require_sound",
+    "sparsely",
     "trim",
     "verify",
     "verify_file",

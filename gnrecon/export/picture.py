@@ -13,6 +13,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from gnrecon.cloud import Float, PointCloud
+from gnrecon.colors import as_bytes
+from gnrecon.colors import to_linear as to_light
 from gnrecon.errors import UsageError
 from gnrecon.export.camera import Camera, View
 from gnrecon.export.nearest import ray_scene
@@ -55,6 +57,7 @@ def render(
     views : sequence of names or (azimuth, elevation) in degrees
         Each is a panel; see `camera.VIEWS` for the names.
     color, point_color : sRGB from 0 to 255
+        Of a mesh without the attribute ``colors``, which is drawn where there is one, and of points.
     points : PointCloud, optional
         Drawn in a panel of its own left of the mesh's, from the same place.
     up : str
@@ -89,7 +92,7 @@ def render(
         camera = Camera.framing((places - centre) / scale, view, up, int(width), height)
         unit = (_places(part) - centre) / scale
         if isinstance(part, Mesh):
-            strips.append(_draw_mesh(Mesh(unit, part.faces, part.normals), camera, to_linear(color)))
+            strips.append(_draw_mesh(part.with_vertices(unit), camera, to_linear(color)))
         else:
             strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, to_linear(point_color)))
     light = np.concatenate(strips, axis=1)
@@ -121,6 +124,9 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
     u, v = answer["primitive_uvs"].numpy()[hit].astype(np.float64).T
     normals = np.einsum("ij,ijk->ik", np.stack([1 - u - v, u, v], axis=1), mesh.vertex_normals()[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    if "colors" in mesh.attributes:
+        light = to_light(as_bytes(mesh.attributes["colors"])[:, :3])
+        color = np.einsum("ij,ijk->ik", np.stack([1 - u - v, u, v], axis=1), light[corners])
     places = rays[hit][:, :3] + distance[hit][:, None] * rays[hit][:, 3:]
     # The sky is looked for once a pixel of the picture, not once a sample: it varies slowly, and costs most.
     coarse = np.zeros_like(hit)

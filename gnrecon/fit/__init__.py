@@ -4,5 +4,6 @@ from gnrecon.fit.misfit import Misfit
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.uncertainty import Uncertainty
 
-__all__ = ["FitOptions", "Misfit", "NeuralSDF", "fit"]
+__all__ = ["FitOptions", "Misfit", "NeuralSDF", "Uncertainty", "fit"]

@@ -71,11 +71,16 @@ def data_terms(
     if len(points) > most:
         rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
         points, normals = points[rows], normals[rows]
-    normal_weight = max(NORMAL_REACH * scene.coarse.spacing, LEAST_REACH) ** 2
+    beside = normal_weight(scene.coarse.spacing)
     return [
         Term("interface", interface, points, None, weight),
-        Term("normal", NORMAL_RESIDUALS[options.normals], points, normals, weight * normal_weight),
+        Term("normal", NORMAL_RESIDUALS[options.normals], points, normals, weight * beside),
     ]
+
+
+def normal_weight(spacing: float) -> float:
+    """Return the weight of normals beside that of the interface, for data of a spacing in radii."""
+    return max(NORMAL_REACH * spacing, LEAST_REACH) ** 2
 
 
 def distance_term(scene: Scene, x: Tensor, distance: Tensor) -> Term:

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
     """
     chosen = _parser().parse_args(arguments)
     protocol = protocol or Protocol()
-    _require_folders(chosen.json, chosen.picture)
+    require_folders(chosen.json, chosen.picture)
     # A missing file is to be told now, not after the cases before it.
     for name in chosen.cases:
         load(CASES[name].shape, chosen.data)
@@ -69,9 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="CASE",
         help=f"of {', '.join(CASES)} (default: {' '.join(DEFAULT_CASES)})",
     )
-    parser.add_argument(
-        "--repeat", type=_positive, default=1, metavar="N", help="random choices of points (default: 1)"
-    )
+    parser.add_argument("--repeat", type=positive, default=1, metavar="N", help="random choices of points (default: 1)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers; an older file is replaced")
     parser.add_argument(
         "--picture", type=Path, metavar="FILE", help="write a contact sheet (PNG); an older file is replaced"
@@ -79,13 +77,14 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
+    """Return the number that an argument is; argparse tells the user where it is none."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"a positive whole number was expected, not {text!r}")
     return int(text)
 
 
-def _require_folders(*files: Path | None) -> None:
+def require_folders(*files: Path | None) -> None:
     """Refuse before the work what could not be written after it."""
     for file in files:
         if file is not None and not file.absolute().parent.is_dir():

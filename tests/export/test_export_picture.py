@@ -158,3 +158,12 @@ def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(
     alone = render_sheet(mesh)
     assert alone.shape == image.shape
     assert not (alone[..., 2].astype(int) - alone[..., 0] > 30).any()
+
+
+def test_colours_of_vertices_are_drawn(ball: Mesh) -> None:
+    left = ball.vertices[:, 0] < ball.vertices[:, 0].mean()
+    colors = np.where(left[:, None], [220, 30, 30, 255], [30, 30, 220, 255]).astype(np.uint8)
+    image = render(ball.with_attributes({"colors": colors}), size=SIZE, views=["front"]).astype(int)
+    red, _, blue = np.moveaxis(image, 2, 0)
+    assert (red - blue)[40:50, 35:50].min() > 50
+    assert (blue - red)[40:50, 70:85].min() > 50

@@ -1,0 +1,114 @@
+"""How uncertain the position of a fitted surface is, from place to place.
+
+A field f with parameters of covariance C has at x the variance J C J^T, J its derivatives by the parameters, and its
+zero level the standard deviation
+
+    sigma(x) = c sqrt(J C J^T) / |grad f|
+
+along the normal, to first order. C is the Laplace approximation (`laplace`), and c one factor for all places, from the
+errors where data is left out (`left_out`). Small where the scan is dense, sigma grows with the distance from it, and
+most where the surface turns its back to all points, as in a hole.
+Source: Sellan and Jacobson, Stochastic Poisson Surface Reconstruction (2022), for the idea of a surface with an
+error bar; the formula is the delta method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gnrecon.cloud import Float, Samples
+from gnrecon.field.siren import batches
+from gnrecon.fit.data_rows import DataRows
+from gnrecon.fit.laplace import laplace
+from gnrecon.fit.left_out import calibration
+from gnrecon.fit.loss import normal_weight
+from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
+from gnrecon.fit.sdf import NeuralSDF
+
+MOST_POINTS = 20_000
+"""Data points that count; more of them are thinned at random, so that sigma is rather too large."""
+
+BATCH = 8192
+LEAST_SLOPE = 0.1
+"""Of the field, whose gradient should have length one; near its critical points the first order says nothing."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations of a fitted surface, along its normal.
+
+    Parameters
+    ----------
+    sdf : the fitted field
+    rows : the data that it was fitted to
+    whitener : of shape (p, p), single precision, with C = W^T W for the covariance C of the free parameters
+    noise : of the points along the normal with which they and their normals fit together, file units
+    factor : c, by which errors at left-out points exceed what C alone says
+    """
+
+    sdf: NeuralSDF
+    rows: DataRows
+    whitener: Tensor
+    noise: float
+    factor: float
+
+    @classmethod
+    def of(cls, sdf: NeuralSDF, samples: Samples, seed: int = 0) -> Uncertainty:
+        """Return the uncertainty of a field that was fitted to `samples`.
+
+        Parameters
+        ----------
+        sdf : NeuralSDF
+            However it was fitted.
+        samples : Samples
+        seed : int
+            Of the points that are left out.
+
+        Raises
+        ------
+        FitError
+            When the matrix of the data cannot be factored, because it is not finite.
+        """
+        rng = np.random.default_rng(seed)
+        chosen = np.sort(rng.permutation(len(samples))[:MOST_POINTS])
+        points, normals = (
+            torch.as_tensor(values[chosen]).to(sdf.theta) for values in (samples.points, samples.normals)
+        )
+        residual = NORMAL_RESIDUALS[sdf.options.get("normals", FitOptions.normals)]
+        weight = normal_weight(_spacing(samples.points))
+        rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
+        posterior = laplace(rows)
+        factor = calibration(rows, posterior, seed)
+        return cls(sdf, rows, posterior.whitener().float(), posterior.noise * sdf.frame.scale, factor)
+
+    def sigma(self, points: npt.ArrayLike) -> Float:
+        """Return the standard deviation of the surface, of shape (N,), at points on it, of shape (N, 3); file units.
+
+        Away from the surface it is that of the level set through the point.
+        """
+        unit = self.sdf.frame.to_unit(np.asarray(points, dtype=np.float64).reshape(-1, 3))
+        x = torch.as_tensor(unit).to(self.sdf.theta)
+        parts = [self._sigma(x[rows]) for rows in batches(len(x), BATCH)]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def describe(self) -> str:
+        """Return the noise and the factor as a phrase."""
+        return f"noise {self.noise:.3g}, calibrated by {self.factor:.3g} where data is left out"
+
+    def _sigma(self, x: Tensor) -> Float:
+        # Rows are made in double precision: frequencies are high, and phases must be exact before they are rounded.
+        variances = [(chunk.float() @ self.whitener.T).square().sum(1) for chunk in self.rows.values(x).dense()]
+        slope = self.sdf.field.value_and_gradient(self.sdf.theta, x)[1].norm(dim=1).clamp_min(LEAST_SLOPE)
+        sigma: Float = (torch.cat(variances).sqrt().double() / slope).cpu().numpy()
+        return self.factor * self.sdf.frame.scale * sigma
+
+
+def _spacing(points: Float) -> float:
+    """Return the median distance from a point to its nearest neighbour, as the fit's weights take it."""
+    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))

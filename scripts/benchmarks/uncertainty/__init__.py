@@ -1,0 +1,1 @@
+"""Whether sigma tells the true error of a reconstruction."""
