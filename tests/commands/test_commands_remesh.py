@@ -168,7 +168,8 @@ def test_a_model_is_saved_with_the_mesh_or_not_at_all(folder: Path, tmp_path: Pa
 def test_a_mesh_that_fails_leaves_no_model(
     folder: Path, tmp_path: Path, command: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(path: Path) -> None:
+    def refuse(path: Path, bordered: bool) -> None:
+        del bordered
         raise RuntimeError(f"cannot read {path.suffix} back")
 
     monkeypatch.setattr("gnrecon.pipeline._verify", refuse)
