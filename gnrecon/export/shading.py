@@ -53,13 +53,16 @@ def shade(normals: Float, color: Float, axes: Float, sky: Float | float) -> Floa
     return result
 
 
-def open_sky(scene: Any, points: Float, normals: Float, reach: float) -> Float:
-    """Share of the sky, of shape (N,), that surface points with unit normals see, as in `sky_share`."""
+def open_sky(scene: Any, points: Float, normals: Float, reach: float, directions: Float) -> Float:
+    """Share of the sky, of shape (N,), that surface points with unit normals see in directions of shape (D, 3).
+
+    The other parameters are those of `sky_share`.
+    """
     from open3d import core
 
     seen = np.zeros(len(points))
     total = np.zeros(len(points))
-    for direction in _sphere_directions():
+    for direction in directions:
         weight = normals @ direction
         rows = np.flatnonzero(weight > 0.05)
         rays = np.empty((len(rows), 6), dtype=np.float32)
@@ -86,13 +89,13 @@ def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float)
         How near something must be to cover the sky.
     """
     image = np.zeros(hit.shape)
-    image[hit] = open_sky(scene, points, normals, reach)
+    image[hit] = open_sky(scene, points, normals, reach, sphere_directions())
     # Averaging over the surface's own pixels alone keeps the outline free of a halo.
     smooth = gaussian_filter(image, 1.2) / np.maximum(gaussian_filter(hit.astype(np.float64), 1.2), 1e-9)
     return np.asarray(smooth)
 
 
-def _sphere_directions() -> Float:
+def sphere_directions() -> Float:
     """Directions spread evenly over the sphere, of shape (N, 3), on a Fibonacci spiral."""
     z = 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(DIRECTIONS)

@@ -198,3 +198,15 @@ def test_it_fits_every_width_in_light_and_dark(
         "e.getBoundingClientRect().right > document.documentElement.clientWidth + 1).map(e => e.outerHTML.slice(0, 99))"
     )
     assert beyond == []
+
+
+def test_paper_is_white_however_dark_the_screen_is(chromium: Browser, file: Path) -> None:
+    chromium.open(file, 1200, 800, dark=True)
+    card = "getComputedStyle(document.querySelector('.card')).backgroundColor"
+    assert chromium.value(card) != "rgb(255, 255, 255)"
+    dark = {"name": "prefers-color-scheme", "value": "dark"}
+    chromium.ask("Emulation.setEmulatedMedia", media="print", features=[dark])
+    assert chromium.value(card) == "rgb(255, 255, 255)"
+    shown = "[...document.querySelectorAll('button')].filter(e => e.getClientRects().length).length"
+    assert chromium.value(shown) == 0, "nothing can be pressed on paper"
+    chromium.ask("Emulation.setEmulatedMedia", media="", features=[])
