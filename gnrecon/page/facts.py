@@ -57,6 +57,9 @@ def verdict(report: Report) -> str:
     parts = f"{count(mesh['components'])} component{'' if mesh['components'] == 1 else 's'}"
     if sound:
         return f"A closed, oriented 2-manifold of genus {mesh['genus']} in {parts}, verified."
+    if mesh.get("guarantee"):
+        article = "An" if mesh["guarantee"][0] in "aeiou" else "A"
+        return f"{article} {mesh['guarantee']} in {parts}, verified."
     faults = [word for word, holds in (("open", not mesh["closed"]), ("not manifold", not mesh["manifold"])) if holds]
     faults += [] if mesh["oriented"] else ["not oriented"]
     return f"A surface in {parts}: {', '.join(faults)}."
@@ -115,7 +118,20 @@ def surface(report: Report) -> list[Fact]:
     facts.append(Fact("Area", figure(mesh["area"], 6), "file units²"))
     if mesh["closed"]:
         facts.append(Fact("Volume", figure(mesh["volume"], 6), "file units³"))
-    return [*facts, *(Fact(word.capitalize(), YES[mesh[word]]) for word in ("closed", "manifold", "oriented"))]
+    facts += [Fact(word.capitalize(), YES[mesh[word]]) for word in ("closed", "manifold", "oriented")]
+    if mesh.get("invented_area_share") is not None:
+        facts.append(
+            Fact("Without data", unsupported(report), f"beyond {figure(mesh['invented_beyond'])} of any point")
+        )
+    if report.get("trim"):
+        trim = report["trim"]
+        facts.append(Fact("Cut off", share(trim["area_share"], 1), f"beyond {figure(trim['distance'])} of any point"))
+    return facts
+
+
+def unsupported(report: Report) -> str:
+    """Share of the surface that no data supports."""
+    return share(report["mesh"]["invented_area_share"], 1)
 
 
 def metrics(report: Report) -> list[tuple[Fact, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -83,6 +83,8 @@ class Layer:
         Of the surface's area over the values, from `low` to `high`.
     figures : tuple of pairs of str
         What is worth saying in numbers, each with its label.
+    beyond : float, optional
+        Value from which on the surface is hatched.
     """
 
     name: str
@@ -92,6 +94,7 @@ class Layer:
     high: float
     histogram: Histogram
     figures: tuple[tuple[str, str], ...]
+    beyond: float | None = None
 
     @property
     def unit(self) -> str:
@@ -99,7 +102,9 @@ class Layer:
         return UNITS[self.kind.power]
 
 
-def layers(mesh: Mesh, origins: Mapping[str, str] = MappingProxyType({})) -> list[Layer]:
+def layers(
+    mesh: Mesh, origins: Mapping[str, str] = MappingProxyType({}), beyond: Mapping[str, float] = MappingProxyType({})
+) -> list[Layer]:
     """Return a layer for every scalar attribute of the mesh that has a finite value, gnrecon's own first.
 
     Parameters
@@ -107,6 +112,8 @@ def layers(mesh: Mesh, origins: Mapping[str, str] = MappingProxyType({})) -> lis
     mesh : Mesh
     origins : mapping of str to str
         How the values of an attribute were found, for those that are none of `KINDS`.
+    beyond : mapping of str to float
+        Values of an attribute from which on the surface is hatched.
     """
     scalars = {
         name: np.asarray(values, dtype=np.float64)
@@ -115,7 +122,7 @@ def layers(mesh: Mesh, origins: Mapping[str, str] = MappingProxyType({})) -> lis
     }
     order = [*(name for name in KINDS if name in scalars), *(name for name in scalars if name not in KINDS)]
     areas = vertex_areas(mesh)
-    return [_layer(name, scalars[name], areas, origins) for name in order]
+    return [replace(_layer(name, scalars[name], areas, origins), beyond=beyond.get(name)) for name in order]
 
 
 def vertex_areas(mesh: Mesh) -> Float:

@@ -128,6 +128,7 @@ def _described(layer: Layer) -> dict[str, Any]:
         "ramp": layer.kind.ramp,
         "low": layer.low,
         "high": layer.high,
+        "beyond": layer.beyond,
     }
 
 

@@ -45,6 +45,7 @@ async function surface(shared) {
     polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,
     uniforms: {
       ...shared.uniforms, ramp: { value: null }, scale: { value: new THREE.Vector2(0, 1) }, paint: { value: 0 },
+      beyond: { value: 3e38 },
       plain: { value: new THREE.Color() }, inner: { value: new THREE.Color() }, solid: { value: scene.solid },
     },
   });

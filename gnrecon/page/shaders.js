@@ -41,6 +41,7 @@ const SURFACE_FRAGMENT = `
   uniform vec3 plain, inner;
   uniform vec4 section;
   uniform int paint;
+  uniform float beyond;
   uniform bool solid;
   uniform float pixel;
   varying vec3 vNormal, vPlace, vTint, vSeen;
@@ -64,7 +65,12 @@ const SURFACE_FRAGMENT = `
     if (paint == 2) color = linear(vTint);
     vec3 light = lit(front ? normal : -normal, color, vSky);
     // Where colour is a measure, light only hints at the form.
-    gl_FragColor = encoded(paint == 1 ? mix(light, color, 0.45) : light);
+    if (paint == 1) light = mix(light, color, 0.45);
+    if (paint == 1 && vValue > beyond) {
+      float stripe = abs(mod(gl_FragCoord.x - gl_FragCoord.y, 8.0 * pixel) - 4.0 * pixel) / pixel;
+      light *= mix(0.45, 1.0, smoothstep(0.8, 1.8, stripe));
+    }
+    gl_FragColor = encoded(light);
   }
 `;
 

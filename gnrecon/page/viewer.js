@@ -133,6 +133,7 @@ class Viewer {
       mesh.geometry.setAttribute("value", layer.attribute);
       uniforms.ramp.value = layer.ramp;
       uniforms.scale.value.set(layer.low, layer.high);
+      uniforms.beyond.value = layer.beyond ?? 3e38;
     }
     mesh.visible = state.mesh === "1";
     wire.visible = state.wire === "1";

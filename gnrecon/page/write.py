@@ -64,7 +64,8 @@ def page_text(report: Mapping[str, Any], mesh: Mesh, cloud: PointCloud | None = 
     if not len(mesh.faces):
         raise MeshError("The mesh has no faces, so there is nothing to show.")
     origins = {one["name"]: one["origin"] for one in report.get("attributes") or []}
-    shown = layers(mesh, origins)
+    unsupported = report["mesh"].get("invented_beyond")
+    shown = layers(mesh, origins, {} if unsupported is None else {"distance": unsupported})
     packed = model(mesh, cloud, shown, solid=bool(report["mesh"]["closed"]))
     environment = Environment(
         loader=FileSystemLoader(FOLDER),
@@ -94,7 +95,8 @@ def _verbatim(name: str) -> Markup:
 
 def _legend(layer: Layer) -> Markup:
     colors = [css(color) for color in ramp(layer.kind.ramp)[::4]]
-    return bars(layer.histogram, layer.unit, strip=colors, size=LEGEND)
+    within = layer.beyond is not None and layer.low < layer.beyond < layer.high
+    return bars(layer.histogram, layer.unit, strip=colors, size=LEGEND, mark=layer.beyond if within else None)
 
 
 def _residuals(report: Mapping[str, Any]) -> list[dict[str, Any]]:

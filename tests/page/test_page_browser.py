@@ -102,6 +102,21 @@ def test_colours_are_those_of_the_scale(opened: Browser) -> None:
         assert (red > blue) == (np.sin(5 * at) > 0), at
 
 
+def test_what_no_data_supports_is_hatched(opened: Browser) -> None:
+    """The distance grows outward from 0.12 to 0.28, and is hatched from 0.22 on: at a radius of 11."""
+    opened.click('[data-set="view"][data-to="top"]')
+    opened.click('[data-set="mode"][data-to="distance"]')
+    image = opened.canvas().astype(int)
+    rows, columns = np.nonzero(drawn(image))
+    middle = (rows.min() + rows.max()) // 2
+    line = image[middle - 15 : middle + 15].sum(axis=2)
+    x = np.abs(np.arange(image.shape[1]) - columns.mean()) / (np.ptp(columns) / 2) * 14
+    # Neighbours along a column are of nearly the same radius: only stripes set them apart.
+    rough = np.abs(np.diff(line, axis=0)).max(axis=0)
+    assert rough[(x > 11.8) & (x < 13)].min() > 40
+    assert rough[(x > 7) & (x < 10)].max() < 20
+
+
 def test_parts_can_be_shown_and_hidden(opened: Browser) -> None:
     mesh = opened.canvas()
     opened.click('[data-set="points"]')

@@ -99,6 +99,8 @@ def test_the_points_are_the_scan(text: str, mesh: Mesh) -> None:
         "fit 1 min 15 s 1.20 GB",
         "Genus 1",
         "needles 0.0 %",
+        "Without data 12.5 % beyond 0.220 of any point",
+        "Hatched: 12.5 % of it, farther than 0.220 from every point.",
         "Held-out residuals",
         "Damping",
     ],
@@ -126,6 +128,12 @@ def test_an_open_surface_is_called_one() -> None:
     text = page_text({"mesh": verify(part).as_dict()}, part)
     assert "A surface in 1 component: open." in Elements(text).text
     assert scene(text)["solid"] is False
+    values = report(part) | {"trim": {"distance": 2.0, "area_share": 0.25, "crumbs": 0, "filled": 1}}
+    values["mesh"] |= {"guarantee": "oriented edge-manifold with borders", "volume": None}
+    said = Elements(page_text(values, part)).text
+    assert "An oriented edge-manifold with borders in 1 component, verified." in said
+    assert "Cut off 25.0 % beyond 2.00 of any point" in said
+    assert "volume" not in said.lower()
 
 
 def test_heavy_meshes_and_clouds_are_drawn_lightly_and_said_to_be(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
