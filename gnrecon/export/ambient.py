@@ -31,8 +31,8 @@ def vertex_sky(mesh: Mesh) -> Float:
     # Normal numbers make quaternions of uniformly distributed rotations.
     rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(TURNS, 4)))
     for turn, rotation in enumerate(rotations):
-        rows = slice(turn, None, TURNS)
-        share[rows] = open_sky(scene, unit[rows], normals[rows], REACH, rotation.apply(sphere_directions()))
+        part = slice(turn, None, TURNS)
+        share[part] = open_sky(scene, unit[part], normals[part], REACH, rotation.apply(sphere_directions()))
     start, end = mesh.faces[:, [0, 1, 2]].reshape(-1), mesh.faces[:, [1, 2, 0]].reshape(-1)
     own = np.arange(len(share))
     rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])
