@@ -195,14 +195,15 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     progress.remark(solution.status)
     # The field's own points, so that a saved field makes the same mesh again.
     mesh, actions = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
-    for sentence in actions:
-        progress.remark(sentence)
     around = Neighbourhood(cloud.points)
     spacing, trimming = around.spacing(), None
     reach = options.trim_at(spacing)
     if reach is not None:
         with stages("trim"):
             mesh, trimming = trim(mesh, around.distances(mesh.vertices), reach)
+        actions += trimming.describe()
+    for sentence in actions:
+        progress.remark(sentence)
     with stages("verify"):
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with stages("attributes"):
@@ -210,7 +211,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         unsupported = invented(mesh, distances, spacing)
         sources = Sources(mesh, sdf, cloud, around, distances, samples, options)
         mesh, attributes, remarks = adorn(sources, progress.advance)
-    for sentence in [*(unsupported if trimming is None else trimming).describe(), *remarks]:
+    for sentence in [*(unsupported.describe() if trimming is None else []), *remarks]:
         progress.remark(sentence)
     metrics = None
     if truth is not None:

@@ -126,11 +126,13 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
 
 def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, Any]) -> str:
     """Return a line about a written mesh, from the facts and resources of the report."""
-    closed = f"genus {facts['genus']}, closed and manifold, volume {facts['volume']:.6g}"
-    opened = f"open, edge-manifold and oriented, area {facts['area']:.6g}"
+    if facts["closed"]:
+        kind = f"genus {facts['genus']}, closed and manifold, volume {facts['volume']:.6g}"
+    else:
+        kind = f"open, edge-manifold and oriented, area {facts['area']:.6g}"
     return (
         f"{output}: {facts['vertices']} vertices, {facts['faces']} faces, {facts['components']} component"
-        f"{'s' if facts['components'] != 1 else ''}, {closed if facts['closed'] else opened}; "
+        f"{'s' if facts['components'] != 1 else ''}, {kind}; "
         f"{resources['seconds']:.1f} s, {resources['peak_memory_mb']:.0f} MB."
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from markupsafe import escape
-from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
+from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, sphere, start, torus, wait_for, write_scan
 
 from gnrecon.cli import main
 from gnrecon.errors import ExitCode
@@ -160,6 +160,30 @@ def assert_torus(path: Path) -> None:
     mesh = trimesh.load(path, force="mesh")
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(facts.volume, rel=1e-5)
+
+
+def test_a_trimmed_mesh_is_open_and_said_to_be(out: Path, tmp_path: Path) -> None:
+    points, normals = sphere(2000, np.random.default_rng(3))
+    half = points[:, 0] > 0
+    scan = write_scan(tmp_path / "half.ply", points[half], normals[half])
+    words = ("-o", out / "mesh.ply", "--report", out / "report.json", "--widths", "300", "--steps", "0")
+    closed = gnrecon(scan, *words, "--resolution", "32")
+    assert closed.returncode == 0, closed.stderr
+    assert "of the surface is invented" in closed.stderr
+    done = gnrecon(scan, *words, "--resolution", "32", "--trim", "3s", "--overwrite")
+    assert done.returncode == 0, done.stderr
+    assert "Cut off" in done.stderr
+    assert "The mesh is open: an oriented edge-manifold with borders" in done.stderr
+    assert "open, edge-manifold and oriented, area" in done.stderr
+    report = json.loads((out / "report.json").read_text())
+    assert report["mesh"]["guarantee"] == "oriented edge-manifold with borders"
+    assert report["mesh"]["volume"] is None
+    assert report["trim"]["distance"] == report["mesh"]["invented_beyond"]
+    assert report["mesh"]["invented_area_share"] < 0.05
+    checked = gnrecon("check", out / "mesh.ply")
+    assert checked.returncode == ExitCode.MESH
+    refused = gnrecon(scan, "-o", out / "none.ply", "--trim", "0")
+    assert_refused(refused, ExitCode.USAGE, "trim must be a positive distance")
 
 
 def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> None:
