@@ -18,7 +18,18 @@ from gnrecon.mesh import Mesh
 from gnrecon.version import __version__
 
 if TYPE_CHECKING:
-    from gnrecon.export import examine, extract, measure, project, remove_stray, render, repair, require_sound, verify
+    from gnrecon.export import (
+        examine,
+        extract,
+        measure,
+        project,
+        remove_stray,
+        render,
+        repair,
+        require_sound,
+        trim,
+        verify,
+    )
     from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
     from gnrecon.ingest import prepare
     from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
@@ -38,6 +49,7 @@ _ROOMS = {
         "render",
         "repair",
         "require_sound",
+        "trim",
         "verify",
     ),
     "gnrecon.fit": ("FitOptions", "NeuralSDF", "Uncertainty", "fit"),
@@ -89,6 +101,7 @@ __all__ = [
     "shaped",
     "to_open3d",
     "to_trimesh",
+    "trim",
     "verify",
     "write_mesh",
     "write_page",
