@@ -97,8 +97,16 @@ Seed = Annotated[int, typer.Option(help="Seed of everything random.", rich_help_
 Device = Annotated[str, typer.Option(help="cpu or cuda.", rich_help_panel=FIT)]
 Threads = Annotated[int | None, typer.Option(help="CPU threads; torch's choice when not given.", rich_help_panel=FIT)]
 Resolution = Annotated[
-    int, typer.Option(help="Cells along the longest side of the box; at least 16.", rich_help_panel=MESH)
+    int | None,
+    typer.Option(help="Cells along the longest side of the box; at least 16, by default 256.", rich_help_panel=MESH),
 ]
+_EDGE_LENGTH = "Mean length of the mesh's edges, in file units, instead of a resolution."
+_MAX_ERROR = (
+    "Make the mesh finer, up to 1,024 cells, until 99.9 % of face centres and edge midpoints lie so near to the fitted "
+    "surface, in file units."
+)
+EdgeLength = Annotated[float | None, typer.Option(help=_EDGE_LENGTH, rich_help_panel=MESH)]
+MaxError = Annotated[float | None, typer.Option(help=_MAX_ERROR, rich_help_panel=MESH)]
 Attributes = Annotated[
     str,
     typer.Option(
@@ -159,7 +167,9 @@ def reconstruct_command(
     seed: Seed = 0,
     device: Device = "cpu",
     threads: Threads = None,
-    resolution: Resolution = 256,
+    resolution: Resolution = None,
+    edge_length: EdgeLength = None,
+    max_error: MaxError = None,
     attributes: Attributes = "auto",
     curvature: Curvature = False,
     trim: Trim = None,
@@ -207,6 +217,8 @@ def reconstruct_command(
         "device": device,
         "threads": threads,
         "resolution": resolution,
+        "edge_length": edge_length,
+        "max_error": max_error,
         "attributes": attributes,
         "curvature": curvature,
         "trim": trim,
@@ -238,7 +250,9 @@ def batch_command(
     seed: Seed = 0,
     device: Device = "cpu",
     threads: Threads = None,
-    resolution: Resolution = 256,
+    resolution: Resolution = None,
+    edge_length: EdgeLength = None,
+    max_error: MaxError = None,
     attributes: Attributes = "auto",
     curvature: Curvature = False,
     trim: Trim = None,
@@ -275,6 +289,8 @@ def batch_command(
         "--device": device,
         "--threads": threads,
         "--resolution": resolution,
+        "--edge-length": edge_length,
+        "--max-error": max_error,
         "--attributes": attributes,
         "--trim": trim,
     }
@@ -288,7 +304,9 @@ def batch_command(
 def mesh_command(
     model: Annotated[Path, typer.Argument(help="Fitted field, a .gnr file that --save wrote.")],
     output: Output,
-    resolution: Resolution = 256,
+    resolution: Resolution = None,
+    edge_length: Annotated[str | None, typer.Option(help=_EDGE_LENGTH, rich_help_panel=MESH)] = None,
+    max_error: Annotated[str | None, typer.Option(help=_MAX_ERROR, rich_help_panel=MESH)] = None,
     crop: Annotated[
         str | None,
         typer.Option(
@@ -336,7 +354,14 @@ def mesh_command(
         None if shell is None else parse_length(shell, units),
         None if crop is None else np.array(parse_box(crop)),
     )
-    options = {"resolution": resolution, "attributes": attributes, "curvature": curvature, "threads": threads}
+    options = {
+        "resolution": resolution,
+        "edge_length": None if edge_length is None else parse_length(edge_length, units),
+        "max_error": None if max_error is None else parse_length(max_error, units),
+        "attributes": attributes,
+        "curvature": curvature,
+        "threads": threads,
+    }
     raise SystemExit(remesh(model, output, options, shape, overwrite=overwrite, quiet=quiet))
 
 

@@ -7,15 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from gnrecon.advance import Advance, unheard
+from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
 from gnrecon.export import SignedDistance, extract, project, remove_stray, repair
+from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
+
+SAFE = 0.95
+"""Share of the wanted chord error at which a mesh is fine enough: all of it, projected, may differ a little from a part."""
 
 StageTimer = Callable[[str], AbstractContextManager[None]]
 """Gives the context in which a stage of a name runs, such as `gnrecon.report.Stages`."""
@@ -35,6 +40,24 @@ class MeshedField(SignedDistance, Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Meshed:
+    """What became of a field.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Closed, with normals; `gnrecon.export.require_sound` has accepted it.
+    fineness : Fineness
+    actions : list of str
+        A sentence for each thing that was dropped or repaired, and for what was asked of the fineness.
+    """
+
+    mesh: Mesh
+    fineness: Fineness
+    actions: list[str]
+
+
 def mesh_field(
     field: MeshedField,
     options: Options,
@@ -43,7 +66,7 @@ def mesh_field(
     bounds: Float | None = None,
     stages: StageTimer = untimed,
     advance: Advance = unheard,
-) -> tuple[Mesh, list[str]]:
+) -> Meshed:
     """Mesh the zero level of a field as the options ask.
 
     Parameters
@@ -59,27 +82,52 @@ def mesh_field(
     advance : callable
         Told of the share that is done of each stage.
 
-    Returns
-    -------
-    Mesh
-        Closed, with normals; `gnrecon.export.require_sound` has accepted it.
-    list of str
-        A sentence for each thing that was dropped or repaired.
-
     Raises
     ------
+    UsageError
+        When an edge length would need too few or too many cells.
     MeshError
         When there is no zero level in the box, or no sound mesh can be made of it.
     """
+    box = field.bounds if bounds is None else bounds
     with stages("extract"):
-        coarse = field if data is None else _coarse(field, data, options.resolution)
-        mesh = extract(coarse, resolution=options.resolution, bounds=bounds, data=data, advance=advance)
-        mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
+        mesh, cells, dropped = _extracted(field, options, data, box, advance)
     with stages("project"):
         mesh = project(mesh, field, steps=2, advance=advance)
+        fineness = measure_fineness(mesh, field, cells, box)
     with stages("repair"):
         mesh, repaired = repair(mesh)
-    return mesh, [*dropped, *repaired]
+    return Meshed(mesh, fineness, [*dropped, *repaired, *_said(fineness, options)])
+
+
+def _extracted(
+    field: MeshedField, options: Options, data: Float | None, box: Float, advance: Advance
+) -> tuple[Mesh, int, list[str]]:
+    """Extract, and again with more cells until the error is small enough; with the cells, and what was dropped."""
+    cells, begin = options.cells(box), 0.0
+    while True:
+        # How often is not known before: each attempt gets half of what is left of the stage.
+        end = 1.0 if options.max_error is None else (begin + 1.0) / 2
+        fast = field if data is None else _coarse(field, data, cells)
+        mesh = extract(fast, resolution=cells, bounds=box, data=data, advance=part(advance, begin, end))
+        mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
+        if options.max_error is None or cells >= MOST_REFINED:
+            return mesh, cells, dropped
+        error = error_once_projected(mesh, field, cells, box)
+        if error <= SAFE * options.max_error:
+            return mesh, cells, dropped
+        cells, begin = min(finer(cells, error, SAFE * options.max_error), MOST_REFINED), end
+
+
+def _said(fineness: Fineness, options: Options) -> list[str]:
+    """Tell what became of an edge length or a greatest error that was asked for."""
+    if options.edge_length is None and options.max_error is None:
+        return []
+    said = [fineness.describe()]
+    if options.max_error is not None and fineness.chord_error > options.max_error:
+        reason = f": the limit of {MOST_REFINED} cells was reached." if fineness.resolution >= MOST_REFINED else "."
+        said.append(f"That is not within {options.max_error:g}{reason}")
+    return said
 
 
 def _coarse(field: MeshedField, data: Float, resolution: int) -> SignedDistance:

@@ -7,8 +7,13 @@ import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
+from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.options import FitOptions
+
+RESOLUTION = 256
+"""Cells where nothing else was asked for."""
 
 _REACH = re.compile(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(s?)\s*", re.IGNORECASE)
 """A distance, in file units or followed by an s in spacings of the points."""
@@ -36,8 +41,13 @@ class Options:
         ``gauss_curvature``, per file unit and per squared file unit.
     uncertainty : bool
         Whether vertices carry ``sigma``, the standard deviation of their position along the normal, see `Uncertainty`.
-    resolution : int
-        Cells of the extraction along the longest side of the shape's box.
+    resolution : int, optional
+        Cells of the extraction along the longest side of the shape's box; 256 unless there is an edge length.
+    edge_length : float, file units, optional
+        Mean length of the mesh's edges, from which the number of cells follows.
+    max_error : float, file units, optional
+        Distance from the field's surface that 99.9 % of face centres and edge midpoints are to stay within; the mesh is
+        made finer until they do, up to 1,024 cells.
     trim : float or str, optional
         Distance from the nearest point beyond which the surface is cut off, in file units, or in spacings of the
         points as in ``"3s"``; the mesh is then open. By default nothing is cut.
@@ -59,7 +69,9 @@ class Options:
     attributes: str = "auto"
     curvature: bool = False
     uncertainty: bool = False
-    resolution: int = 256
+    resolution: int | None = None
+    edge_length: float | None = None
+    max_error: float | None = None
     trim: float | str | None = None
     widths: tuple[int, ...] | None = None
     steps: int | None = None
@@ -72,8 +84,9 @@ class Options:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        if self.resolution < 16:
-            raise UsageError(f"The resolution must be at least 16 cells, not {self.resolution}.")
+        if self.resolution is None and self.edge_length is None:
+            object.__setattr__(self, "resolution", RESOLUTION)
+        self._check_fineness()
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
         if self.seed < 0:
@@ -84,6 +97,15 @@ class Options:
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
         self.trim_at(spacing=1.0)
         self.fit()
+
+    def _check_fineness(self) -> None:
+        if self.resolution is not None and self.edge_length is not None:
+            raise UsageError("An edge length decides the resolution, so that only one of the two can be given.")
+        if self.resolution is not None and self.resolution < LEAST_CELLS:
+            raise UsageError(f"The resolution must be at least {LEAST_CELLS} cells, not {self.resolution}.")
+        for name, value in (("edge length", self.edge_length), ("greatest error", self.max_error)):
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"The {name} must be a positive length, not {value:g}.")
 
     @classmethod
     def of(cls, **values: Any) -> Options:
@@ -120,6 +142,18 @@ class Options:
         if match is None or not 0 < reach < math.inf:
             raise UsageError(f"The trim must be a positive distance, such as 2.5 or 3s (spacings), not {self.trim!r}.")
         return reach * spacing if match[2] else reach
+
+    def cells(self, bounds: Float) -> int:
+        """Return the cells along the longest side of a box, of shape (2, 3) in file units, to begin with.
+
+        Raises
+        ------
+        UsageError
+            When the edge length would need too few or too many.
+        """
+        if self.edge_length is not None:
+            return cells_for_edges(self.edge_length, bounds)
+        return self.resolution or RESOLUTION
 
     def fit(self) -> FitOptions:
         """Return the options of the fit."""

@@ -33,7 +33,7 @@ from gnrecon.export import (
     verify_file,
     vertex_error,
 )
-from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, fit
+from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.ingest import IngestCounts, prepare
 from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
@@ -186,6 +186,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
     wanted(cloud, options.attributes)  # a misspelt name is refused before the work
     with stages("ingest"):
         samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
+    options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
     for sentence in counts.remarks():
         progress.remark(sentence)
     with stages("fit"):
@@ -194,14 +195,15 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
         residuals = Misfit.of(sdf, samples)
     progress.remark(solution.status)
     # The field's own points, so that a saved field makes the same mesh again.
-    mesh, actions = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
+    meshed = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
+    mesh, actions = meshed.mesh, meshed.actions
     around = Neighbourhood(cloud.points)
     spacing, trimming = around.spacing(), None
     reach = options.trim_at(spacing)
     if reach is not None:
         with stages("trim"):
             mesh, trimming = trim(mesh, around.distances(mesh.vertices), reach)
-        actions += trimming.describe()
+        actions = [*actions, *trimming.describe()]
     for sentence in actions:
         progress.remark(sentence)
     with stages("verify"):
@@ -220,7 +222,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
             if options.attributes != "none":
                 error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
-    surface = _surface(facts, unsupported, trimming)
+    surface = _surface(facts, unsupported, trimming) | {"fineness": meshed.fineness.as_dict()}
     report = _report(source, options, stages, counts, solution, residuals, sdf, surface, actions, attributes, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty)
 

@@ -94,16 +94,15 @@ def shaped(
     MeshError
         When there is no zero level, or no sound mesh can be made of it.
     """
-    cell = float(np.ptp(sdf.bounds if shape.crop is None else shape.crop, axis=0).max()) / options.resolution
+    box = sdf.bounds if shape.crop is None else shape.crop
+    cell = float(np.ptp(box, axis=0).max()) / options.cells(box)
     region = sdf.bounds
     if shape.crop is not None:
         # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
         region = _around(shape.crop, max(map(abs, shape.levels)) + MARGIN * cell, sdf.bounds)
     data, remarks = _data(sdf, region)
-    mesh, actions = mesh_field(
-        sdf, _at(options, region, cell), data=data, bounds=region, stages=stages, advance=advance
-    )
-    remarks += actions
+    meshed = mesh_field(sdf, _at(options, region, cell), data=data, bounds=region, stages=stages, advance=advance)
+    mesh, remarks = meshed.mesh, remarks + meshed.actions
     surfaces = []
     for level in shape.levels:
         surface = mesh
@@ -133,7 +132,8 @@ def _corners(box: Float) -> str:
 
 def _at(options: Options, region: Float, cell: float) -> Options:
     """The same options for another box, with cells of the given size."""
-    return replace(options, resolution=max(16, int(np.ceil(np.ptp(region, axis=0).max() / cell - 1e-9))))
+    cells = max(16, int(np.ceil(np.ptp(region, axis=0).max() / cell - 1e-9)))
+    return replace(options, resolution=cells, edge_length=None)
 
 
 def _data(sdf: NeuralSDF, region: Float) -> tuple[Float | None, list[str]]:
@@ -156,10 +156,11 @@ def _offset(
         bounds = _around(box, MARGIN * cell, bounds)
     field = OffsetField(mesh, level, sdf.frame, bounds)
     try:
-        surface, remarks = mesh_field(field, _at(options, bounds, cell), data=None, bounds=bounds, advance=advance)
+        meshed = mesh_field(field, _at(options, bounds, cell), data=None, bounds=bounds, advance=advance)
     except MeshError:
         _require_depth(field, bounds)
         raise
+    surface, remarks = meshed.mesh, meshed.actions
     inner = ((surface.vertices > bounds[0] + 2 * cell) & (surface.vertices < bounds[1] - 2 * cell)).all(axis=1)
     lengths = nearest_on_surface(mesh, surface.vertices[inner])[0]
     if not len(lengths):

@@ -35,7 +35,7 @@ class Scene:
         """Put samples on a device."""
         points, normals = (torch.as_tensor(rows, device=device) for rows in (samples.points, samples.normals))
         coarse = CoarseDistance(samples.points, samples.normals, rng)
-        return cls(points, normals, samples, coarse, Box.around(samples.points, MARGIN))
+        return cls(points, normals, samples, coarse, _box(samples))
 
     def volume(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
         """Return about `count` points of the box, (Q, 3), half of them near the data, and their coarse distances."""
@@ -46,3 +46,13 @@ class Scene:
     def tensor(self, values: Float) -> Tensor:
         """Return `values` as a tensor like the data's."""
         return torch.as_tensor(values).to(self.points)
+
+
+def bounds_of(samples: Samples) -> Float:
+    """Lower and upper corner of the box in which samples will be fitted, of shape (2, 3), file units."""
+    box = _box(samples)
+    return samples.frame.to_world(np.stack([box.lower, box.upper]))
+
+
+def _box(samples: Samples) -> Box:
+    return Box.around(samples.points, MARGIN)

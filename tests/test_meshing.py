@@ -1,0 +1,104 @@
+"""Meshing as the options ask: edge lengths and greatest errors decide how fine, and the report tells."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "export"))
+
+from analytic_fields import UTM, Field, torus
+
+from gnrecon import meshing
+from gnrecon.errors import UsageError
+from gnrecon.export import SignedDistance
+from gnrecon.export.fineness import chord_error
+from gnrecon.meshing import mesh_field
+from gnrecon.options import Options
+from gnrecon.pipeline import Progress, reconstruct
+
+
+class Precise(Field):
+    """An analytic field, as precise in single precision."""
+
+    def single(self) -> SignedDistance:
+        return self
+
+
+@pytest.fixture
+def field() -> Precise:
+    return Precise(torus(), frame=UTM)
+
+
+def test_an_edge_length_decides_the_cells(field: Precise) -> None:
+    meshed = mesh_field(field, Options(edge_length=1.2), data=None)
+    assert meshed.fineness.edge_length == pytest.approx(1.2, rel=0.1)
+    assert meshed.actions == [meshed.fineness.describe()]
+    assert mesh_field(field, Options(resolution=20), data=None).actions == []
+
+
+def test_a_mesh_becomes_finer_until_the_error_is_small_enough(field: Precise) -> None:
+    coarse = mesh_field(field, Options(resolution=20), data=None)
+    wanted = 0.2 * coarse.fineness.chord_error
+    shares: dict[str, list[float]] = {}
+
+    def stage(name: str) -> AbstractContextManager[None]:
+        shares[name] = []
+        return nullcontext()
+
+    def advance(share: float) -> None:
+        list(shares.values())[-1].append(share)
+
+    options = Options(resolution=20, max_error=wanted)
+    meshed = mesh_field(field, options, data=None, bounds=field.bounds, stages=stage, advance=advance)
+    assert 20 < meshed.fineness.resolution < 80
+    found = chord_error(meshed.mesh, field, field.bounds, np.ptp(field.bounds, axis=0).max() / 50)
+    assert 0.2 * wanted < found <= wanted
+    assert meshed.fineness.chord_error == pytest.approx(found, rel=0.1)
+    assert len(meshed.actions) == 1
+    assert list(shares) == ["extract", "project", "repair"]
+    assert shares["extract"] == sorted(shares["extract"])
+    assert 0.5 < shares["extract"][-1] <= 1.0
+    again = mesh_field(field, replace(options, max_error=2 * coarse.fineness.chord_error), data=None)
+    assert again.fineness.resolution == 20
+
+
+def test_what_the_limit_of_cells_reaches_is_said(field: Precise, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(meshing, "MOST_REFINED", 30)
+    meshed = mesh_field(field, Options(resolution=20, max_error=1e-6), data=None)
+    assert meshed.fineness.resolution == 30
+    assert meshed.actions[-1] == "That is not within 1e-06: the limit of 30 cells was reached."
+
+
+@pytest.mark.parametrize("values", [{"edge_length": 0.0}, {"edge_length": np.inf}, {"max_error": -1.0}])
+def test_senseless_lengths_are_refused(values: dict[str, float]) -> None:
+    with pytest.raises(UsageError, match="must be a positive length"):
+        Options(**values)
+
+
+def test_a_resolution_and_an_edge_length_exclude_each_other() -> None:
+    with pytest.raises(UsageError, match="only one of the two"):
+        Options(resolution=128, edge_length=0.5)
+    assert Options().resolution == 256
+    assert Options(edge_length=0.5).resolution is None
+    with pytest.raises(UsageError, match="possible"):
+        Options(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))
+
+
+def test_an_impossible_edge_length_is_refused_before_the_fit() -> None:
+    stages: list[str] = []
+
+    class Heard(Progress):
+        def stage(self, name: str) -> None:
+            stages.append(name)
+
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    with pytest.raises(UsageError, match="possible"):
+        reconstruct(points, points, edge_length=1e-9, progress=Heard())
+    assert stages == ["read", "ingest"]
