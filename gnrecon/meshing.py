@@ -20,7 +20,7 @@ from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 
 SAFE = 0.95
-"""Share of the wanted chord error at which a mesh is fine enough: all of it, projected, may differ a little from a part."""
+"""Share of the wanted chord error at which a mesh is fine enough: projected as a whole, it may differ a little."""
 
 StageTimer = Callable[[str], AbstractContextManager[None]]
 """Gives the context in which a stage of a name runs, such as `gnrecon.report.Stages`."""

@@ -103,6 +103,8 @@ def shaped(
     data, remarks = _data(sdf, region)
     meshed = mesh_field(sdf, _at(options, region, cell), data=data, bounds=region, stages=stages, advance=advance)
     mesh, remarks = meshed.mesh, remarks + meshed.actions
+    if options.edge_length is not None and options.max_error is None:
+        remarks.append(meshed.fineness.describe())  # meshing was asked for cells of that size, and so does not tell
     surfaces = []
     for level in shape.levels:
         surface = mesh

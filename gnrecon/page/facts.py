@@ -119,6 +119,10 @@ def surface(report: Report) -> list[Fact]:
     if mesh["closed"]:
         facts.append(Fact("Volume", figure(mesh["volume"], 6), "file units³"))
     facts += [Fact(word.capitalize(), YES[mesh[word]]) for word in ("closed", "manifold", "oriented")]
+    if (report.get("fineness") or {}).get("chord_error") is not None:
+        fineness = report["fineness"]
+        cells = f"from the fitted surface, with {count(fineness['resolution'])} cells"
+        facts.append(Fact("Chord error", figure(fineness["chord_error"]), cells))
     if mesh.get("invented_area_share") is not None:
         facts.append(
             Fact("Without data", unsupported(report), f"beyond {figure(mesh['invented_beyond'])} of any point")

@@ -66,6 +66,23 @@ def test_a_finer_mesh_of_the_same_field(model: Path, folder: Path, tmp_path: Pat
     assert facts.faces > 2 * len(read_mesh(folder / "ring.obj").faces)
 
 
+def test_edges_and_errors_may_be_asked_for_with_units(model: Path, tmp_path: Path, command: CommandLine) -> None:
+    words = ("mesh", model, "--units", "cm", "-o")
+    coarse = command(*words, tmp_path / "coarse.ply", "--edge-length", "1mm")
+    assert coarse.returncode == 0, coarse.stderr
+    assert "cells along the box, edges are 0." in coarse.stderr
+    mesh = read_mesh(tmp_path / "coarse.ply")
+    sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
+    assert np.linalg.norm(sides, axis=2).mean() == pytest.approx(0.1, rel=0.1)
+    fine = command(*words, tmp_path / "fine.ply", "--edge-length", "1mm", "--max-error", "0.02mm")
+    assert fine.returncode == 0, fine.stderr
+    assert "99.9 % of face centres and edge midpoints lie within 0.0" in fine.stderr
+    assert len(read_mesh(tmp_path / "fine.ply").faces) > 2 * len(mesh.faces)
+    both = command(*words, tmp_path / "none.ply", "--edge-length", "1mm", "--resolution", 64)
+    assert both.returncode == ExitCode.USAGE
+    assert "only one of the two" in both.stderr
+
+
 def test_vertices_carry_their_distance_and_curvature(model: Path, tmp_path: Path, command: CommandLine) -> None:
     words = ("mesh", model, "--resolution", 32, "--quiet", "-o")
     assert command(*words, tmp_path / "a.ply", "--curvature").returncode == 0

@@ -89,6 +89,7 @@ def report(mesh: Mesh) -> dict[str, Any]:
             "guarantee": "closed, oriented 2-manifold",
         },
         "trim": None,
+        "fineness": {"resolution": 256, "edge_length": 0.5, "chord_error": 0.0125},
         "actions": ["Dropped 2 of 3 components."],
         "attributes": [{"name": "intensity", "origin": "weighted mean of the nearest points"}],
         "metrics": measure(mesh, mesh, samples=500).as_dict(),

@@ -99,6 +99,7 @@ def test_the_points_are_the_scan(text: str, mesh: Mesh) -> None:
         "fit 1 min 15 s 1.20 GB",
         "Genus 1",
         "needles 0.0 %",
+        "Chord error 0.0125 from the fitted surface, with 256 cells",
         "Without data 12.5 % beyond 0.220 of any point",
         "Hatched: 12.5 % of it, farther than 0.220 from every point.",
         "Held-out residuals",
