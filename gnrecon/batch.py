@@ -16,7 +16,7 @@ from rich.table import Table
 
 from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
-from gnrecon.io import READERS, WRITERS
+from gnrecon.io import READERS, WRITERS, extension_of
 
 SUMMARY = "summary.json"
 
@@ -95,7 +95,7 @@ def run_batch(
 def _scans(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"There is no folder {folder}.")
-    scans = sorted(path for path in folder.iterdir() if path.suffix.lower() in READERS and path.is_file())
+    scans = sorted(path for path in folder.iterdir() if extension_of(path) in READERS and path.is_file())
     if not scans:
         raise InputError(f"The folder {folder} holds no scan; extensions read are {', '.join(READERS)}.")
     return scans

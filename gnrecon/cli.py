@@ -39,6 +39,10 @@ app = typer.Typer(
 
 POINTS, FIT, MESH, OUTPUT = "Points", "Fit", "Mesh", "Output"
 
+Format = Annotated[
+    str | None,
+    typer.Option(help="How the scan is read, such as ply; by default as its extension says.", rich_help_panel=POINTS),
+]
 Fraction = Annotated[
     float | None, typer.Option(help="Share of the points to keep, above 0 and up to 1.", rich_help_panel=POINTS)
 ]
@@ -152,8 +156,15 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show a traceback on failur
 @app.command(DEFAULT_COMMAND)
 def reconstruct_command(
     context: typer.Context,
-    scan: Annotated[Path, typer.Argument(help="PLY, PCD, XYZ, PTS, TXT, CSV, OBJ, OFF or STL file.")],
+    scan: Annotated[
+        Path,
+        typer.Argument(
+            help="PLY, PCD, XYZ, PTS, TXT, CSV, LAS, LAZ, E57, PTX, VTK, VTP, OBJ, OFF, STL, glTF, GLB or 3MF file, "
+            "compressed by gzip or not; - for standard input."
+        ),
+    ],
     output: Output,
+    format: Format = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
     subsample: Subsample = "random",
@@ -225,7 +236,7 @@ def reconstruct_command(
         "uncertainty": uncertainty,
     }
     del debug  # read from the arguments by `main`, which handles failures
-    files = Files(scan, output, reference, report, preview, save, html, overwrite)
+    files = Files(scan, output, reference, report, preview, save, html, overwrite, format)
     raise SystemExit(run(files, options, command=context.obj, quiet=quiet, verbose=verbose))
 
 

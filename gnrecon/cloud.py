@@ -32,6 +32,8 @@ class PointCloud:
         Outward directions; not necessarily of unit length as read from a file.
     attributes : mapping of name to array of shape (N,) or (N, C)
         Whatever else the file carries for each point (colour, intensity, labels).
+    origins : array of shape (N, 3), optional
+        Where the scanner stood when it saw each point; rows of NaN where that is not known.
 
     Raises
     ------
@@ -42,6 +44,7 @@ class PointCloud:
     points: Float
     normals: Float | None = None
     attributes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    origins: Float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", _as_rows("points", self.points))
@@ -49,6 +52,10 @@ class PointCloud:
             object.__setattr__(self, "normals", _as_rows("normals", self.normals))
             if len(self.normals) != len(self.points):
                 raise InputError(f"{len(self.points)} points cannot go with {len(self.normals)} normals.")
+        if self.origins is not None:
+            object.__setattr__(self, "origins", _as_rows("origins", self.origins))
+            if len(self.origins) != len(self.points):
+                raise InputError(f"{len(self.points)} points cannot go with {len(self.origins)} origins.")
         for name, values in self.attributes.items():
             if len(values) != len(self.points):
                 raise InputError(f"{len(self.points)} points cannot go with {len(values)} values of {name!r}.")
@@ -62,6 +69,7 @@ class PointCloud:
             self.points[rows],
             None if self.normals is None else self.normals[rows],
             {name: values[rows] for name, values in self.attributes.items()},
+            None if self.origins is None else self.origins[rows],
         )
 
     def with_normals(self, normals: Float | None) -> PointCloud:

@@ -25,6 +25,8 @@ from gnrecon.system_packages import LIBRARIES, install_command, loading_fault, m
 
 PACKAGES = {
     "jinja2": "jinja2",
+    "laspy": "laspy",
+    "lazrs": "lazrs",
     "manifold3d": "manifold3d",
     "numpy": "numpy",
     "open3d": "open3d",

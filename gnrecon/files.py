@@ -7,6 +7,9 @@ from pathlib import Path
 
 from gnrecon.errors import InputError, OutputError, UsageError
 
+STANDARD_INPUT = Path("-")
+"""How standard input is named among the inputs."""
+
 
 def require_files(inputs: Sequence[Path], targets: Sequence[Path], overwrite: bool) -> None:
     """Refuse missing inputs, and targets that could not or must not be written.
@@ -21,7 +24,7 @@ def require_files(inputs: Sequence[Path], targets: Sequence[Path], overwrite: bo
         When a target exists and may not be overwritten, or its folder is missing.
     """
     for path in inputs:
-        if not path.exists():
+        if path != STANDARD_INPUT and not path.exists():
             raise InputError(f"There is no file {path}.")
     for index, target in enumerate(targets):
         if any(_same(target, other) for other in [*inputs, *targets[:index]]):

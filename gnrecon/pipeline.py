@@ -6,7 +6,7 @@ The way of the data: file -> cloud -> samples -> fitted field -> mesh -> report.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,6 +81,8 @@ class Reconstruction:
         Whether the fit was stopped early by Ctrl-C; the mesh then shows the best field until then.
     uncertainty : Uncertainty, optional
         Standard deviations of the surface, where they were asked for.
+    cloud : PointCloud, optional
+        The scan as it was read.
     """
 
     mesh: Mesh
@@ -89,6 +91,7 @@ class Reconstruction:
     metrics: Metrics | None = None
     interrupted: bool = False
     uncertainty: Uncertainty | None = None
+    cloud: PointCloud | None = None
 
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
@@ -121,6 +124,7 @@ def reconstruct(
     normals: npt.ArrayLike | None = None,
     *,
     reference: Any = None,
+    format: str | None = None,
     progress: Progress | None = None,
     **options: Any,
 ) -> Reconstruction:
@@ -134,6 +138,8 @@ def reconstruct(
         Outward normals that go with an array of points.
     reference : path, Mesh or PointCloud, optional
         Truth to measure the mesh against.
+    format : str, optional
+        Extension that says how the scan's file is read, such as ``"ply"``; by default its own.
     progress : Progress, optional
         Told of stages, steps and remarks; it may end the run by raising `gnrecon.Cancelled`.
     **options
@@ -147,7 +153,7 @@ def reconstruct(
     chosen = Options.of(**options)
     _require_device(chosen.device)
     with limited(chosen.threads):
-        return _run(source, normals, reference, progress or Progress(), chosen)
+        return _run(lambda: _cloud(source, normals, format), source, reference, progress or Progress(), chosen)
 
 
 @contextmanager
@@ -177,10 +183,12 @@ def limited(threads: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _run(source: Any, normals: Any, reference: Any, progress: Progress, options: Options) -> Reconstruction:
+def _run(
+    read: Callable[[], PointCloud], source: Any, reference: Any, progress: Progress, options: Options
+) -> Reconstruction:
     stages = Stages(progress.stage, options.device)
     with stages("read"):
-        cloud = _cloud(source, normals)
+        cloud = read()
         progress.advance(0.5)
         truth = _reference(reference)
     wanted(cloud, options.attributes)  # a misspelt name is refused before the work
@@ -224,7 +232,7 @@ def _run(source: Any, normals: Any, reference: Any, progress: Progress, options:
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
     surface = _surface(facts, unsupported, trimming) | {"fineness": meshed.fineness.as_dict()}
     report = _report(source, options, stages, counts, solution, residuals, sdf, surface, actions, attributes, metrics)
-    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty)
+    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty, cloud)
 
 
 def _require_device(device: str) -> None:
@@ -242,9 +250,9 @@ def _require_device(device: str) -> None:
         raise UsageError("The device is 'cuda', but torch sees no CUDA GPU; `gnrecon doctor` tells what it sees.")
 
 
-def _cloud(source: Any, normals: Any) -> PointCloud:
+def _cloud(source: Any, normals: Any, format: str | None) -> PointCloud:
     if isinstance(source, str | Path):
-        return read_cloud(source)
+        return read_cloud(source, format)
     return as_cloud(source, normals)
 
 

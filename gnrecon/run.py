@@ -16,7 +16,7 @@ from gnrecon.atomic import atomic_write
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import render_sheet
 from gnrecon.files import require_files
-from gnrecon.io import check_writable, read_cloud
+from gnrecon.io import check_writable
 from gnrecon.optim import Record
 from gnrecon.page import page_text
 from gnrecon.pipeline import Progress as PipelineProgress
@@ -51,6 +51,7 @@ class Files:
     model: Path | None = None
     html: Path | None = None
     overwrite: bool = False
+    format: str | None = None
 
     def check(self) -> None:
         """Refuse before any work what would fail after it.
@@ -89,7 +90,7 @@ def run(
     files.check()
     console = Console(stderr=True, quiet=quiet)
     with shown(console, verbose) as progress:
-        result = reconstruct(files.scan, reference=files.reference, progress=progress, **options)
+        result = reconstruct(files.scan, reference=files.reference, format=files.format, progress=progress, **options)
         result.report["command"] = command
         progress.stage("write")
         warnings = _write(files, result)
@@ -106,7 +107,6 @@ def run(
 
 def _write(files: Files, result: Reconstruction) -> list[str]:
     """Write the mesh, and with it what was asked for besides; all of them or none."""
-    cloud = None if files.preview is None and files.html is None else read_cloud(files.scan)
     with ExitStack() as stack:
         # The side files are complete under their temporary names before the mesh receives its own.
         if files.report is not None:
@@ -114,13 +114,13 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
             report.write_text(json.dumps(result.report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         if files.preview is not None:
             picture = stack.enter_context(atomic_write(files.preview, files.overwrite))
-            render_sheet(result.mesh, picture, points=cloud)
+            render_sheet(result.mesh, picture, points=result.cloud)
         if files.model is not None:
             model = stack.enter_context(atomic_write(files.model, files.overwrite))
             result.sdf.save(model, overwrite=True)
         if files.html is not None:
             page = stack.enter_context(atomic_write(files.html, files.overwrite))
-            page.write_text(page_text(result.report, result.mesh, cloud), encoding="utf-8")
+            page.write_text(page_text(result.report, result.mesh, result.cloud), encoding="utf-8")
         return result.save(files.output, files.overwrite)
 
 

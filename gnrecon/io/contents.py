@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,6 +41,7 @@ class Contents:
     faces : integer array of shape (F, 3); empty for a bare cloud
     attributes : mapping of name to array of N rows
     unread : what else the file holds, in words such as ``"texture coordinates"``
+    origins : array of shape (N, 3), optional, where the scanner stood for each point; NaN where that is not known
     """
 
     points: Float
@@ -48,6 +49,7 @@ class Contents:
     faces: Int = field(default_factory=no_faces)
     attributes: Columns = field(default_factory=dict)
     unread: tuple[str, ...] = ()
+    origins: Float | None = None
 
 
 def _take(columns: dict[str, npt.NDArray[np.generic]], choices: tuple[tuple[str, ...], ...]) -> Columns | None:
@@ -81,4 +83,44 @@ def from_columns(columns: Columns, faces: Int | None = None) -> Contents:
         None if normal is None else np.column_stack([values.astype(np.float64) for values in normal.values()]),
         no_faces() if faces is None else faces,
         rest,
+    )
+
+
+def joined(pieces: Sequence[Contents]) -> Contents:
+    """Return the contents of all pieces, in their order, as one.
+
+    Normals and attributes are kept where all pieces have them in the same shape; which ones are not is told by
+    `Contents.unread`. Scan origins that only some pieces have are NaN for the others.
+    """
+    if len(pieces) == 1:
+        return pieces[0]
+    starts = np.cumsum([0, *(len(piece.points) for piece in pieces[:-1])])
+    normals = [piece.normals for piece in pieces if piece.normals is not None]
+    names = dict.fromkeys(name for piece in pieces for name in piece.attributes)
+    shared = {name: values for name in names if (values := _shared(name, pieces)) is not None}
+    lost = [f"{name} of some of the scans" for name in names if name not in shared]
+    if 0 < len(normals) < len(pieces):
+        lost.append("normals of some of the scans")
+    return Contents(
+        np.concatenate([piece.points for piece in pieces]),
+        np.concatenate(normals) if len(normals) == len(pieces) else None,
+        np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]),
+        {name: np.concatenate(values) for name, values in shared.items()},
+        tuple(dict.fromkeys([*(words for piece in pieces for words in piece.unread), *lost])),
+        _origins(pieces),
+    )
+
+
+def _shared(name: str, pieces: Sequence[Contents]) -> list[npt.NDArray[np.generic]] | None:
+    """The values of an attribute in each piece, or None where they are missing or of differing shape."""
+    values = [piece.attributes[name] for piece in pieces if name in piece.attributes]
+    same = len(values) == len(pieces) and len({one.shape[1:] for one in values}) == 1
+    return values if same else None
+
+
+def _origins(pieces: Sequence[Contents]) -> Float | None:
+    if all(piece.origins is None for piece in pieces):
+        return None
+    return np.concatenate(
+        [np.full((len(piece.points), 3), np.nan) if piece.origins is None else piece.origins for piece in pieces]
     )

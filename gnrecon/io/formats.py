@@ -9,14 +9,20 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.io.contents import Contents
+from gnrecon.io.e57 import read_e57
 from gnrecon.io.glb import fits_glb, read_glb, write_glb
+from gnrecon.io.gltf import read_gltf
+from gnrecon.io.las import read_las
 from gnrecon.io.obj import read_obj, write_obj
 from gnrecon.io.off import read_off, write_off
 from gnrecon.io.pcd import read_pcd
 from gnrecon.io.ply import read_ply, write_ply
+from gnrecon.io.ptx import read_ptx
 from gnrecon.io.stl import read_stl, write_stl
 from gnrecon.io.threemf import write_3mf
 from gnrecon.io.threemf_model import read_3mf
+from gnrecon.io.vtk import read_vtk
+from gnrecon.io.vtp import read_vtp
 from gnrecon.io.xyz import read_xyz, write_xyz
 from gnrecon.mesh import Mesh
 
@@ -31,7 +37,14 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".off": read_off,
     ".stl": read_stl,
     ".glb": read_glb,
+    ".gltf": read_gltf,
     ".3mf": read_3mf,
+    ".las": read_las,
+    ".laz": read_las,
+    ".e57": read_e57,
+    ".ptx": read_ptx,
+    ".vtk": read_vtk,
+    ".vtp": read_vtp,
 }
 
 WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
@@ -82,6 +95,9 @@ HOLDS: dict[str, Callable[[str, Values], bool]] = {
 ZIPPED = (".3mf",)
 """Formats that are ZIP archives of their parts."""
 
+SAME_BEGINNING = ({".las", ".laz"},)
+"""Formats that begin alike and have one reader."""
+
 # How files begin, to name what a wrongly named file really is.
 SIGNATURES: dict[bytes, str] = {
     b"ply\n": ".ply",
@@ -97,7 +113,7 @@ SIGNATURES: dict[bytes, str] = {
     b"\xff\xd8\xff": "JPEG image",
     b"%PDF": "PDF document",
     b"PK\x03\x04": "ZIP archive",
-    b"\x1f\x8b": "gzip archive",
-    b"LASF": "LAS or LAZ",
-    b"ASTM-E57": "E57",
+    b"LASF": ".las",
+    b"ASTM-E57": ".e57",
+    b"# vtk DataFile": ".vtk",
 }

@@ -1,4 +1,4 @@
-"""GLB, binary glTF, by trimesh.
+"""GLB, binary glTF, by trimesh; glTF in text is turned into the same by `gltf.py`.
 
 glTF stores float32. Positions are therefore stored relative to the middle of the mesh's bounding box, and the node's
 matrix, whose numbers are JSON text with all digits, carries the offset.
@@ -6,6 +6,9 @@ matrix, whose numbers are JSON text with all digits, carries the offset.
 Colours of vertices are linear light in glTF, which 8 bits would make too coarse in the dark: they are written, and
 read, as the 16-bit numbers that the format also allows. trimesh knows 8 bits only, so it handles them as an attribute
 of another name, and the file's JSON is renamed behind it. All other attributes are float32, named with an underscore.
+
+Of bare points trimesh gives the positions alone. They are shown to it as triangles therefore, of which one names the
+first point three times, by an accessor without a buffer, whose values are zero by the specification.
 """
 
 from __future__ import annotations
@@ -19,13 +22,17 @@ import numpy.typing as npt
 
 from gnrecon.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.errors import InputError
-from gnrecon.io.contents import Contents, no_faces
+from gnrecon.io.contents import Contents
+from gnrecon.io.foreign import parsing
 from gnrecon.mesh import Mesh
 
 _COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"
 """The name of colours in glTF, and the one under which trimesh takes them for any attribute."""
 
 _JSON = b"JSON"
+_POINTS, _TRIANGLES, _UNSIGNED_BYTE = 0, 4, 5121
+_NO_TRIANGLE = [[0, 0, 0]]
+"""The faces of what are points only."""
 
 _UNREAD = {
     b"TEXCOORD_0": "texture coordinates",
@@ -48,7 +55,7 @@ def fits_glb(name: str, values: npt.NDArray[np.generic]) -> bool:
 
 
 def read_glb(path: Path) -> Contents:
-    """Read all meshes of the scene into one, each moved by its node's matrix.
+    """Read all meshes and clouds of the scene into one, each moved by its node's matrix.
 
     Attributes are kept where all meshes have them, with their names in lower case.
 
@@ -57,34 +64,40 @@ def read_glb(path: Path) -> Contents:
     InputError
         When the file is malformed or holds no vertices.
     """
+    return read_glb_bytes(path.read_bytes())
+
+
+def read_glb_bytes(data: bytes) -> Contents:
+    """Read the bytes of a GLB file, as `read_glb` does."""
     import trimesh
 
-    try:
-        file = trimesh.util.wrap_as_stream(_renamed(path.read_bytes()))
+    with parsing("GLB"):
+        file = trimesh.util.wrap_as_stream(_renamed(data))
         scene = trimesh.load_scene(file, file_type="glb", process=False, skip_materials=True)
-    # A malformed file surfaces as whatever the parser of JSON and buffers happens to raise.
-    except Exception as error:
-        raise InputError(f"the file is not a well-formed GLB ({type(error).__name__}: {error}).") from None
+        return _collected(scene, _unread(data))
+
+
+def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
+    """All that a scene shows, in one."""
     vertices, normals, faces, attributes, start = [], [], [], [], 0
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         part = scene.geometry[name]
         vertices.append(np.asarray(part.vertices) @ matrix[:3, :3].T + matrix[:3, 3])
-        triangles = np.asarray(part.faces, np.int64) if hasattr(part, "faces") else no_faces()
+        triangles = np.asarray(part.faces, np.int64)
+        triangles = triangles[:0] if np.array_equal(triangles, _NO_TRIANGLE) else triangles
         # A mirroring matrix turns faces inside out, so their corners are reversed.
         faces.append((triangles if np.linalg.det(matrix[:3, :3]) > 0 else triangles[:, ::-1]) + start)
-        turned = np.asarray(getattr(part, "vertex_normals", np.zeros((len(part.vertices), 3))))
-        normals.append(turned @ np.linalg.inv(matrix[:3, :3]))
-        attributes.append(getattr(part, "vertex_attributes", {}))
+        normals.append(np.asarray(part.vertex_normals) @ np.linalg.inv(matrix[:3, :3]))
+        attributes.append(part.vertex_attributes)
         start += len(part.vertices)
     if not start:
         raise InputError("the file holds no vertices.")
     directions = np.concatenate(normals)
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = np.divide(directions, lengths, out=np.zeros_like(directions), where=lengths > 0)
-    all_faces = np.concatenate(faces)
-    given = directions if len(all_faces) else None
-    return Contents(np.concatenate(vertices), given, all_faces, _attributes(attributes), _unread(path.read_bytes()))
+    given = directions if directions.any() else None
+    return Contents(np.concatenate(vertices), given, np.concatenate(faces), _attributes(attributes), unread)
 
 
 def _unread(data: bytes) -> tuple[str, ...]:
@@ -94,19 +107,26 @@ def _unread(data: bytes) -> tuple[str, ...]:
 
 
 def _renamed(data: bytes) -> bytes:
-    """The file with colours under the name of any attribute, so that trimesh gives them as they are stored."""
+    """The file with colours under the name of any attribute, and points as triangles: what trimesh gives in full."""
     length = int.from_bytes(data[12:16], "little")
-    if data[16:20] != _JSON or _COLOR.encode() not in data[20 : 20 + length]:
+    if data[16:20] != _JSON:
         return data
     tree = json.loads(data[20 : 20 + length])
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
             _rename(primitive["attributes"], _COLOR, _HIDDEN)
+            if primitive.get("mode") == _POINTS:
+                tree["accessors"].append({"componentType": _UNSIGNED_BYTE, "type": "SCALAR", "count": 3})
+                primitive.update(mode=_TRIANGLES, indices=len(tree["accessors"]) - 1)
+    return packed(tree, data[20 + length :])
+
+
+def packed(tree: dict[str, Any], rest: bytes) -> bytes:
+    """Return a GLB file of its JSON and of the chunks that follow it."""
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
     size = (20 + len(text) + len(rest)).to_bytes(4, "little")
-    return data[:8] + size + len(text).to_bytes(4, "little") + _JSON + text + rest
+    return b"glTF\x02\0\0\0" + size + len(text).to_bytes(4, "little") + _JSON + text + rest
 
 
 def _rename(names: dict[str, Any], old: str, new: str) -> None:

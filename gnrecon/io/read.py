@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError, MemoryLimitError, UsageError
+from gnrecon.files import STANDARD_INPUT
 from gnrecon.io.contents import Contents
-from gnrecon.io.formats import READERS, SIGNATURES, ZIPPED
+from gnrecon.io.formats import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED
+from gnrecon.io.unpack import extension_of, plain_file
 from gnrecon.mesh import Mesh
 
 
@@ -20,7 +24,7 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
 
     Parameters
     ----------
-    path : file to read
+    path : file to read, compressed by gzip or not; ``-`` for standard input
     format : extension that says how to read it, such as ``"ply"``; by default the file's own
 
     Raises
@@ -28,13 +32,13 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     InputError
         When the file is missing, empty, malformed, or of no supported kind.
     UsageError
-        When `format` is no supported one.
+        When `format` is no supported one, or standard input is read without one.
     """
-    contents = _read(Path(path), format)
+    contents = read_contents(Path(path), format)
     normals = contents.normals
     if normals is None and len(contents.faces):
         normals = _mesh(contents, Path(path)).vertex_normals()
-    return PointCloud(contents.points, normals, contents.attributes)
+    return PointCloud(contents.points, normals, contents.attributes, contents.origins)
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -45,7 +49,7 @@ def read_mesh(path: str | Path) -> Mesh:
     InputError
         As `read_cloud` does, and when the file holds no faces.
     """
-    contents = _read(Path(path), None)
+    contents = read_contents(Path(path), None)
     if not len(contents.faces):
         raise InputError(f"{path}: expected a mesh, but the file holds {len(contents.points)} points and no faces.")
     return _mesh(contents, Path(path))
@@ -70,10 +74,10 @@ def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
     InputError
         As `read_cloud` does.
     """
-    contents = _read(Path(path), None)
+    contents = read_contents(Path(path), None)
     if len(contents.faces):
         return _mesh(contents, Path(path)), contents.unread
-    return PointCloud(contents.points, contents.normals, contents.attributes), contents.unread
+    return PointCloud(contents.points, contents.normals, contents.attributes, contents.origins), contents.unread
 
 
 def _mesh(contents: Contents, path: Path) -> Mesh:
@@ -85,50 +89,71 @@ def _mesh(contents: Contents, path: Path) -> Mesh:
         raise InputError(f"{path}: {error}") from None
 
 
-def _read(path: Path, format: str | None) -> Contents:
-    extension = path.suffix.lower() if format is None else f".{format.lower().lstrip('.')}"
+def extension_for(path: Path, format: str | None) -> str:
+    """Return the extension, with its dot, that says how a file is read.
+
+    Raises
+    ------
+    UsageError
+        When `format` is no supported one, or standard input is read without one.
+    """
     supported = ", ".join(suffix[1:] for suffix in READERS)
+    if format is None and path == STANDARD_INPUT:
+        raise UsageError(f"Standard input has no extension: say with --format how to read it, as one of {supported}.")
+    extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
     if format is not None and extension not in READERS:
         raise UsageError(f"The format {format!r} is not supported; expected one of {supported}.")
-    _check_file(path, extension)
-    if extension not in READERS:
-        raise InputError(f"{path}: the extension {extension!r} is not supported; expected one of {supported}.")
-    try:
-        contents = READERS[extension](path)
+    return extension
+
+
+def read_contents(path: Path, format: str | None) -> Contents:
+    """Read all that a file holds; the arguments and errors are those of `read_cloud`."""
+    extension = extension_for(path, format)
+    with reading(path), plain_file(path, extension) as file:
+        _check_file(file, extension)
+        contents = READERS[extension](file)
         if not len(contents.points):
             raise InputError("the file holds no points.")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except MemoryError:
-        raise MemoryLimitError(f"{path}: the file holds more than fits into this machine's memory.") from None
-    except OSError as error:
-        raise InputError(f"{path}: the file cannot be read: {error.strerror or error}.") from None
-    # Damaged numbers can break a parser in ways that its own checks do not foresee; the user needs one sentence.
-    except (ValueError, OverflowError, IndexError, KeyError, RuntimeError) as error:
-        raise InputError(f"{path}: the file is malformed ({error}).") from None
     return contents
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn every failure of reading a file into one sentence that begins with its name."""
+    name = "standard input" if path == STANDARD_INPUT else path
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    except MemoryLimitError:
+        raise
+    except MemoryError:
+        raise MemoryLimitError(f"{name}: the file holds more than fits into this machine's memory.") from None
+    except OSError as error:
+        raise InputError(f"{name}: the file cannot be read: {error.strerror or error}.") from None
+    except UsageError:
+        raise
+    # Damaged numbers can break a parser in ways that its own checks do not foresee; the user needs one sentence.
+    except (ValueError, OverflowError, IndexError, KeyError, TypeError, RuntimeError) as error:
+        raise InputError(f"{name}: the file is malformed ({error}).") from None
 
 
 def _check_file(path: Path, extension: str) -> None:
     """Refuse what is no file, is empty, or begins as a file of another kind."""
     if not path.exists():
-        raise InputError(f"{path}: there is no such file.")
+        raise InputError("there is no such file.")
     if not path.is_file():
-        raise InputError(f"{path}: expected a file, but this is a folder or a device.")
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError as error:
-        raise InputError(f"{path}: the file cannot be read: {error.strerror or error}.") from None
+        raise InputError("expected a file, but this is a folder or a device.")
+    with path.open("rb") as file:
+        head = file.read(16)
     if not head.strip():
-        raise InputError(f"{path}: the file is empty.")
+        raise InputError("the file is empty.")
+    if extension not in READERS:
+        supported = ", ".join(suffix[1:] for suffix in READERS)
+        raise InputError(f"the extension {extension!r} is not supported; expected one of {supported}.")
     kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
-    if kind == "ZIP archive" and extension in ZIPPED:
-        return
-    if kind == extension or extension not in READERS:
+    if kind == extension or {kind, extension} in SAME_BEGINNING or (kind == "ZIP archive" and extension in ZIPPED):
         return
     if kind in READERS:
-        raise InputError(
-            f"{path}: the file holds {kind[1:].upper()} data; rename it or give its format as {kind[1:]!r}."
-        )
-    raise InputError(f"{path}: expected {extension[1:].upper()} data, but the file is a {kind} file.")
+        raise InputError(f"the file holds {kind[1:].upper()} data; rename it or give its format as {kind[1:]!r}.")
+    raise InputError(f"expected {extension[1:].upper()} data, but the file is a {kind} file.")

@@ -79,7 +79,8 @@ MALFORMED: list[tuple[str, str | bytes, str]] = [
     ("a.stl", "hello, this is some text\n", "STL"),
     ("a.glb", b"glTF\x02\0\0\0" + bytes(100), "GLB"),
     ("a.glb", "hello, this is some text\n", "GLB"),
-    ("a.las", "LASF", "extension '.las' is not supported; expected one of ply, pcd, xyz"),
+    ("a.las", "LASF", "header of a LAS file"),
+    ("a.docx", FOUR, "extension '.docx' is not supported; expected one of ply, pcd, xyz"),
     ("scan", FOUR, "extension '' is not supported"),
 ]
 
