@@ -60,6 +60,9 @@ class Sources:
             return None
 
 
+GRID = ("row", "column")
+"""Places in a scanner's grid: a surface has none, so they are carried over only where they are asked for by name."""
+
 UNASKED = ("distance", "error")
 """What vertices carry without being asked to, and without a scan that holds it."""
 
@@ -91,7 +94,7 @@ def wanted(cloud: PointCloud, attributes: str) -> list[str]:
     """
     offered = list(dict.fromkeys(["distance", *cloud.attributes]))
     if attributes in ("auto", "none"):
-        return offered if attributes == "auto" else []
+        return [name for name in offered if name not in GRID] if attributes == "auto" else []
     names = [name.strip() for name in attributes.split(",")]
     for name in names:
         if name not in offered:

@@ -158,3 +158,9 @@ def test_a_sigma_that_cannot_be_had_is_a_sentence(scan: PointCloud, monkeypatch:
     found = reconstruct(scan, progress=told, uncertainty=True, **FAST)
     assert "sigma" not in found.mesh.attributes
     assert any(remark.startswith("There is no sigma") for remark in told.remarks)
+
+
+def test_places_in_a_grid_are_carried_only_when_asked_for(scan: PointCloud) -> None:
+    gridded = PointCloud(scan.points, scan.normals, {"row": np.arange(len(scan)), "intensity": scan.points[:, 0]})
+    assert wanted(gridded, "auto") == ["distance", "intensity"]
+    assert wanted(gridded, "row") == ["row"]

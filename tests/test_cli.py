@@ -6,6 +6,7 @@ import json
 import shlex
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -337,3 +338,16 @@ def test_version_and_help() -> None:
     assert details.returncode == 0
     for option in ("--output", "--fraction", "--widths", "--resolution", "--reference", "--overwrite", "--debug"):
         assert option in details.stdout
+
+
+def test_a_scan_from_standard_input_makes_all_files(scan: Path, out: Path) -> None:
+    command = [sys.executable, "-m", "gnrecon", "-", "--format", "ply", "-o", str(out / "a.ply"), *FAST_WORDS]
+    command += ["--html", str(out / "a.html")]
+    with scan.open("rb") as file:
+        done = subprocess.run(command, stdin=file, capture_output=True, text=True, check=False)
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert names(out) == ["a.html", "a.ply"]
+
+
+def test_standard_input_needs_a_format(here: Here, out: Path) -> None:
+    assert_refused(here("-", "-o", out / "a.ply"), ExitCode.USAGE, "say with --format how to read it")
