@@ -43,6 +43,18 @@ Format = Annotated[
     str | None,
     typer.Option(help="How the scan is read, such as ply; by default as its extension says.", rich_help_panel=POINTS),
 ]
+ReadPoints = Annotated[
+    int,
+    typer.Option(
+        help="Most points to keep while reading; larger scans are thinned by voxels on the way.", rich_help_panel=POINTS
+    ),
+]
+Units = Annotated[
+    str | None,
+    typer.Option(
+        help="The scan's own unit (um, mm, cm, m, km, in, ft), for lengths with a suffix.", rich_help_panel=POINTS
+    ),
+]
 Fraction = Annotated[
     float | None, typer.Option(help="Share of the points to keep, above 0 and up to 1.", rich_help_panel=POINTS)
 ]
@@ -156,15 +168,18 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show a traceback on failur
 @app.command(DEFAULT_COMMAND)
 def reconstruct_command(
     context: typer.Context,
-    scan: Annotated[
-        Path,
+    scans: Annotated[
+        list[Path],
         typer.Argument(
-            help="PLY, PCD, XYZ, PTS, TXT, CSV, LAS, LAZ, E57, PTX, VTK, VTP, OBJ, OFF, STL, glTF, GLB or 3MF file, "
-            "compressed by gzip or not; - for standard input."
+            help="One or more scans of an object, merged after the poses that they hold: PLY, PCD, XYZ, PTS, TXT, CSV, "
+            "LAS, LAZ, E57, PTX, VTK, VTP, OBJ, OFF, STL, glTF, GLB or 3MF, compressed by gzip or not; CONF names "
+            "scans with their poses; - is standard input."
         ),
     ],
     output: Output,
     format: Format = None,
+    read_points: ReadPoints = 2_000_000,
+    units: Units = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
     subsample: Subsample = "random",
@@ -214,6 +229,8 @@ def reconstruct_command(
     from gnrecon.run import Files, run
 
     options = {
+        "read_points": read_points,
+        "units": units,
         "fraction": fraction,
         "max_points": max_points,
         "subsample": subsample,
@@ -236,7 +253,7 @@ def reconstruct_command(
         "uncertainty": uncertainty,
     }
     del debug  # read from the arguments by `main`, which handles failures
-    files = Files(scan, output, reference, report, preview, save, html, overwrite, format)
+    files = Files(tuple(scans), output, reference, report, preview, save, html, overwrite, format)
     raise SystemExit(run(files, options, command=context.obj, quiet=quiet, verbose=verbose))
 
 
@@ -248,6 +265,8 @@ def batch_command(
         str,
         typer.Option("--format", help="Format of the meshes: obj, ply, stl, off, glb or 3mf.", rich_help_panel=OUTPUT),
     ] = "obj",
+    read_points: ReadPoints = 2_000_000,
+    units: Units = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
     subsample: Subsample = "random",
@@ -286,6 +305,8 @@ def batch_command(
     from gnrecon.batch import run_batch
 
     arguments = {
+        "--read-points": read_points,
+        "--units": units,
         "--fraction": fraction,
         "--max-points": max_points,
         "--subsample": subsample,

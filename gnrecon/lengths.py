@@ -11,6 +11,8 @@ METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254,
 
 _LENGTH = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", re.IGNORECASE)
 
+_SPACINGS = re.compile(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*s\s*", re.IGNORECASE)
+
 
 def parse_length(text: str, units: str | None) -> float:
     """Return a length in the file's unit.
@@ -38,6 +40,27 @@ def parse_length(text: str, units: str | None) -> float:
     if units is None:
         raise UsageError(f"{text!r} needs the file's own unit to be converted: add --units, such as --units mm.")
     return float(match[1]) * (METRES[suffix] / METRES[units])
+
+
+def parse_reach(text: str, spacing: float, units: str | None) -> float:
+    """Return a positive distance in the file's unit, which may be given in spacings of the points.
+
+    Parameters
+    ----------
+    text : such as ``2.5``, ``2mm``, or ``3s`` for three spacings
+    spacing : of the points, in the file's unit
+    units : as of `parse_length`
+
+    Raises
+    ------
+    UsageError
+        When it is no positive length, or none that can be converted.
+    """
+    match = _SPACINGS.fullmatch(text)
+    reach = float(match[1]) * spacing if match else parse_length(text, units)
+    if not 0 < reach < math.inf:
+        raise UsageError(f"{text!r} is not a positive distance such as 2.5, 2mm or 3s (spacings).")
+    return reach
 
 
 def parse_box(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -11,12 +10,11 @@ from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.options import FitOptions
+from gnrecon.io import MOST_POINTS
+from gnrecon.lengths import METRES, parse_reach
 
 RESOLUTION = 256
 """Cells where nothing else was asked for."""
-
-_REACH = re.compile(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(s?)\s*", re.IGNORECASE)
-"""A distance, in file units or followed by an s in spacings of the points."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +23,11 @@ class Options:
 
     Parameters
     ----------
+    read_points : int
+        Most points to keep of a scan while it is read: of a larger one, the first point in each of as many equal cubes
+        stays, and memory does not grow with the file.
+    units : str, optional
+        The scan's own unit, a name of `gnrecon.lengths.METRES`; with it, lengths may have other units, as in ``"2mm"``.
     fraction : float in (0, 1], optional
         Share of the points to keep.
     max_points : int, optional
@@ -49,8 +52,8 @@ class Options:
         Distance from the field's surface that 99.9 % of face centres and edge midpoints are to stay within; the mesh is
         made finer until they do, up to 1,024 cells.
     trim : float or str, optional
-        Distance from the nearest point beyond which the surface is cut off, in file units, or in spacings of the
-        points as in ``"3s"``; the mesh is then open. By default nothing is cut.
+        Distance from the nearest point beyond which the surface is cut off, in file units, in another unit as in
+        ``"2mm"``, or in spacings of the points as in ``"3s"``; the mesh is then open. By default nothing is cut.
     widths, steps, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
@@ -62,6 +65,8 @@ class Options:
         When a name is unknown or a value out of its range.
     """
 
+    read_points: int = MOST_POINTS
+    units: str | None = None
     fraction: float | None = None
     max_points: int | None = None
     subsample: str = "random"
@@ -89,6 +94,10 @@ class Options:
         self._check_fineness()
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
+        if self.read_points < 1:
+            raise UsageError(f"The number of points to keep while reading must be positive, not {self.read_points}.")
+        if self.units is not None and self.units not in METRES:
+            raise UsageError(f"The scan's unit must be one of {', '.join(METRES)}, not {self.units!r}.")
         if self.seed < 0:
             raise UsageError(f"The seed must not be negative, not {self.seed}.")
         if self.widths is not None and not isinstance(self.widths, list | tuple):
@@ -137,11 +146,7 @@ class Options:
         """
         if self.trim is None:
             return None
-        match = _REACH.fullmatch(str(self.trim))
-        reach = float(match[1]) if match else 0.0
-        if match is None or not 0 < reach < math.inf:
-            raise UsageError(f"The trim must be a positive distance, such as 2.5 or 3s (spacings), not {self.trim!r}.")
-        return reach * spacing if match[2] else reach
+        return parse_reach(str(self.trim), spacing, self.units)
 
     def cells(self, bounds: Float) -> int:
         """Return the cells along the longest side of a box, of shape (2, 3) in file units, to begin with.

@@ -35,7 +35,7 @@ from gnrecon.export import (
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.ingest import IngestCounts, prepare
-from gnrecon.io import as_cloud, read_cloud, read_reference, to_open3d, to_trimesh, write_mesh
+from gnrecon.io import Reading, as_cloud, read_reference, read_scans, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
@@ -132,8 +132,8 @@ def reconstruct(
 
     Parameters
     ----------
-    source : path, array of shape (N, 3) or (N, 6), PointCloud, open3d or trimesh point cloud
-        Points, in any unit, with or without normals.
+    source : path, list of paths, array of shape (N, 3) or (N, 6), PointCloud, open3d or trimesh point cloud
+        Points, in any unit, with or without normals. Several files are merged, after the poses that they hold.
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
     reference : path, Mesh or PointCloud, optional
@@ -153,7 +153,13 @@ def reconstruct(
     chosen = Options.of(**options)
     _require_device(chosen.device)
     with limited(chosen.threads):
-        return _run(lambda: _cloud(source, normals, format), source, reference, progress or Progress(), chosen)
+        return _run(
+            lambda: read_source(source, normals, format, chosen.read_points),
+            source,
+            reference,
+            progress or Progress(),
+            chosen,
+        )
 
 
 @contextmanager
@@ -184,18 +190,18 @@ def limited(threads: int | None) -> Iterator[None]:
 
 
 def _run(
-    read: Callable[[], PointCloud], source: Any, reference: Any, progress: Progress, options: Options
+    read: Callable[[], tuple[PointCloud, Reading]], source: Any, reference: Any, progress: Progress, options: Options
 ) -> Reconstruction:
     stages = Stages(progress.stage, options.device)
     with stages("read"):
-        cloud = read()
+        cloud, reading = read()
         progress.advance(0.5)
         truth = _reference(reference)
     wanted(cloud, options.attributes)  # a misspelt name is refused before the work
     with stages("ingest"):
         samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
     options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
-    for sentence in counts.remarks():
+    for sentence in [*reading.remarks(), *counts.remarks()]:
         progress.remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
@@ -230,7 +236,10 @@ def _run(
             if options.attributes != "none":
                 error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
-    surface = _surface(facts, unsupported, trimming) | {"fineness": meshed.fineness.as_dict()}
+    surface = _surface(facts, unsupported, trimming) | {
+        "reading": reading.as_dict(),
+        "fineness": meshed.fineness.as_dict(),
+    }
     report = _report(source, options, stages, counts, solution, residuals, sdf, surface, actions, attributes, metrics)
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty, cloud)
 
@@ -250,10 +259,31 @@ def _require_device(device: str) -> None:
         raise UsageError("The device is 'cuda', but torch sees no CUDA GPU; `gnrecon doctor` tells what it sees.")
 
 
-def _cloud(source: Any, normals: Any, format: str | None) -> PointCloud:
+def read_source(source: Any, normals: Any, format: str | None, most: int) -> tuple[PointCloud, Reading]:
+    """Return the cloud that `reconstruct` makes of its source, and what was read; `most` bounds what is kept of files.
+
+    Raises
+    ------
+    InputError, UsageError
+        When it cannot be read, or is nothing that holds points.
+    """
+    if files := _files(source):
+        return read_scans(files, format, most)
+    cloud = as_cloud(source, normals)
+    return cloud, Reading((), len(cloud), len(cloud))
+
+
+def _files(source: Any) -> list[str | Path]:
+    """The paths that a source consists of; none where it is something else."""
     if isinstance(source, str | Path):
-        return read_cloud(source, format)
-    return as_cloud(source, normals)
+        return [source]
+    paths = list(source) if isinstance(source, list | tuple) else []
+    return paths if all(isinstance(path, str | Path) for path in paths) else []
+
+
+def _named(source: Any) -> str:
+    """The source for the report: its files, or its type."""
+    return ", ".join(map(str, _files(source))) or type(source).__name__
 
 
 def _reference(reference: Any) -> Mesh | PointCloud | None:
@@ -296,7 +326,7 @@ def _report(
     found = {
         "schema_version": SCHEMA_VERSION,
         "command": None,
-        "input": str(source) if isinstance(source, str | Path) else type(source).__name__,
+        "input": _named(source),
         "options": options.as_dict(),
         "versions": versions(),
         "ingest": counts.as_dict(),

@@ -43,7 +43,7 @@ STAGES = {
 class Files:
     """What one run reads and writes."""
 
-    scan: Path
+    scans: tuple[Path, ...]
     output: Path
     reference: Path | None = None
     report: Path | None = None
@@ -72,7 +72,7 @@ class Files:
             raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
-        inputs = [path for path in (self.scan, self.reference) if path is not None]
+        inputs = [path for path in (*self.scans, self.reference) if path is not None]
         asked = (self.output, self.report, self.preview, self.model, self.html)
         require_files(inputs, [path for path in asked if path is not None], self.overwrite)
 
@@ -90,7 +90,7 @@ def run(
     files.check()
     console = Console(stderr=True, quiet=quiet)
     with shown(console, verbose) as progress:
-        result = reconstruct(files.scan, reference=files.reference, format=files.format, progress=progress, **options)
+        result = reconstruct(files.scans, reference=files.reference, format=files.format, progress=progress, **options)
         result.report["command"] = command
         progress.stage("write")
         warnings = _write(files, result)

@@ -259,7 +259,7 @@ def test_an_interrupt_during_the_fit_keeps_the_best_mesh(out: Path, scan: Path) 
     assert json.loads((out / "report.json").read_text())["fit"]["interrupted"]
 
 
-@pytest.mark.parametrize("stage", ["read_cloud", "prepare"])
+@pytest.mark.parametrize("stage", ["read_scans", "prepare"])
 def test_an_interrupt_before_the_fit_writes_nothing(out: Path, scan: Path, stage: str) -> None:
     with started(scan, "-o", out / "mesh.obj", before=pause_at(f"gnrecon.pipeline.{stage}")) as process:
         wait_for(process, "paused")

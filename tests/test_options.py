@@ -29,12 +29,14 @@ from gnrecon.options import Options
         ({"search": "golden"}, "one of auto, damping, geodesic, line, not 'golden'"),
         ({"solver": "gauss"}, "solver must be one of auto, cholesky, qr, .*, not 'gauss'"),
         ({"optimiser": "sgd"}, "optimiser must be one of gn, adam, lbfgs, not 'sgd'"),
-        ({"trim": "3m"}, "trim must be a positive distance, such as 2.5 or 3s .spacings., not '3m'"),
-        ({"trim": 0}, "trim must be a positive distance, .* not 0"),
-        ({"trim": "-1s"}, "trim must be a positive distance"),
-        ({"trim": float("inf")}, "trim must be a positive distance"),
-        ({"trim": "1e999"}, "trim must be a positive distance"),
-        ({"detail": 3}, "no option 'detail'; the options are fraction, max_points"),
+        ({"trim": "3m"}, "'3m' needs the file's own unit"),
+        ({"trim": 0}, "'0' is not a positive distance such as 2.5, 2mm or 3s .spacings."),
+        ({"trim": "-1s"}, "unknown unit"),
+        ({"trim": float("inf")}, "is not a length"),
+        ({"trim": "1e999"}, "is not a length"),
+        ({"trim": "1s", "units": "parsec"}, "scan's unit must be one of um, mm, .* not 'parsec'"),
+        ({"read_points": 0}, "while reading must be positive, not 0"),
+        ({"detail": 3}, "no option 'detail'; the options are read_points, units, fraction"),
     ],
 )
 def test_values_out_of_range_and_unknown_names(values: dict[str, Any], sentence: str) -> None:
@@ -69,6 +71,7 @@ def test_trimming_is_in_file_units_or_spacings() -> None:
     reaches = {None: None, 2.5: 2.5, "2.5": 2.5, "3s": 0.6, " .5 S ": 0.1, 4: 4, "1e-1": 0.1}
     for given, expected in reaches.items():
         assert Options(trim=given).trim_at(spacing=0.2) == pytest.approx(expected)
+    assert Options(trim="2mm", units="m").trim_at(spacing=0.2) == pytest.approx(0.002)
 
 
 def test_options_are_plain_values() -> None:

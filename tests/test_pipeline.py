@@ -290,7 +290,7 @@ def test_a_limit_that_a_stage_names_itself_is_left_in_its_words(monkeypatch: pyt
     def exhausted(*_: object) -> None:
         raise MemoryLimitError("The file holds too much.")
 
-    monkeypatch.setattr("gnrecon.pipeline.read_cloud", exhausted)
+    monkeypatch.setattr("gnrecon.pipeline.read_scans", exhausted)
     with pytest.raises(MemoryLimitError, match=r"^The file holds too much\.$"):
         reconstruct("scan.ply")
 

@@ -4,13 +4,16 @@ from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
 from gnrecon.io.objects import as_cloud, to_open3d, to_trimesh
 from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
+from gnrecon.io.scans import MOST_POINTS, Reading, read_scans
 from gnrecon.io.unpack import extension_of
 from gnrecon.io.write import check_writable, holds, write_cloud, write_mesh
 
 __all__ = [
     "CLOUD_WRITERS",
+    "MOST_POINTS",
     "READERS",
     "WRITERS",
+    "Reading",
     "as_cloud",
     "atomic_write",
     "check_writable",
@@ -20,6 +23,7 @@ __all__ = [
     "read_cloud",
     "read_mesh",
     "read_reference",
+    "read_scans",
     "to_open3d",
     "to_trimesh",
     "write_cloud",

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.io.conf import read_conf
 from gnrecon.io.contents import Contents
 from gnrecon.io.e57 import read_e57
 from gnrecon.io.glb import fits_glb, read_glb, write_glb
@@ -45,6 +46,7 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".ptx": read_ptx,
     ".vtk": read_vtk,
     ".vtp": read_vtp,
+    ".conf": read_conf,
 }
 
 WRITERS: dict[str, Callable[[Mesh, Path], None]] = {

@@ -110,7 +110,7 @@ def read_contents(path: Path, format: str | None) -> Contents:
     """Read all that a file holds; the arguments and errors are those of `read_cloud`."""
     extension = extension_for(path, format)
     with reading(path), plain_file(path, extension) as file:
-        _check_file(file, extension)
+        check_file(file, extension)
         contents = READERS[extension](file)
         if not len(contents.points):
             raise InputError("the file holds no points.")
@@ -138,8 +138,14 @@ def reading(path: Path) -> Iterator[None]:
         raise InputError(f"{name}: the file is malformed ({error}).") from None
 
 
-def _check_file(path: Path, extension: str) -> None:
-    """Refuse what is no file, is empty, or begins as a file of another kind."""
+def check_file(path: Path, extension: str) -> None:
+    """Refuse what is no file, is empty, or begins as a file of another kind.
+
+    Raises
+    ------
+    InputError
+        With the sentence that says which.
+    """
     if not path.exists():
         raise InputError("there is no such file.")
     if not path.is_file():

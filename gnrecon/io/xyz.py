@@ -38,17 +38,27 @@ def read_xyz(path: Path) -> Contents:
     InputError
         When a word is no number, rows differ in length, a count line does not fit, or there are fewer than 3 columns.
     """
-    names, count, body = _split(read_text(path))
-    table = _table(body)
-    if count is not None and len(table) != count:
-        raise InputError(f"the first line declares {count} points, but {len(table)} follow.")
-    if table.shape[1] < 3:
-        raise InputError(f"expected at least 3 columns (x, y, z), but found {table.shape[1]}.")
-    if names is None:
-        names = _guess(table)
-    if len(names) != table.shape[1]:
-        raise InputError(f"the header names {len(names)} columns, but the rows hold {table.shape[1]}.")
-    return from_columns(dict(zip(names, table.T, strict=True)))
+    names, count, body = split(read_text(path))
+    rows = table(body)
+    if count is not None and len(rows) != count:
+        raise InputError(f"the first line declares {count} points, but {len(rows)} follow.")
+    return from_columns(dict(zip(named(names, rows), rows.T, strict=True)))
+
+
+def named(names: list[str] | None, rows: Float) -> list[str]:
+    """Return the names of the columns of a table of shape (N, C): those of its header, or else guessed ones.
+
+    Raises
+    ------
+    InputError
+        When they do not fit the table, or there are fewer than 3 columns.
+    """
+    if rows.shape[1] < 3:
+        raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1]}.")
+    names = _guess(rows) if names is None else names
+    if len(names) != rows.shape[1]:
+        raise InputError(f"the header names {len(names)} columns, but the rows hold {rows.shape[1]}.")
+    return names
 
 
 def _words(line: str) -> list[str]:
@@ -63,8 +73,14 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _split(text: str) -> tuple[list[str] | None, int | None, str]:
-    """Return the column names and the count that the file's head states, and the rows that follow them."""
+def split(text: str) -> tuple[list[str] | None, int | None, str]:
+    """Return the column names and the count that the file's head states, and the rows that follow them.
+
+    Raises
+    ------
+    InputError
+        When there is neither a row of numbers nor a header.
+    """
     names: list[str] | None = None
     start = 0
     for line in io.StringIO(text):
@@ -85,8 +101,14 @@ def _split(text: str) -> tuple[list[str] | None, int | None, str]:
     raise InputError("the file holds no points.")
 
 
-def _table(body: str) -> Float:
-    """Return the rows as an array of shape (N, columns)."""
+def table(body: str) -> Float:
+    """Return the rows as an array of shape (N, columns).
+
+    Raises
+    ------
+    InputError
+        When there are none, a word is no number, or rows differ in length.
+    """
     first = body.lstrip().partition("\n")[0]
     if ";" in first and "," in first:
         body = body.replace(",", ".")  # a spreadsheet of a country that writes decimal commas
@@ -115,19 +137,19 @@ def _is_unit(vectors: Float) -> bool:
     return len(lengths) > 0 and bool((np.abs(lengths - 1) < _UNIT_TOLERANCE).mean() >= _UNIT_SHARE)
 
 
-def _guess(table: Float) -> list[str]:
+def _guess(rows: Float) -> list[str]:
     """Return names for the columns of a table without a header."""
-    extra = table.shape[1] - 3
-    if extra >= 3 and _is_unit(table[:, 3:6]):
+    extra = rows.shape[1] - 3
+    if extra >= 3 and _is_unit(rows[:, 3:6]):
         rest = _COLOR if extra == 6 else ["intensity"] if extra == 4 else []
         names = [*_NORMAL, *rest]
-    elif extra == 6 and _is_unit(table[:, 6:9]):
+    elif extra == 6 and _is_unit(rows[:, 6:9]):
         names = [*_COLOR, *_NORMAL]
-    elif extra == 7 and _is_unit(table[:, 7:10]):
+    elif extra == 7 and _is_unit(rows[:, 7:10]):
         names = ["intensity", *_COLOR, *_NORMAL]
     else:
         names = {1: ["intensity"], 3: _COLOR, 4: ["intensity", *_COLOR]}.get(extra, [])
-    return ["x", "y", "z", *names, *(f"column_{i + 1}" for i in range(3 + len(names), table.shape[1]))]
+    return ["x", "y", "z", *names, *(f"column_{i + 1}" for i in range(3 + len(names), rows.shape[1]))]
 
 
 def write_xyz(cloud: Mesh, path: Path) -> None:
