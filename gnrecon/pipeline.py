@@ -326,6 +326,7 @@ def _report(
     found = {
         "schema_version": SCHEMA_VERSION,
         "command": None,
+        "origin": None,
         "input": _named(source),
         "options": options.as_dict(),
         "versions": versions(),

@@ -16,7 +16,7 @@ from gnrecon.atomic import atomic_write
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import render_sheet
 from gnrecon.files import require_files
-from gnrecon.io import check_writable
+from gnrecon.io import check_writable, written_origin
 from gnrecon.optim import Record
 from gnrecon.page import page_text
 from gnrecon.pipeline import Progress as PipelineProgress
@@ -107,6 +107,8 @@ def run(
 
 def _write(files: Files, result: Reconstruction) -> list[str]:
     """Write the mesh, and with it what was asked for besides; all of them or none."""
+    origin = written_origin(result.mesh, files.output)
+    result.report["origin"] = None if origin is None else origin.tolist()
     with ExitStack() as stack:
         # The side files are complete under their temporary names before the mesh receives its own.
         if files.report is not None:

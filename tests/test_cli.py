@@ -20,6 +20,7 @@ from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, sphere, start, torus, 
 from gnrecon.cli import main
 from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
+from gnrecon.io import read_mesh
 from gnrecon.version import __version__
 
 Here = Callable[..., subprocess.CompletedProcess[str]]
@@ -185,6 +186,22 @@ def test_a_trimmed_mesh_is_open_and_said_to_be(out: Path, tmp_path: Path) -> Non
     assert checked.returncode == ExitCode.MESH
     refused = gnrecon(scan, "-o", out / "none.ply", "--trim", "0")
     assert_refused(refused, ExitCode.USAGE, "trim must be a positive distance")
+
+
+def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path) -> None:
+    points, normals = torus(1200, np.random.default_rng(3))
+    place = np.array([500_000.25, 4_000_000.25, 100.25])
+    scan = write_scan(tmp_path / "far.ply", points + place, normals)
+    done = gnrecon(scan, "-o", out / "far.stl", "--report", out / "report.json", *FAST_WORDS)
+    assert done.returncode == 0, done.stderr
+    assert "relative to the origin 500000 4000000 100, which its header names" in done.stderr
+    assert json.loads((out / "report.json").read_text())["origin"] == [500_000, 4_000_000, 100]
+    assert (out / "far.stl").read_bytes().startswith(b"STL, origin 500000 4000000 100 ")
+    facts = verify_file(out / "far.stl")
+    assert facts.genus == 1
+    assert facts.volume == pytest.approx(TORUS_VOLUME, rel=0.05)
+    corners = read_mesh(out / "far.stl").vertices
+    assert (corners.min(axis=0) + corners.max(axis=0)) / 2 == pytest.approx(place, rel=0, abs=0.05)
 
 
 def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> None:

@@ -9,8 +9,9 @@ from rich.console import Console
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.files import require_files
-from gnrecon.io import CLOUD_WRITERS, WRITERS, holds, read_any, write_cloud, write_mesh
+from gnrecon.io import CLOUD_WRITERS, WRITERS, holds, read_any, write_cloud, write_mesh, written_origin
 from gnrecon.io.losses import losses
+from gnrecon.io.origin import told
 from gnrecon.mesh import Mesh
 
 
@@ -51,6 +52,8 @@ def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]
     if isinstance(found, Mesh) and target.suffix.lower() in WRITERS:
         unheld = [name for name, values in found.attributes.items() if not holds(target, name, values)]
         write_mesh(found, target, overwrite, compare)
+        origin = written_origin(found, target)
+        lost += [] if origin is None else [told(origin)]
         lost += [f"The format has no place for {', '.join(unheld)} of the vertices; PLY has."] if unheld else []
     else:
         cloud = PointCloud(found.vertices, found.normals, found.attributes) if isinstance(found, Mesh) else found

@@ -6,7 +6,7 @@ from gnrecon.io.objects import as_cloud, to_open3d, to_trimesh
 from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
 from gnrecon.io.scans import MOST_POINTS, Reading, read_scans
 from gnrecon.io.unpack import extension_of
-from gnrecon.io.write import check_writable, holds, write_cloud, write_mesh
+from gnrecon.io.write import check_writable, holds, write_cloud, write_mesh, written_origin
 
 __all__ = [
     "CLOUD_WRITERS",
@@ -29,4 +29,5 @@ __all__ = [
     "write_cloud",
     "write_mesh",
     "write_text",
+    "written_origin",
 ]

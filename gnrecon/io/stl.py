@@ -1,4 +1,7 @@
-"""STL, triangles without shared vertices: read by trimesh, with equal corners merged; written binary (float32)."""
+"""STL, triangles without shared vertices: read by trimesh, with equal corners merged; written binary (float32).
+
+Coordinates are in the file's own frame unless its header names an origin, see `gnrecon.io.origin`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents
+from gnrecon.io.origin import HEADER, far_origin, header, origin_in
 from gnrecon.mesh import Mesh
 
 
@@ -25,6 +29,8 @@ def read_stl(path: Path) -> Contents:
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # how numpy reports words that are no numbers
+            origin = origin_in(file.read(HEADER))
+            file.seek(0)
             loaded = load_stl(file)
     except (HeaderError, DeprecationWarning, ValueError):
         raise InputError("the file is neither a complete binary STL nor a well-formed text STL.") from None
@@ -36,18 +42,22 @@ def read_stl(path: Path) -> Contents:
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    return Contents(corners[first[order]], None, rank[which].reshape(-1, 3))
+    return Contents(origin + corners[first[order]], None, rank[which].reshape(-1, 3))
 
 
 def write_stl(mesh: Mesh, path: Path) -> None:
-    """Write binary STL; coordinates are rounded to float32, the only precision that the format has."""
+    """Write binary STL; coordinates are rounded to float32, the only precision that the format has.
+
+    They are relative to an origin, named in the header, where rounding would otherwise join different vertices.
+    """
+    origin = far_origin(mesh)
     record = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets = np.zeros(len(mesh.faces), record)
     area = mesh.face_vectors
     lengths = np.maximum(np.linalg.norm(area, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     facets["normal"] = area / lengths
-    facets["corners"] = mesh.corners
+    facets["corners"] = mesh.corners if origin is None else mesh.corners - origin
     with path.open("wb") as file:
-        file.write(b"binary STL".ljust(80, b" "))
+        file.write(header(origin))
         np.array(len(facets), "<u4").tofile(file)
         facets.tofile(file)

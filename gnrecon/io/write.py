@@ -14,6 +14,7 @@ from gnrecon.cloud import PointCloud
 from gnrecon.errors import MeshError, UsageError
 from gnrecon.io.contents import no_faces
 from gnrecon.io.formats import CLOUD_WRITERS, HOLDS, WRITERS
+from gnrecon.io.origin import far_origin, rounding, told
 from gnrecon.mesh import Mesh
 
 _NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
@@ -49,14 +50,14 @@ def write_mesh(
     if len(mesh.vertices) >= _INT32_LIMIT:
         raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices can name.")
     held = {name: values for name, values in mesh.attributes.items() if HOLDS[extension](name, values)}
-    rounding = _rounding(mesh) if extension == ".stl" else []
+    stored = _stored(mesh, path)
     try:
         with atomic_write(path, overwrite, verify) as temporary:
             WRITERS[extension](replace(mesh, attributes=held), temporary)
     except MeshError as error:
         # Rounding is then the likely reason.
-        raise MeshError("; ".join([str(error).removesuffix("."), *rounding]).removesuffix(".") + ".") from error
-    return _lost(mesh, held, extension) + rounding
+        raise MeshError("; ".join([str(error).removesuffix("."), *stored]).removesuffix(".") + ".") from error
+    return _lost(mesh, held, extension) + stored
 
 
 def write_cloud(
@@ -98,6 +99,11 @@ def holds(path: str | Path, name: str, values: npt.NDArray[np.generic]) -> bool:
     return HOLDS[check_writable(path)](name, values)
 
 
+def written_origin(mesh: Mesh, path: str | Path) -> npt.NDArray[np.float64] | None:
+    """Return the origin, of shape (3,), that coordinates are relative to in a mesh's file; None for the mesh's own."""
+    return far_origin(mesh) if Path(path).suffix.lower() == ".stl" else None
+
+
 def check_writable(path: str | Path) -> str:
     """Return the extension of `path` when a mesh can be written so.
 
@@ -124,11 +130,14 @@ def _lost(mesh: Mesh, held: Mapping[str, npt.NDArray[np.generic]], extension: st
     return [f"{extension[1:].upper()} cannot hold {named} of the vertices; PLY can."]
 
 
-def _rounding(mesh: Mesh) -> list[str]:
-    """Return a sentence about the rounding to float32, where that is notable beside the mesh's size."""
-    with np.errstate(over="ignore"):  # beyond float32 the rounding is infinite, and said to be
-        rounding = float(np.abs(mesh.vertices - mesh.vertices.astype(np.float32)).max())
-    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    if rounding <= _NOTABLE_ROUNDING * diagonal:
+def _stored(mesh: Mesh, path: str | Path) -> list[str]:
+    """Return a sentence about how coordinates are stored, where it is in float32 and notable beside the mesh's size."""
+    if Path(path).suffix.lower() != ".stl":
         return []
-    return [f"STL stores float32: coordinates are rounded by up to {rounding:.2g} units; PLY or OBJ keep them exactly."]
+    origin = written_origin(mesh, path)
+    if origin is not None:
+        return [told(origin)]
+    moved = rounding(mesh.vertices)
+    if moved <= _NOTABLE_ROUNDING * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))):
+        return []
+    return [f"STL stores float32: coordinates are rounded by up to {moved:.2g} units; PLY or OBJ keep them exactly."]

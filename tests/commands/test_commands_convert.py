@@ -63,7 +63,12 @@ def test_a_mesh_to_ply_and_back_loses_nothing(tmp_path: Path, command: CommandLi
         ("off", ["no place for intensity", "Normals are not kept"]),
         (
             "stl",
-            ["Coordinates are rounded by up to 0.25 units", "no place for intensity, colors", "Normals are not kept"],
+            [
+                "relative to the origin 500000 4500000 100, which",
+                "Coordinates are rounded",
+                "no place for intensity, colors",
+                "Normals are not kept",
+            ],
         ),
         ("glb", ["Coordinates are rounded", "Values of intensity are rounded"]),
         ("3mf", ["no place for intensity", "Normals are not kept"]),
