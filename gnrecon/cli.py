@@ -368,6 +368,9 @@ def mesh_command(
         typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=MESH),
     ] = "auto",
     curvature: Curvature = False,
+    device: Annotated[
+        str, typer.Option(help="Where the field is evaluated: cpu or cuda.", rich_help_panel=MESH)
+    ] = "cpu",
     threads: Threads = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -392,6 +395,7 @@ def mesh_command(
         "max_error": None if max_error is None else parse_length(max_error, units),
         "attributes": attributes,
         "curvature": curvature,
+        "device": device,
         "threads": threads,
     }
     raise SystemExit(remesh(model, output, options, shape, overwrite=overwrite, quiet=quiet))

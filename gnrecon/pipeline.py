@@ -151,7 +151,7 @@ def reconstruct(
         See `gnrecon.errors`; each says in one sentence what is wrong.
     """
     chosen = Options.of(**options)
-    _require_device(chosen.device)
+    require_device(chosen.device)
     with limited(chosen.threads):
         return _run(
             lambda: read_source(source, normals, format, chosen.read_points),
@@ -244,7 +244,7 @@ def _run(
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty, cloud)
 
 
-def _require_device(device: str) -> None:
+def require_device(device: str) -> None:
     """Refuse a device that torch does not have.
 
     Raises

@@ -109,8 +109,8 @@ def test_the_numbers_of_a_report_hold(name: str, report_of: Callable[[str], Repo
     rounding = 0.001 * (len(stages) + 1)
     for key in ("seconds", "cpu_seconds"):
         assert 0 < sum(stage[key] for stage in stages) <= resources[key] + rounding
-    # What lies between the stages is bookkeeping.
-    assert sum(stage["seconds"] for stage in stages) > 0.9 * resources["seconds"]
+    # What lies between the stages is bookkeeping; on a busy machine it may have to wait, which takes no processor time.
+    assert sum(stage["cpu_seconds"] for stage in stages) > 0.9 * resources["cpu_seconds"]
     assert all(10 < stage["peak_memory_mb"] <= resources["peak_memory_mb"] for stage in stages)
     names = [stage["name"] for stage in stages]
     assert names == [known for known in STAGES if known in names]

@@ -17,7 +17,7 @@ from gnrecon.fit import NeuralSDF
 from gnrecon.io import check_writable, holds, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
-from gnrecon.pipeline import limited
+from gnrecon.pipeline import limited, require_device
 from gnrecon.report import Stages
 from gnrecon.run import shown, summarise
 from gnrecon.shaping import Shape, shaped
@@ -32,7 +32,7 @@ def remesh(
     ----------
     model : a file that `NeuralSDF.save` wrote
     output : the mesh; its extension names the format
-    options : of the meshing, by their names in `Options`
+    options : of the meshing, by their names in `Options`; the field is evaluated on the device
     shape : offset, shell and crop, in file units
     overwrite : whether an existing mesh may be replaced
     quiet : say nothing but failures
@@ -45,12 +45,13 @@ def remesh(
     check_writable(output)
     require_files([model], [output], overwrite)
     chosen = Options.of(**options)
+    require_device(chosen.device)
     wanted(PointCloud(np.empty((0, 3))), chosen.attributes)  # a misspelt name is refused before the work
     console = Console(stderr=True, quiet=quiet)
     with shown(console, verbose=False) as progress, limited(chosen.threads):
-        stages = Stages(progress.stage)
+        stages = Stages(progress.stage, chosen.device)
         with stages("read"):
-            sdf = NeuralSDF.load(model)
+            sdf = NeuralSDF.load(model, chosen.device)
         mesh, remarks = shaped(sdf, chosen, shape, stages=stages, advance=progress.advance)
         with stages("verify"):
             facts = require_sound(mesh)

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_line import CommandLine
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, torus, write_scan
+from scipy.spatial import cKDTree
 
 from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
@@ -102,6 +104,28 @@ def test_vertices_carry_their_distance_and_curvature(model: Path, tmp_path: Path
     assert "cannot hold distance" in command(*words, tmp_path / "b.obj", "--attributes", "distance").stderr
     assert command(*words, tmp_path / "c.ply", "--offset", "0.1").returncode == 0
     assert read_mesh(tmp_path / "c.ply").attributes == {}
+
+
+def test_a_device_that_is_not_there_is_refused(model: Path, tmp_path: Path, command: CommandLine) -> None:
+    done = command("mesh", model, "-o", tmp_path / "a.ply", "--device", "abacus")
+    assert done.returncode == ExitCode.USAGE
+    assert "device is 'abacus', but must be cpu or cuda" in done.stderr
+    if not torch.cuda.is_available():
+        done = command("mesh", model, "-o", tmp_path / "a.ply", "--device", "cuda")
+        assert done.returncode == ExitCode.USAGE
+        assert "torch sees no CUDA GPU" in done.stderr
+    assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA GPU")
+def test_a_gpu_makes_the_same_surface(model: Path, tmp_path: Path, command: CommandLine) -> None:
+    for device in ("cpu", "cuda"):
+        words = ("mesh", model, "-o", tmp_path / f"{device}.ply", "--resolution", 48, "--device", device)
+        done = command(*words)
+        assert done.returncode == 0, done.stderr
+    ours, theirs = (read_mesh(tmp_path / f"{device}.ply") for device in ("cpu", "cuda"))
+    gaps, _ = cKDTree(theirs.vertices).query(ours.vertices)
+    assert np.median(gaps) < 1e-6
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
