@@ -157,6 +157,36 @@ UncertaintyOption = Annotated[
         rich_help_panel=MESH,
     ),
 ]
+Remesh = Annotated[
+    float | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="Mesh anew with nearly equilateral faces of this edge length, in the scan's units.",
+        rich_help_panel=MESH,
+    ),
+]
+Adaptive = Annotated[
+    bool,
+    typer.Option(
+        "--adaptive", help="With --remesh: shorter edges, down to an eighth, where it bends.", rich_help_panel=MESH
+    ),
+]
+Simplify = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DISTANCE",
+        help="Remove vertices while the surface moves by less than this, in the scan's units.",
+        rich_help_panel=MESH,
+    ),
+]
+Faces = Annotated[int | None, typer.Option(help="Reduce the mesh to this number of faces.", rich_help_panel=MESH)]
+FeatureAngle = Annotated[
+    float,
+    typer.Option(
+        help="With the three above: turn between neighbouring faces, in degrees, from which on an edge is kept sharp.",
+        rich_help_panel=MESH,
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -200,6 +230,11 @@ def reconstruct_command(
     curvature: Curvature = False,
     trim: Trim = None,
     uncertainty: UncertaintyOption = False,
+    remesh: Remesh = None,
+    adaptive: Adaptive = False,
+    simplify: Simplify = None,
+    faces: Faces = None,
+    feature_angle: FeatureAngle = 30.0,
     reference: Annotated[
         Path | None,
         typer.Option(help="Mesh or cloud to measure the result against; printed to stdout.", rich_help_panel=OUTPUT),
@@ -251,6 +286,11 @@ def reconstruct_command(
         "curvature": curvature,
         "trim": trim,
         "uncertainty": uncertainty,
+        "remesh": remesh,
+        "adaptive": adaptive,
+        "simplify": simplify,
+        "faces": faces,
+        "feature_angle": feature_angle,
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(tuple(scans), output, reference, report, preview, save, html, overwrite, format)
@@ -287,6 +327,11 @@ def batch_command(
     curvature: Curvature = False,
     trim: Trim = None,
     uncertainty: UncertaintyOption = False,
+    remesh: Remesh = None,
+    adaptive: Adaptive = False,
+    simplify: Simplify = None,
+    faces: Faces = None,
+    feature_angle: FeatureAngle = 30.0,
     reports: Annotated[
         bool,
         typer.Option(
@@ -325,9 +370,13 @@ def batch_command(
         "--max-error": max_error,
         "--attributes": attributes,
         "--trim": trim,
+        "--remesh": remesh,
+        "--simplify": simplify,
+        "--faces": faces,
+        "--feature-angle": feature_angle,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
-    passed += ["--curvature"] * curvature + ["--uncertainty"] * uncertainty
+    passed += ["--curvature"] * curvature + ["--uncertainty"] * uncertainty + ["--adaptive"] * adaptive
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
     raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, pages=pages, quiet=quiet))
 
@@ -363,6 +412,11 @@ def mesh_command(
             help="The file's own unit (um, mm, cm, m, km, in, ft), for lengths with a suffix.", rich_help_panel=MESH
         ),
     ] = None,
+    remesh: Remesh = None,
+    adaptive: Adaptive = False,
+    simplify: Simplify = None,
+    faces: Faces = None,
+    feature_angle: FeatureAngle = 30.0,
     attributes: Annotated[
         str,
         typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=MESH),
@@ -379,7 +433,7 @@ def mesh_command(
     """Mesh a fitted field again, without refitting: at another resolution, cropped, offset, or as a hollow shell."""
     import numpy as np
 
-    from gnrecon.commands.remesh import remesh
+    from gnrecon.commands.remesh import remesh as mesh_again
     from gnrecon.lengths import parse_box, parse_length
     from gnrecon.shaping import Shape
 
@@ -393,12 +447,17 @@ def mesh_command(
         "resolution": resolution,
         "edge_length": None if edge_length is None else parse_length(edge_length, units),
         "max_error": None if max_error is None else parse_length(max_error, units),
+        "remesh": remesh,
+        "adaptive": adaptive,
+        "simplify": simplify,
+        "faces": faces,
+        "feature_angle": feature_angle,
         "attributes": attributes,
         "curvature": curvature,
         "device": device,
         "threads": threads,
     }
-    raise SystemExit(remesh(model, output, options, shape, overwrite=overwrite, quiet=quiet))
+    raise SystemExit(mesh_again(model, output, options, shape, overwrite=overwrite, quiet=quiet))
 
 
 @app.command("eval")

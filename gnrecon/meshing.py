@@ -1,4 +1,4 @@
-"""From a fitted field to a mesh in file units: extract, drop what no data supports, project, repair.
+"""From a fitted field to a mesh in file units: extract, drop what no data supports, project, refine, repair.
 
 A reconstruction and `gnrecon mesh`, which meshes a saved field again, both do their meshing here.
 """
@@ -14,7 +14,7 @@ import numpy as np
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
-from gnrecon.export import SignedDistance, extract, project, remove_stray, repair
+from gnrecon.export import SignedDistance, extract, project, refine, remove_stray, repair
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
@@ -50,7 +50,7 @@ class Meshed:
         Closed, with normals; `gnrecon.export.require_sound` has accepted it.
     fineness : Fineness
     actions : list of str
-        A sentence for each thing that was dropped or repaired, and for what was asked of the fineness.
+        A sentence for each thing that was dropped, refined or repaired, and for what was asked of the fineness.
     """
 
     mesh: Mesh
@@ -78,7 +78,7 @@ def mesh_field(
     bounds : array of shape (2, 3), file units, optional
         The box to mesh in; by default the field's own.
     stages : callable
-        Times the stages ``extract``, ``project`` and ``repair``.
+        Times the stages ``extract``, ``project``, ``refine`` where the options ask for it, and ``repair``.
     advance : callable
         Told of the share that is done of each stage.
 
@@ -94,10 +94,14 @@ def mesh_field(
         mesh, cells, dropped = _extracted(field, options, data, box, advance)
     with stages("project"):
         mesh = project(mesh, field, steps=2, advance=advance)
-        fineness = measure_fineness(mesh, field, cells, box)
+    refined: list[str] = []
+    if options.refine().anything:
+        with stages("refine"):
+            mesh, refined = refine(mesh, field, options.refine(), advance=advance)
     with stages("repair"):
         mesh, repaired = repair(mesh)
-    return Meshed(mesh, fineness, [*dropped, *repaired, *_said(fineness, options)])
+        fineness = measure_fineness(mesh, field, cells, box)
+    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *_said(fineness, options)])
 
 
 def _extracted(

@@ -8,6 +8,7 @@ from typing import Any
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
+from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.options import FitOptions
 from gnrecon.io import MOST_POINTS
@@ -54,6 +55,8 @@ class Options:
     trim : float or str, optional
         Distance from the nearest point beyond which the surface is cut off, in file units, in another unit as in
         ``"2mm"``, or in spacings of the points as in ``"3s"``; the mesh is then open. By default nothing is cut.
+    remesh, adaptive, simplify, faces, feature_angle
+        Of the mesh's refinement, see `gnrecon.export.RefineOptions`.
     widths, steps, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
@@ -78,6 +81,11 @@ class Options:
     edge_length: float | None = None
     max_error: float | None = None
     trim: float | str | None = None
+    remesh: float | None = None
+    adaptive: bool = False
+    simplify: float | None = None
+    faces: int | None = None
+    feature_angle: float = RefineOptions.feature_angle
     widths: tuple[int, ...] | None = None
     steps: int | None = None
     normal_residual: str = FitOptions.normals
@@ -106,6 +114,7 @@ class Options:
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
         self.trim_at(spacing=1.0)
         self.fit()
+        self.refine()
 
     def _check_fineness(self) -> None:
         if self.resolution is not None and self.edge_length is not None:
@@ -172,6 +181,10 @@ class Options:
             seed=self.seed,
             device=self.device,
         )
+
+    def refine(self) -> RefineOptions:
+        """Return the options of the mesh's refinement."""
+        return RefineOptions(self.remesh, self.adaptive, self.simplify, self.faces, self.feature_angle)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as plain values."""

@@ -27,6 +27,7 @@ from gnrecon.export import (
     Trimming,
     invented,
     measure,
+    quality,
     require_bordered,
     require_sound,
     trim,
@@ -236,7 +237,7 @@ def _run(
             if options.attributes != "none":
                 error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
-    surface = _surface(facts, unsupported, trimming) | {
+    surface = _surface(mesh, facts, unsupported, trimming) | {
         "reading": reading.as_dict(),
         "fineness": meshed.fineness.as_dict(),
     }
@@ -301,13 +302,13 @@ def _out_of_memory(error: Exception) -> MemoryLimitError:
     )
 
 
-def _surface(facts: MeshFacts, unsupported: Invented, trimming: Trimming | None) -> dict[str, Any]:
+def _surface(mesh: Mesh, facts: MeshFacts, unsupported: Invented, trimming: Trimming | None) -> dict[str, Any]:
     """What the mesh is and what was cut off it, as plain values; an open one has no volume."""
     guarantee = "closed, oriented 2-manifold" if facts.closed else "oriented edge-manifold with borders"
-    mesh = {**facts.as_dict(), **unsupported.as_dict(), "guarantee": guarantee}
+    found = {**facts.as_dict(), **unsupported.as_dict(), "guarantee": guarantee, "quality": quality(mesh).as_dict()}
     if not facts.closed:
-        mesh["volume"] = None
-    return {"mesh": mesh, "trim": None if trimming is None else trimming.as_dict()}
+        found["volume"] = None
+    return {"mesh": found, "trim": None if trimming is None else trimming.as_dict()}
 
 
 def _report(

@@ -28,6 +28,7 @@ STAGES = {
     "fit": "Fitting",
     "extract": "Extracting",
     "project": "Projecting",
+    "refine": "Refining",
     "repair": "Repairing",
     "offset": "Offsetting",
     "cut": "Cutting",

@@ -101,7 +101,9 @@ def shaped(
         # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
         region = _around(shape.crop, max(map(abs, shape.levels)) + MARGIN * cell, sdf.bounds)
     data, remarks = _data(sdf, region)
-    meshed = mesh_field(sdf, _at(options, region, cell), data=data, bounds=region, stages=stages, advance=advance)
+    # What is only measured from is best left as fine as it is.
+    plain = options if 0.0 in shape.levels else replace(options, remesh=None, adaptive=False, simplify=None, faces=None)
+    meshed = mesh_field(sdf, _at(plain, region, cell), data=data, bounds=region, stages=stages, advance=advance)
     mesh, remarks = meshed.mesh, remarks + meshed.actions
     if options.edge_length is not None and options.max_error is None:
         remarks.append(meshed.fineness.describe())  # meshing was asked for cells of that size, and so does not tell

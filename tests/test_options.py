@@ -11,6 +11,7 @@ import pytest
 
 from gnrecon.cli import batch_command, parse_widths, reconstruct_command
 from gnrecon.errors import UsageError
+from gnrecon.export import RefineOptions
 from gnrecon.fit import FitOptions
 from gnrecon.ingest import prepare
 from gnrecon.options import Options
@@ -36,6 +37,11 @@ from gnrecon.options import Options
         ({"trim": "1e999"}, "is not a length"),
         ({"trim": "1s", "units": "parsec"}, "scan's unit must be one of um, mm, .* not 'parsec'"),
         ({"read_points": 0}, "while reading must be positive, not 0"),
+        ({"remesh": -2.0}, "edge length to remesh to must be positive, not -2"),
+        ({"adaptive": True}, "add --remesh"),
+        ({"simplify": 0.0}, "tolerance to simplify to must be positive, not 0"),
+        ({"faces": 2}, "number of faces must be at least 4, not 2"),
+        ({"feature_angle": 120.0}, "feature angle must be from 5 to 90 degrees, not 120"),
         ({"detail": 3}, "no option 'detail'; the options are read_points, units, fraction"),
     ],
 )
@@ -72,6 +78,13 @@ def test_trimming_is_in_file_units_or_spacings() -> None:
     for given, expected in reaches.items():
         assert Options(trim=given).trim_at(spacing=0.2) == pytest.approx(expected)
     assert Options(trim="2mm", units="m").trim_at(spacing=0.2) == pytest.approx(0.002)
+
+
+def test_the_refinement_receives_its_options() -> None:
+    chosen = {"remesh": 2.0, "adaptive": True, "simplify": 0.1, "faces": 500, "feature_angle": 20.0}
+    assert Options(**chosen).refine() == RefineOptions(**chosen)
+    assert Options().refine() == RefineOptions()
+    assert not Options().refine().anything
 
 
 def test_options_are_plain_values() -> None:

@@ -15,7 +15,7 @@ import pytest
 from scan_files import gnrecon, torus, write_scan
 
 import gnrecon as package
-from gnrecon.export import Invented, MeshFacts, Metrics, Trimming
+from gnrecon.export import Invented, MeshFacts, MeshQuality, Metrics, Trimming
 from gnrecon.ingest import IngestCounts
 from gnrecon.optim import Record
 from gnrecon.options import Options
@@ -31,6 +31,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "gauss-newton": {"steps": 2},
     "line": {"steps": 2, "search": "line", "solver": "qr"},
     "trimmed": {"steps": 0, "trim": "3s", "curvature": True},
+    "refined": {"steps": 0, "remesh": 0.4, "simplify": 0.02, "faces": 600, "feature_angle": 40.0},
     "adam": {"steps": 3, "optimiser": "adam"},
     "lbfgs": {"steps": 1, "optimiser": "lbfgs"},
     "deep": {"steps": 3, "widths": (16, 16), "max_points": None},
@@ -115,6 +116,10 @@ def test_the_numbers_of_a_report_hold(name: str, report_of: Callable[[str], Repo
     names = [stage["name"] for stage in stages]
     assert names == [known for known in STAGES if known in names]
     assert ("measure" in names) == (report["metrics"] is not None)
+    assert ("refine" in names) == (name == "refined")
+    shape = report["mesh"]["quality"]
+    assert sum(shape["histogram"]["counts"]) == 3 * report["mesh"]["faces"]
+    assert shape["edge_length"]["min"] <= shape["edge_length"]["mean"] <= shape["edge_length"]["max"]
     dropped = ("non_finite", "zero_normals", "duplicates", "outliers", "thinned")
     assert ingest["read"] == ingest["kept"] + sum(ingest[reason] for reason in dropped) == 1200
     if RUNS[name].get("threads"):
@@ -158,7 +163,8 @@ def test_everything_is_described(path: str, schema: dict[str, Any]) -> None:
     [
         ("options", [field.name for field in fields(Options)]),
         ("ingest", [field.name for field in fields(IngestCounts)]),
-        ("mesh", [*(field.name for field in [*fields(MeshFacts), *fields(Invented)]), "guarantee"]),
+        ("mesh", [*(field.name for field in [*fields(MeshFacts), *fields(Invented)]), "guarantee", "quality"]),
+        ("mesh.quality", [field.name for field in fields(MeshQuality)]),
         ("trim", [field.name for field in fields(Trimming)]),
         ("metrics", [*(field.name for field in fields(Metrics)), "relative"]),
         ("fit.history[]", [field.name for field in fields(Record)]),

@@ -17,7 +17,7 @@ import numpy as np
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
-from gnrecon.export.project import edge_lengths, project
+from gnrecon.export.project import project, side_lengths
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.mesh import Int, Mesh
 
@@ -96,7 +96,7 @@ def _rounded(number: float, towards: Callable[[float], int]) -> str:
 def measure_fineness(mesh: Mesh, field: SignedDistance, resolution: int, bounds: Float) -> Fineness:
     """Return how fine a projected mesh, extracted with `resolution` from `bounds`, of shape (2, 3), is."""
     cell = float(np.ptp(bounds, axis=0).max()) / resolution
-    edge = float(edge_lengths(mesh).mean(dtype=np.float64))
+    edge = float(side_lengths(mesh).mean(dtype=np.float64))
     return Fineness(resolution, edge, chord_error(mesh, field, bounds, cell))
 
 

@@ -67,7 +67,7 @@ def project(
     if steps < 0:
         raise UsageError(f"The number of Newton steps is {steps}, but cannot be negative.")
     if limit is None:
-        limit = 0.5 * float(np.median(edge_lengths(mesh)))
+        limit = 0.5 * float(np.median(side_lengths(mesh)))
     if not limit > 0:
         raise UsageError(f"The limit is {limit} file units, but must be positive.")
     moved = np.empty_like(mesh.vertices)
@@ -75,7 +75,7 @@ def project(
     gradient = np.empty_like(moved)
     for start in range(0, len(moved), batch):
         rows = slice(start, start + batch)
-        moved[rows], value[rows], gradient[rows] = _newton(mesh.vertices[rows], field, steps, limit)
+        moved[rows], value[rows], gradient[rows] = newton(mesh.vertices[rows], field, steps, limit)
         advance(min(start + batch, len(moved)) / len(moved))
     back = _undo_turned(mesh, moved)
     moved[back] = mesh.vertices[back]
@@ -89,7 +89,7 @@ def project(
     return Mesh(moved, mesh.faces, normals)
 
 
-def edge_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
+def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     """Lengths of the faces' sides, of shape (3 F,)."""
     lengths = np.empty((len(mesh.faces), 3), dtype=np.float32)
     for rows in parts(len(mesh.faces)):
@@ -98,8 +98,8 @@ def edge_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     return lengths.reshape(-1)
 
 
-def _newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tuple[Float, Float, Float]:
-    """Points after the steps, with the field's value and gradient there."""
+def newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tuple[Float, Float, Float]:
+    """Points of shape (N, 3) after Newton steps no farther than `limit` from `start`, with value and gradient there."""
     points = start.copy()
     value, gradient = field.sdf(points), field.gradient(points)
     low, high = field.bounds

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.export.quality import corner_angles, edge_lengths
 from gnrecon.histogram import Histogram
 from gnrecon.mesh import Mesh
 from gnrecon.page.facts import Fact
@@ -45,23 +45,3 @@ def quality(mesh: Mesh) -> Quality:
             Fact("longest", figure(float(lengths.max()))),
         ),
     )
-
-
-def corner_angles(mesh: Mesh) -> Float:
-    """Return the angle at each corner of each face, of shape (F, 3), in degrees; zero where an edge has no length."""
-    corners = mesh.corners
-    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    # The tangent's two parts stay exact for needles, where the cosine alone would not.
-    sines = np.linalg.norm(np.cross(ahead, behind), axis=2)
-    angles: Float = np.degrees(np.arctan2(sines, np.einsum("fki,fki->fk", ahead, behind)))
-    return angles
-
-
-def edge_lengths(mesh: Mesh) -> Float:
-    """Return the length of each edge once, of shape (E,), in the mesh's units."""
-    ends = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    # One number an edge sorts many times faster than a pair.
-    once = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1])
-    start, end = np.divmod(once, len(mesh.vertices))
-    lengths: Float = np.linalg.norm(mesh.vertices[end] - mesh.vertices[start], axis=1)
-    return lengths

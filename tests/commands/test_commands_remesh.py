@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, torus, write_scan
 from scipy.spatial import cKDTree
 
 from gnrecon.errors import ExitCode
-from gnrecon.export import verify_file
+from gnrecon.export import quality, verify_file
 from gnrecon.fit import NeuralSDF
 from gnrecon.io import read_mesh
 
@@ -128,6 +129,33 @@ def test_a_gpu_makes_the_same_surface(model: Path, tmp_path: Path, command: Comm
     assert np.median(gaps) < 1e-6
 
 
+def test_faces_of_a_wanted_size_or_number(model: Path, tmp_path: Path, command: CommandLine) -> None:
+    words = ("mesh", model, "--resolution", 48, "-o")
+    assert "Remeshed to edges of 0.1: " in command(*words, tmp_path / "even.ply", "--remesh", "0.1").stderr
+    even = verify_file(tmp_path / "even.ply")
+    assert even.genus == 1
+    assert quality(read_mesh(tmp_path / "even.ply")).edge_length["mean"] == pytest.approx(0.1, rel=0.05)
+    assert "distance" in read_mesh(tmp_path / "even.ply").attributes
+    done = command(*words, tmp_path / "few.ply", "--faces", "400")
+    assert (done.returncode, verify_file(tmp_path / "few.ply").faces) == (0, 400)
+    done = command(*words, tmp_path / "within.ply", "--simplify", "0.02")
+    said = re.search(r"Simplified to within 0.02: (\d+) faces became (\d+)", done.stderr)
+    assert said is not None
+    assert int(said[2]) == verify_file(tmp_path / "within.ply").faces < 0.9 * int(said[1])
+
+
+def test_an_offset_is_measured_from_the_whole_surface_and_refined_itself(
+    model: Path, tmp_path: Path, command: CommandLine
+) -> None:
+    words = ("mesh", model, "--resolution", 48, "--offset", "0.05", "-o")
+    done = command(*words, tmp_path / "few.ply", "--faces", "600")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("Decimated to 600 faces") == 1
+    facts = verify_file(tmp_path / "few.ply")
+    assert (facts.faces, facts.genus) == (600, 1)
+    assert facts.volume == pytest.approx(2 * np.pi**2 * 0.35**2, rel=0.06)
+
+
 @pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
 def test_offset_shell_and_crop_at_once(model: Path, tmp_path: Path, command: CommandLine, suffix: str) -> None:
     shape = ("--offset", "-20mm", "--units", "m", "--shell", "0.1", "--crop", "-2,-2,-2,2,2,0")
@@ -158,6 +186,10 @@ def test_offset_shell_and_crop_at_once(model: Path, tmp_path: Path, command: Com
         (("--resolution", "3"), "at least 16 cells"),
         (("--attributes", "colors"), "no attribute 'colors'"),
         (("--threads", "0"), "threads must be positive"),
+        (("--remesh", "-1"), "edge length to remesh to must be positive"),
+        (("--adaptive",), "add --remesh"),
+        (("--simplify", "0"), "tolerance to simplify to must be positive"),
+        (("--faces", "3"), "number of faces must be at least 4"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -1,0 +1,157 @@
+"""Collapsing short edges of a surface.
+
+An edge collapses into its end of the higher kind (corner, crease, smooth), or into its middle when both are of one
+kind. It may do so when the surface stays what it is: the ends share no neighbours but the two opposite vertices (the
+link condition, by which a closed 2-manifold stays one of the same genus), creases neither vanish nor merge, no face
+turns out of its surroundings, and no edge becomes too long. Collapses that touch no common face are made at once, the
+shortest edges first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from gnrecon.cloud import Float
+from gnrecon.export.independent import ranks, rings_apart
+from gnrecon.export.split import LONG
+from gnrecon.export.surface import CORNER, SMOOTH, EdgeTable, Surface, area_vectors, face_normals, unit
+from gnrecon.export.topology import Mask
+from gnrecon.mesh import Int
+
+SHORT = 4.0 / 5.0
+"""An edge is too short below this share of the target length: with `LONG`, no halved edge is collapsed again."""
+
+TURN = 0.5
+"""Least cosine between a face's new normal and what it should be."""
+
+ROUNDS = 15
+"""Most rounds; the first few do most of the work, and what is left is tried again in the next iteration."""
+
+
+@dataclass(frozen=True)
+class _Collapses:
+    """Vertices that vanish and that are kept, of shape (N,), with the latter's places and normals, of shape (N, 3)."""
+
+    gone: Int
+    kept: Int
+    place: Float
+    normal: Float
+
+    def only(self, mask: Mask) -> _Collapses:
+        return _Collapses(self.gone[mask], self.kept[mask], self.place[mask], self.normal[mask])
+
+
+def collapse_short(surface: Surface, length: Float) -> tuple[Surface, Float]:
+    """Collapse edges shorter than 4/5 of the target length, of shape (V,), where that is safe.
+
+    Returns
+    -------
+    Surface, array
+        The surface without unused vertices, and the target lengths at those that are left.
+    """
+    refused = np.empty(0, dtype=np.int64)
+    size = len(surface.vertices)
+    for _ in range(ROUNDS):
+        edges = EdgeTable.of(surface.faces)
+        names = edges.ends @ np.array([size, 1])
+        wanted = _wanted(surface, edges, length) & ~np.isin(names, refused)
+        chosen = _independent(surface, edges, wanted)
+        if not len(chosen):
+            break
+        collapses = _directed(surface, edges.ends[chosen])
+        good = _keeps_topology(edges, chosen, size) & _keeps_shape(surface, collapses, length)
+        refused = np.union1d(refused, names[chosen[~good]])
+        surface = _apply(surface, collapses.only(good))
+    used = np.unique(surface.faces)
+    return surface.compact(), length[used]
+
+
+def _wanted(surface: Surface, edges: EdgeTable, length: Float) -> Mask:
+    """Which edges are too short and may collapse as far as creases are concerned."""
+    a, b = edges.ends.T
+    short = np.linalg.norm(surface.vertices[a] - surface.vertices[b], axis=1) < SHORT * np.minimum(length[a], length[b])
+    low = surface.kinds()[edges.ends].min(axis=1)
+    along = surface.is_crease(edges.ends) & (low < CORNER) & ~_in_crease_triangle(surface, edges)
+    wanted: Mask = short & ((low == SMOOTH) | along)
+    return wanted
+
+
+def _in_crease_triangle(surface: Surface, edges: EdgeTable) -> Mask:
+    """Which edges have a face whose other two edges are creases: a collapse would lay these on each other."""
+    sides = [
+        surface.is_crease(np.sort(np.stack([edges.ends[:, end], edges.opposite[:, face]], axis=1), axis=1))
+        for face in (0, 1)
+        for end in (0, 1)
+    ]
+    return (sides[0] & sides[1]) | (sides[2] & sides[3])
+
+
+def _independent(surface: Surface, edges: EdgeTable, wanted: Mask) -> Int:
+    """Numbers of wanted edges that touch no common face, the shortest first."""
+    rows = np.flatnonzero(wanted)
+    ends = edges.ends[rows]
+    lengths = np.linalg.norm(surface.vertices[ends[:, 0]] - surface.vertices[ends[:, 1]], axis=1)
+    return rows[rings_apart(ends, ranks(lengths), surface.faces, len(surface.vertices))]
+
+
+def _directed(surface: Surface, ends: Int) -> _Collapses:
+    """Decide for each edge, of shape (N, 2), which end stays, and where."""
+    kinds = surface.kinds()[ends]
+    kept = np.where(kinds[:, 0] > kinds[:, 1], ends[:, 0], ends[:, 1])
+    even = (kinds[:, 0] == kinds[:, 1])[:, None]
+    place = np.where(even, surface.vertices[ends].mean(axis=1), surface.vertices[kept])
+    normal = np.where(even, unit(surface.normals[ends].sum(axis=1)), surface.normals[kept])
+    return _Collapses(ends.sum(axis=1) - kept, kept, place, normal)
+
+
+def _keeps_topology(edges: EdgeTable, chosen: Int, size: int) -> Mask:
+    """Link condition; the opposite vertices must be left with three neighbours."""
+    both = np.concatenate([edges.ends, edges.ends[:, ::-1]])
+    links = coo_array((np.ones(len(both), dtype=np.int8), both.T), shape=(size, size)).tocsr()
+    a, b = edges.ends[chosen].T
+    common = np.asarray(links[a].multiply(links[b]).sum(axis=1)).reshape(-1)
+    valence = np.bincount(both[:, 0], minlength=size)
+    safe: Mask = (common == 2) & (valence[edges.opposite[chosen]] > 3).all(axis=1)
+    return safe
+
+
+def _keeps_shape(surface: Surface, collapses: _Collapses, length: Float) -> Mask:
+    """Whether no face turns from what it should be, unless it was turned already, and no edge becomes too long."""
+    count = len(collapses.gone)
+    owner = np.full(len(surface.vertices), -1, dtype=np.int64)
+    owner[collapses.gone] = owner[collapses.kept] = np.arange(count)
+    owners = owner[surface.faces].max(axis=1)
+    after = _apply(surface, collapses, drop=False)
+    changed = np.flatnonzero(owners >= 0)
+    faces = after.faces[changed]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    changed, faces = changed[whole], faces[whole]
+    areas = area_vectors(after.vertices, faces)
+    along = np.einsum("ij,ij->i", areas, face_normals(surface)[changed])
+    bad = ~(along > TURN * np.linalg.norm(areas, axis=1))
+    a, b = after.vertices[faces], after.vertices[np.roll(faces, -1, axis=1)]
+    limit = LONG * np.minimum(length[faces], length[np.roll(faces, -1, axis=1)])
+    before = surface.vertices[surface.faces[changed]]
+    grown = np.linalg.norm(a - b, axis=2) > np.maximum(
+        limit, np.linalg.norm(before - np.roll(before, -1, axis=1), axis=2)
+    )
+    bad |= grown.any(axis=1)
+    good: Mask = np.bincount(owners[changed], weights=bad, minlength=count) == 0
+    return good
+
+
+def _apply(surface: Surface, collapses: _Collapses, *, drop: bool = True) -> Surface:
+    """Rename the vanishing vertices; `drop` removes the faces and creases that have lost an edge."""
+    names = np.arange(len(surface.vertices))
+    names[collapses.gone] = collapses.kept
+    vertices, normals = surface.vertices.copy(), surface.normals.copy()
+    vertices[collapses.kept], normals[collapses.kept] = collapses.place, collapses.normal
+    faces, creases = names[surface.faces], names[surface.creases]
+    if not drop:
+        return Surface(vertices, normals, faces, surface.creases)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    creases = np.unique(np.sort(creases[creases[:, 0] != creases[:, 1]], axis=1), axis=0)
+    return Surface(vertices, normals, faces, creases)
