@@ -20,8 +20,12 @@ def parsing(kind: str) -> Iterator[None]:
     """
     try:
         yield
-    except (GnreconError, MemoryError, OSError):
+    except (GnreconError, MemoryError):
         raise
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise InputError(_sentence(kind, error)) from None
     except Exception as error:
         raise InputError(_sentence(kind, error)) from None
     except BaseException as error:

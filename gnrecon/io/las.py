@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,12 @@ from gnrecon.io.foreign import parsing
 _LEAST_HEADER, _VLR, _EVLR = 227, 54, 60  # bytes, from the specification
 _COMPRESSED = 0xC0
 """Bits of the point format by which compressed files are told."""
+
+_LEAST_POINT = 20
+"""Bytes of a point in the smallest format; the first one of each compressed chunk is stored so."""
+
+_MOST_BYTES = 1 << 28
+"""Of the records in a chunk: those of a damaged file may be any size."""
 
 _SKIPPED = ("X", "Y", "Z", "red", "green", "blue", "withheld", "synthetic", "key_point", "overlap")
 
@@ -56,8 +63,16 @@ def las_chunks(path: Path, rows: int) -> Iterator[Contents]:
     import laspy
 
     _require_all(path)
-    with parsing("LAS or LAZ"), laspy.open(path) as reader:
+    # The parallel decompressor takes the sizes that a damaged file states for granted, and ends the process.
+    backend = laspy.LazBackend.Lazrs
+    with (
+        path.open("rb") as file,
+        parsing("LAS or LAZ"),
+        _no_more_than_it_holds(),
+        laspy.open(file, closefd=False, laz_backend=backend) as reader,
+    ):
         left = reader.header.point_count
+        rows = max(1, min(rows, _MOST_BYTES // max(reader.header.point_format.size, 1)))
         for chunk in reader.chunk_iterator(rows):
             left -= len(chunk)
             yield _contents(chunk)
@@ -65,12 +80,21 @@ def las_chunks(path: Path, rows: int) -> Iterator[Contents]:
             raise InputError(f"the header declares {reader.header.point_count} points, but {left} of them are missing.")
 
 
+@contextmanager
+def _no_more_than_it_holds() -> Iterator[None]:
+    """Take want of memory for what it is here: chunks are small, so only damaged sizes can ask for so much."""
+    try:
+        yield
+    except MemoryError:
+        raise InputError("the header declares records that are larger than this machine's memory.") from None
+
+
 def settled(contents: Contents) -> Contents:
     """Return all contents of a file without attributes that are zero everywhere, and with colours on their own scale.
 
     Colours have 16 bits by the specification. Where none exceeds 255, a program has put 8-bit ones into their places.
     """
-    filled = {name: values for name, values in contents.attributes.items() if values.any()}
+    filled = {name: values for name, values in contents.attributes.items() if (values != 0).any()}
     if "colors" in filled and filled["colors"].max() <= 255:
         filled["colors"] = filled["colors"].astype(np.uint8)
     return replace(contents, attributes=filled)
@@ -119,5 +143,22 @@ def _require_all(path: Path) -> None:
     if header_size < _LEAST_HEADER or header_size + vlrs * _VLR > start or start > size:
         raise InputError("the header's sizes contradict each other or the file's size.")
     held = (size - start) // max(length, 1)
-    if not kind & _COMPRESSED and count > held:
+    if kind & _COMPRESSED:
+        _require_chunk_table(path, start, size)
+    elif count > held:
         raise InputError(f"the header declares {count} points, but the file ends after {held}.")
+
+
+def _require_chunk_table(path: Path, start: int, size: int) -> None:
+    """Refuse a table of compressed chunks that lies outside of the file, or lists more of them than it can hold."""
+    with path.open("rb") as file:
+        file.seek(start)
+        place = int.from_bytes(file.read(8), "little", signed=True)
+        if place == -1:  # written behind everything else, by a program that could not go back
+            file.seek(size - 8)
+            place = int.from_bytes(file.read(8), "little", signed=True)
+        file.seek(max(place, 0))
+        table = file.read(8)
+    chunks = int.from_bytes(table[4:], "little")
+    if not start + 8 <= place <= size - 8 or len(table) < 8 or chunks * _LEAST_POINT > size:
+        raise InputError("the table of compressed chunks contradicts the file's size.")

@@ -2,7 +2,8 @@
 
 That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). But it reports failures by
 printing a warning and returning an empty cloud, and fills up what a short file lacks with zeros. So the amount of data
-is compared with the header before, and the number of points after.
+is compared with the header before, and the number of points after. A header that contradicts itself ends the process
+there, so that it is refused here.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from gnrecon.io.text import numbers
 
 Header = dict[str, list[str]]
 
+_NORMAL = ("normal_x", "normal_y", "normal_z")
+_SINGLE = ("x", "y", "z", "rgb", "rgba", *_NORMAL)
+_TYPES = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
 _KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
@@ -33,6 +37,7 @@ def read_pcd(path: Path) -> Contents:
 
     header, body = _split(path.read_bytes())
     declared = int(header["POINTS"][0])
+    _require_consistent(header)
     _require_all(header, body, declared)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, format="pcd")
@@ -55,23 +60,47 @@ def _split(data: bytes) -> tuple[Header, bytes]:
         end = data.find(b"\n", start) + 1 or len(data)
         words = data[start:end].decode("ascii", errors="replace").split()
         if words and not words[0].startswith("#"):
-            header[words[0].upper()] = words[1:]
+            if words[0] in header:
+                raise InputError(f"the PCD header has two lines {words[0][:20]}.")
+            header[words[0]] = words[1:]
         start = end
     missing = [key for key in _KEYS if not header.get(key)]
     if missing:
         raise InputError(f"the PCD header lacks {' and '.join(missing)}.")
     if not {"x", "y", "z"} <= set(header["FIELDS"]):
         raise InputError(f"expected fields named x, y and z, but the header lists {' '.join(header['FIELDS'])}.")
-    for key in ("SIZE", "COUNT", "POINTS"):
+    for key in ("SIZE", "COUNT", "POINTS", "WIDTH", "HEIGHT"):
         for word in header.get(key, []):
             if not word.isdecimal():
                 raise InputError(f"the header's {key} holds {word!r}, but a count was expected.")
     return header, data[start:]
 
 
+def _require_consistent(header: Header) -> None:
+    """Refuse fields of unlike numbers, of no known type, or whose parts are missing.
+
+    Raises
+    ------
+    InputError
+        With the sentence that says which.
+    """
+    names = header["FIELDS"]
+    counts = header.setdefault("COUNT", ["1"] * len(names))
+    if not len(names) == len(header["SIZE"]) == len(header["TYPE"]) == len(counts):
+        raise InputError("the PCD header does not give a size, a type and a count for each field.")
+    for name, kind, size, count in zip(names, header["TYPE"], header["SIZE"], counts, strict=True):
+        single = name in _SINGLE and (count != "1" or (name in ("rgb", "rgba") and size != "4"))
+        if kind + size not in _TYPES or int(count) < 1 or single:
+            raise InputError(f"the PCD header describes the field {name[:20]!r} in a way that is unknown.")
+    if len(set(names)) < len(names) or len(set(names) & set(_NORMAL)) not in (0, 3):
+        raise InputError("the PCD header names a field twice, or some of the normals' three only.")
+    if int(header["WIDTH"][0]) * int(header["HEIGHT"][0]) != int(header["POINTS"][0]):
+        raise InputError("the PCD header's width and height do not give its number of points.")
+
+
 def _require_all(header: Header, body: bytes, points: int) -> None:
     """Refuse data of another size than the header declares."""
-    counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["SIZE"]))]
+    counts = [int(word) for word in header["COUNT"]]
     row = sum(int(size) * count for size, count in zip(header["SIZE"], counts, strict=True))
     match header["DATA"][0]:
         case "ascii":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import posixpath
 import zipfile
+import zlib
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -70,7 +71,7 @@ def read_3mf(path: Path) -> Contents:
     try:
         with zipfile.ZipFile(path) as archive:
             model = _load(archive)
-    except (zipfile.BadZipFile, expat.ExpatError, KeyError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, expat.ExpatError, KeyError, EOFError) as error:
         raise InputError(f"the file is no well-formed 3MF archive ({error}).") from None
     pieces = [piece for key, way in model.items for piece in _placed(model, key, way, 0)]
     if not pieces:
