@@ -59,7 +59,27 @@ Fraction = Annotated[
     float | None, typer.Option(help="Share of the points to keep, above 0 and up to 1.", rich_help_panel=POINTS)
 ]
 MaxPoints = Annotated[int | None, typer.Option(help="Most points to keep.", rich_help_panel=POINTS)]
-Subsample = Annotated[str, typer.Option(help="How they are chosen: random, voxel or poisson.", rich_help_panel=POINTS)]
+Spacing = Annotated[
+    str | None,
+    typer.Option(
+        help="Distance between points to thin to: in file units or, as 2s, in multiples of their own.",
+        rich_help_panel=POINTS,
+    ),
+]
+Subsample = Annotated[
+    str,
+    typer.Option(
+        help="How they are chosen: random, voxel, poisson, farthest or curvature (more where the surface bends).",
+        rich_help_panel=POINTS,
+    ),
+]
+Holdout = Annotated[
+    float | None,
+    typer.Option(
+        help="Share of the points that the fit does not see, such as 0.1; their distances from its surface are told.",
+        rich_help_panel=POINTS,
+    ),
+]
 Outliers = Annotated[
     str,
     typer.Option(
@@ -212,7 +232,9 @@ def reconstruct_command(
     units: Units = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
+    spacing: Spacing = None,
     subsample: Subsample = "random",
+    holdout: Holdout = None,
     outliers: Outliers = "auto",
     widths: Widths = None,
     steps: Steps = None,
@@ -268,7 +290,9 @@ def reconstruct_command(
         "units": units,
         "fraction": fraction,
         "max_points": max_points,
+        "spacing": spacing,
         "subsample": subsample,
+        "holdout": holdout,
         "outliers": outliers,
         "widths": None if widths is None else parse_widths(widths),
         "steps": steps,
@@ -309,7 +333,9 @@ def batch_command(
     units: Units = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
+    spacing: Spacing = None,
     subsample: Subsample = "random",
+    holdout: Holdout = None,
     outliers: Outliers = "auto",
     widths: Widths = None,
     steps: Steps = None,
@@ -354,7 +380,9 @@ def batch_command(
         "--units": units,
         "--fraction": fraction,
         "--max-points": max_points,
+        "--spacing": spacing,
         "--subsample": subsample,
+        "--holdout": holdout,
         "--outliers": outliers,
         "--widths": widths,
         "--steps": steps,

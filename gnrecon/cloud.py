@@ -125,11 +125,14 @@ class Samples:
     points : array of shape (N, 3), unit coordinates
     normals : array of shape (N, 3), outward, of length one
     frame : Frame
+    held_out : Samples, optional
+        Points that were kept from the fit, so that it can be checked at them, in the same frame.
     """
 
     points: Float
     normals: Float
     frame: Frame
+    held_out: Samples | None = None
 
     def __len__(self) -> int:
         return len(self.points)

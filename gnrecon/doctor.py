@@ -24,6 +24,7 @@ from rich.table import Table
 from gnrecon.system_packages import LIBRARIES, install_command, loading_fault, missing_library_packages
 
 PACKAGES = {
+    "fpsample": "fpsample",
     "jinja2": "jinja2",
     "laspy": "laspy",
     "lazrs": "lazrs",

@@ -33,8 +33,13 @@ class Options:
         Share of the points to keep.
     max_points : int, optional
         Most points to keep.
-    subsample : ``"random"``, ``"voxel"`` or ``"poisson"``
-        How the kept points are chosen.
+    spacing : float or str, optional
+        Distance between neighbouring points to thin to, in file units, in another unit as in ``"2mm"``, or as in
+        ``"2s"`` in multiples of the distance that they have.
+    subsample : ``"random"``, ``"voxel"``, ``"poisson"``, ``"farthest"`` or ``"curvature"``
+        How the kept points are chosen, see `gnrecon.ingest.subsample`.
+    holdout : float in (0, 1), optional
+        Share of the points that the fit does not see; how far they lie from its surface is reported.
     outliers : ``"auto"``, ``"on"`` or ``"off"``
         Whether scattered points are removed; ``"auto"`` leaves them when they are more than 5 % of all.
     attributes : str
@@ -72,7 +77,9 @@ class Options:
     units: str | None = None
     fraction: float | None = None
     max_points: int | None = None
+    spacing: float | str | None = None
     subsample: str = "random"
+    holdout: float | None = None
     outliers: str = "auto"
     attributes: str = "auto"
     curvature: bool = False
@@ -113,6 +120,10 @@ class Options:
         if not all(name.strip() for name in self.attributes.split(",")):
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
         self.trim_at(spacing=1.0)
+        if self.spacing is not None:
+            parse_reach(str(self.spacing), 1.0, self.units)
+        if self.holdout is not None and not 0 < self.holdout < 1:
+            raise UsageError(f"The share of points to hold out is {self.holdout}, but must lie between 0 and 1.")
         self.fit()
         self.refine()
 
@@ -142,7 +153,7 @@ class Options:
 
     def ingest(self) -> dict[str, Any]:
         """Return the arguments of `gnrecon.ingest.prepare`."""
-        names = ("outliers", "fraction", "max_points", "subsample", "seed")
+        names = ("outliers", "fraction", "max_points", "spacing", "subsample", "holdout", "units", "seed")
         return {name: getattr(self, name) for name in names}
 
     def trim_at(self, spacing: float) -> float | None:

@@ -208,7 +208,10 @@ def _run(
         total = options.fit().steps_for(len(samples))
         sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total), progress.advance)
         residuals = Misfit.of(sdf, samples)
+        unseen = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
     progress.remark(solution.status)
+    if unseen is not None:
+        progress.remark(f"At {counts.held_out} points that the fit never saw: {unseen.describe()}")
     # The field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
     mesh, actions = meshed.mesh, meshed.actions
@@ -241,7 +244,9 @@ def _run(
         "reading": reading.as_dict(),
         "fineness": meshed.fineness.as_dict(),
     }
-    report = _report(source, options, stages, counts, solution, residuals, sdf, surface, actions, attributes, metrics)
+    report = _report(
+        source, options, stages, counts, solution, (residuals, unseen), sdf, surface, actions, attributes, metrics
+    )
     return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty, cloud)
 
 
@@ -317,7 +322,7 @@ def _report(
     stages: Stages,
     counts: IngestCounts,
     solution: Solution,
-    residuals: Misfit,
+    misfits: tuple[Misfit, Misfit | None],
     sdf: NeuralSDF,
     surface: dict[str, Any],
     actions: list[str],
@@ -339,7 +344,8 @@ def _report(
             "interrupted": solution.interrupted,
             "parameters": len(sdf.theta),
             "history": [vars(record) for record in solution.history],
-            "residuals": residuals.as_dict(),
+            "residuals": misfits[0].as_dict(),
+            "held_out": None if misfits[1] is None else misfits[1].as_dict(),
         },
         **surface,
         "actions": actions,

@@ -45,6 +45,14 @@ class Misfit:
         cosines = np.einsum("ij,ij->i", sdf.normals(points), normals)
         return cls(sdf.sdf(points), np.degrees(np.arccos(np.clip(cosines, -1, 1))))
 
+    def describe(self) -> str:
+        """Return a sentence with the distances, in file units, and the angles."""
+        sizes = np.abs(self.distances)
+        return (
+            f"distances {sizes.mean():.3g} on the mean, {np.percentile(sizes, 95):.3g} for 95 % of them, "
+            f"{sizes.max():.3g} at most; normals {np.median(self.angles):.1f} degrees off in the median."
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return the figures and a histogram of each residual, ready for JSON."""
         reach = _reach(np.abs(self.distances))

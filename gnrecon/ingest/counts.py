@@ -17,6 +17,7 @@ class IngestCounts:
     duplicates : dropped, because another point has exactly the same position
     outliers : dropped as scattered far off the surface
     outliers_found : found so, but left alone because they are too many or because removal is off
+    held_out : kept from the fit, to check it
     thinned : left out by subsampling
     kept : what remains
     normals : how they came about, such as ``"given"``, ``"given, flipped"`` or ``"estimated"``
@@ -28,6 +29,7 @@ class IngestCounts:
     duplicates: int = 0
     outliers: int = 0
     outliers_found: int = 0
+    held_out: int = 0
     thinned: int = 0
     kept: int = 0
     normals: str = "missing"

@@ -44,6 +44,31 @@ def poisson_disk(points: Float, count: int, rng: np.random.Generator) -> Rows:
     return chosen
 
 
+def poisson_disk_apart(points: Float, distance: float, rng: np.random.Generator) -> Rows:
+    """Return row indices of points no two of which are closer than a distance, such that no other point can be added.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), centred, distinct
+    distance : positive
+    """
+    order = rng.permutation(len(points))
+    tree = cKDTree(points[order])
+    chosen: Rows = order[_spread_in_turn(tree, distance)]
+    return chosen
+
+
+def _spread_in_turn(tree: cKDTree, radius: float) -> Rows:
+    """What `_spread` returns, point by point: a wide radius has more pairs than memory can hold."""
+    free = np.ones(tree.n, bool)
+    kept = []
+    for row in range(tree.n):
+        if free[row]:
+            kept.append(row)
+            free[tree.query_ball_point(tree.data[row], radius)] = False
+    return np.array(kept, dtype=np.intp)
+
+
 def _bracket(tree: cKDTree, count: int) -> tuple[float, float]:
     """Return a radius that keeps at least `count` points, and a larger one that keeps fewer."""
     if count == 1:

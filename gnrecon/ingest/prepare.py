@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Frame, PointCloud, Samples
 from gnrecon.errors import UsageError
 from gnrecon.ingest.clean import LEAST_POINTS, clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.normals import flip_if_inward, oriented_normals
+from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample as thin
+from gnrecon.lengths import parse_reach
 
 CLEANED, ORIENTED = 0.2, 0.7
 """About which shares of the time have passed after cleaning and after the normals."""
+
+_HELD_OUT = 1
+"""Tells the choice of held-out points from that of the kept ones, which has the same seed."""
 
 
 def prepare(
@@ -22,7 +29,10 @@ def prepare(
     outliers: str = "auto",
     fraction: float | None = None,
     max_points: int | None = None,
+    spacing: float | str | None = None,
     subsample: str = "random",
+    holdout: float | None = None,
+    units: str | None = None,
     seed: int = 0,
     advance: Advance = unheard,
 ) -> tuple[Samples, IngestCounts]:
@@ -34,8 +44,10 @@ def prepare(
     ----------
     cloud : in file units
     outliers : ``"auto"``, ``"on"`` or ``"off"``, see `clean`
-    fraction, max_points, subsample, seed : how many points to keep and how to choose them, see `subsample`, where
-        `subsample` is called `method`
+    fraction, max_points, spacing, subsample, seed : how many points to keep and how to choose them, see `subsample`,
+        where `subsample` is called `method`; a spacing may be given in mean spacings of the points, as ``"2s"``
+    holdout : share of the points, in (0, 1), that are kept from the fit as `Samples.held_out`
+    units : the cloud's unit, for a spacing in another one, as ``"2mm"``
     advance : told of the share that is done after each of them
 
     Raises
@@ -54,10 +66,28 @@ def prepare(
         how = "given, flipped" if flipped else "given"
     advance(ORIENTED)
     oriented = cleaned.with_normals(normals)
-    kept = thin(oriented, fraction=fraction, max_points=max_points, method=subsample, seed=seed)
+    oriented, held_out = _hold_out(oriented, holdout, seed)
+    # Distances between points are those of the whole cloud.
+    apart = None if spacing is None else parse_reach(str(spacing), mean_spacing(cleaned.points), units)
+    kept = thin(oriented, fraction=fraction, max_points=max_points, spacing=apart, method=subsample, seed=seed)
     if len(kept) < LEAST_POINTS:
         raise UsageError(f"Subsampling leaves {len(kept)} points, but a surface needs at least {LEAST_POINTS}.")
-    counts = replace(counts, thinned=len(cleaned) - len(kept), kept=len(kept), normals=how)
+    counts = replace(counts, thinned=len(oriented) - len(kept), held_out=len(held_out), kept=len(kept), normals=how)
     assert kept.normals is not None
     frame = Frame.of(kept.points)
-    return Samples(frame.to_unit(kept.points), kept.normals, frame), counts
+    return Samples(frame.to_unit(kept.points), kept.normals, frame, _held_samples(held_out, frame)), counts
+
+
+def _hold_out(cloud: PointCloud, share: float | None, seed: int) -> tuple[PointCloud, PointCloud]:
+    """Split off a random share of the points."""
+    if share is not None and not 0 < share < 1:
+        raise UsageError(f"The share of points to hold out is {share}, but must lie between 0 and 1.")
+    held = np.zeros(len(cloud), bool)
+    held[np.random.default_rng([seed, _HELD_OUT]).permutation(len(cloud))[: round((share or 0.0) * len(cloud))]] = True
+    return cloud.select(~held), cloud.select(held)
+
+
+def _held_samples(held_out: PointCloud, frame: Frame) -> Samples | None:
+    if not len(held_out) or held_out.normals is None:
+        return None
+    return Samples(frame.to_unit(held_out.points), held_out.normals, frame)

@@ -38,6 +38,18 @@ def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -
     return rng.permutation(_nearest_to_means(points, cells))[:count]
 
 
+def voxel_representatives_of_side(points: Float, side: float, rng: np.random.Generator) -> Rows:
+    """Return a row index for each occupied cube of the given side, the point nearest to the mean of those in it.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), distinct
+    side : positive; below a millionth of the extent, cubes of that size are taken
+    """
+    del rng  # nothing is left to chance
+    return _nearest_to_means(points, _cells(points, max(side, float(np.ptp(points, axis=0).max()) * _FINEST)))
+
+
 def _cells(points: Float, size: float) -> Rows:
     """Return for each point the number, from 0, of the occupied cube of side `size` that holds it; shape (N,)."""
     corner = np.floor((points - points.min(axis=0)) / size).astype(np.int64)

@@ -22,6 +22,7 @@ BENCHMARKS = {
     "paper": Benchmark("benchmarks.paper", "the paper's two shapes, gnrecon beside screened Poisson"),
     "uncertainty": Benchmark("benchmarks.uncertainty.main", "sigma beside the true error, on known shapes"),
     "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
+    "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
     "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),
 }
 
