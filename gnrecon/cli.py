@@ -23,7 +23,7 @@ from gnrecon.version import __version__
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
 _CommandLineError: Any = typer.BadParameter.__mro__[2]
 
-COMMANDS = ("reconstruct", "batch", "mesh", "eval", "convert", "check", "doctor", "schema")
+COMMANDS = ("reconstruct", "batch", "mesh", "eval", "convert", "check", "info", "doctor", "schema")
 DEFAULT_COMMAND = "reconstruct"
 
 app = typer.Typer(
@@ -277,6 +277,10 @@ def reconstruct_command(
             rich_help_panel=OUTPUT,
         ),
     ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Tell what would be done, and write nothing.", rich_help_panel=OUTPUT),
+    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -318,6 +322,11 @@ def reconstruct_command(
     }
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(tuple(scans), output, reference, report, preview, save, html, overwrite, format)
+    if dry_run:
+        from gnrecon.commands.info import info
+
+        files.check()
+        raise SystemExit(info(scans, options, format))
     raise SystemExit(run(files, options, command=context.obj, quiet=quiet, verbose=verbose))
 
 
@@ -531,6 +540,20 @@ def check_command(
 
     del debug
     raise SystemExit(check(mesh, as_json=as_json))
+
+
+@app.command("info")
+def info_command(
+    scans: Annotated[list[Path], typer.Argument(help="One or more scans; - is standard input.")],
+    format: Format = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Tell what is in a scan, what would trouble a fit, and what a run would do by default."""
+    from gnrecon.commands.info import info
+
+    del debug
+    raise SystemExit(info(scans, {}, format, as_json=as_json))
 
 
 @app.command("doctor")
