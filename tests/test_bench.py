@@ -16,11 +16,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.__main__ import main as bench
+from benchmarks.arrays import save_mesh, save_scan
 from benchmarks.cases import CASES, ROCKER_ARM, draw, load
 from benchmarks.comparison import Protocol, summarise
 from benchmarks.paper import main as paper
 from benchmarks.table import FIGURES, comparison_table, failures
-from benchmarks.trial import Job, run_trial, save_mesh, save_scan
+from benchmarks.trial import Job, run_trial
 
 from gnrecon.io import write_mesh
 from gnrecon.mesh import Mesh

@@ -20,6 +20,7 @@ class Benchmark:
 
 BENCHMARKS = {
     "paper": Benchmark("benchmarks.paper", "the paper's two shapes, gnrecon beside screened Poisson"),
+    "accuracy": Benchmark("benchmarks.accuracy.main", "gnrecon beside its peers on clean, noisy and sparse scans"),
     "uncertainty": Benchmark("benchmarks.uncertainty.main", "sigma beside the true error, on known shapes"),
     "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
     "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Float, Frame
+from benchmarks.problem import Problem
+from gnrecon.cloud import Float, Frame, PointCloud
 from gnrecon.errors import InputError
 from gnrecon.io import read_mesh
 from gnrecon.mesh import Mesh
@@ -29,20 +30,34 @@ class Shape:
 
 @dataclass(frozen=True)
 class Case:
-    """A shape, and the share of its vertices that the scan has."""
+    """A shape, the share of its vertices that the scan has, and the shape's genus, None where it is not closed."""
 
     shape: Shape
     fraction: float
+    genus: int | None = None
+
+    def problem(self, data: Path, seed: int) -> Problem:
+        """Return the scan of a seed and the shape, whose file lies in the folder `data`.
+
+        Raises
+        ------
+        InputError
+            When the file is missing or cannot be read.
+        """
+        truth = load(self.shape, data)
+        scan = PointCloud(*draw(truth, self.fraction, seed))
+        return Problem(scan, truth, self.genus, up=self.shape.up, view=self.shape.view)
 
 
 ROCKER_ARM = Shape("rocker-arm.off", up="z", view=(70.0, 20.0))
 BUNNY = Shape("bun_zipper.ply", up="y", view=(0.0, 10.0))
 
 CASES = {
-    "rockerarm-5": Case(ROCKER_ARM, 0.05),
-    "rockerarm-20": Case(ROCKER_ARM, 0.2),
-    "rockerarm-30": Case(ROCKER_ARM, 0.3),
-    "rockerarm-100": Case(ROCKER_ARM, 1.0),
+    "rockerarm-5": Case(ROCKER_ARM, 0.05, genus=1),
+    "rockerarm-20": Case(ROCKER_ARM, 0.2, genus=1),
+    "rockerarm-30": Case(ROCKER_ARM, 0.3, genus=1),
+    "rockerarm-100": Case(ROCKER_ARM, 1.0, genus=1),
+    "bunny-5": Case(BUNNY, 0.05),
     "bunny-20": Case(BUNNY, 0.2),
     "bunny-30": Case(BUNNY, 0.3),
     "bunny-100": Case(BUNNY, 1.0),

@@ -12,14 +12,17 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.arrays import load_mesh, load_scan
 from benchmarks.cases import CASES, DEFAULT_CASES, load
-from benchmarks.comparison import Protocol, run_case, summarise
+from benchmarks.comparison import Protocol, problems_of, run_case, summarise
 from benchmarks.provenance import REPOSITORY, provenance
-from benchmarks.sheet import draw_sheet
+from benchmarks.sheet import Part, Row, draw_row, write_sheet
 from benchmarks.table import comparison_table, failures
 from gnrecon.atomic import write_text
+from gnrecon.cloud import PointCloud
 from gnrecon.errors import ExitCode, OutputError
 
+METHODS = ("gnrecon", "Poisson")
 DATA = REPOSITORY.parent / "shared/data/paper"
 
 
@@ -42,18 +45,38 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
     report = provenance("paper", arguments) | {"protocol": asdict(protocol), "seeds": list(range(chosen.repeat))}
     with TemporaryDirectory(prefix="gnrecon-bench-") as temporary:
         folder = Path(temporary)
-        trials = {name: run_case(name, chosen.data, report["seeds"], protocol, folder / name) for name in chosen.cases}
+        trials = {
+            name: run_case(
+                name, problems_of(CASES[name], chosen.data), report["seeds"], METHODS, protocol, folder / name
+            )
+            for name in chosen.cases
+        }
         summaries = [summarise(records) for records in trials.values()]
         Console(highlight=False).print(comparison_table(summaries, chosen.repeat))
         if chosen.json:
             records = [record for case in trials.values() for record in case]
-            report |= {"summary": _lasting(summaries), "trials": _lasting(records)}
+            report |= {"summary": lasting(summaries), "trials": lasting(records)}
             write_text(chosen.json, json.dumps(report, indent=2) + "\n", overwrite=True)
         if chosen.picture:
-            draw_sheet(summaries, folder, chosen.picture)
+            rows = [draw_row(_row(summary, folder / summary["case"])) for summary in summaries]
+            write_sheet(rows, chosen.picture)
     failed = failures(summaries)
     print(*failed, sep="\n", end="\n" if failed else "")
     return ExitCode.BATCH if failed else ExitCode.OK
+
+
+def _row(summary: dict[str, Any], folder: Path) -> Row:
+    """Return the first seed's row of the contact sheet, from the files of its trials."""
+    shape = CASES[summary["case"]].shape
+    parts: dict[str, Part] = {
+        f"{summary['case']}: {summary['points']:,} points": PointCloud(*load_scan(folder / "scan-0.npz"))
+    }
+    for method in METHODS:
+        result = summary[method]
+        failed = "error" in result
+        title = f"{method}: failed" if failed else f"{method}: {1e3 * result['chamfer_mean']:.2f}e-3"
+        parts[title] = result["error"] if failed else load_mesh(Path(result["folder"]) / "mesh.npz")
+    return Row(parts | {"truth": load_mesh(folder / "truth.npz")}, shape.up, shape.view)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -91,11 +114,11 @@ def require_folders(*files: Path | None) -> None:
             raise OutputError(f"{file} cannot be written: its folder does not exist.")
 
 
-def _lasting(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def lasting(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return records without the names of temporary folders, which lie in them and in the methods within."""
     return [
         {
-            key: _lasting([value])[0] if isinstance(value, dict) else value
+            key: lasting([value])[0] if isinstance(value, dict) else value
             for key, value in record.items()
             if key != "folder"
         }

@@ -16,12 +16,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.alone import run_program
+from benchmarks.arrays import load_scan, load_truth, save_mesh
 from benchmarks.methods import METHODS
-from gnrecon.cloud import Float
-from gnrecon.errors import GnreconError
+from benchmarks.samples_apart import between_samples
+from gnrecon.cloud import PointCloud
+from gnrecon.errors import GnreconError, MeshError
 from gnrecon.export import measure, verify
 from gnrecon.memory import process_peak_mb
 from gnrecon.mesh import Mesh
@@ -34,10 +34,11 @@ class Job:
     Parameters
     ----------
     method : name in `METHODS`
-    scan, truth : files of the arrays points and normals, and of vertices and faces (.npz)
+    scan, truth : files that `arrays.save_scan` and `arrays.save_truth` wrote
     threads : processors and threads to use
     samples : samples on each surface for measuring
     settings : keyword arguments of the method
+    samples_apart : samples on each surface for distances from sample to sample; 0 for none
     """
 
     method: str
@@ -46,36 +47,16 @@ class Job:
     threads: int
     samples: int
     settings: dict[str, Any] = field(default_factory=dict)
+    samples_apart: int = 0
 
 
-def run_trial(job: Job, folder: Path) -> dict[str, Any]:
-    """Run a job in a new process within an empty `folder`, and return its figures, in units of the truth.
+def run_trial(job: Job, folder: Path, limit: float | None = None) -> dict[str, Any]:
+    """Run a job in a new process within a new `folder`, and return its figures, in units of the truth.
 
-    A failure of the method is a result too: the sentence under ``"error"`` then takes the figures' place.
+    A failure of the method is a result too: the sentence under ``"error"`` then takes the figures' place. So is an
+    empty mesh, and a run that takes more than `limit` seconds.
     """
-    return run_program("benchmarks.trial", asdict(job), job.threads, folder)
-
-
-def load_mesh(path: Path) -> Mesh:
-    """Return a mesh that `save_mesh` wrote."""
-    with np.load(path) as arrays:
-        return Mesh(arrays["vertices"], arrays["faces"])
-
-
-def save_mesh(mesh: Mesh, path: Path) -> None:
-    """Write vertices and faces as they are (.npz)."""
-    np.savez(path, vertices=mesh.vertices, faces=mesh.faces)
-
-
-def load_scan(path: Path) -> tuple[Float, Float]:
-    """Return the points and normals that `save_scan` wrote."""
-    with np.load(path) as arrays:
-        return arrays["points"], arrays["normals"]
-
-
-def save_scan(points: Float, normals: Float, path: Path) -> None:
-    """Write the points and normals of a scan as they are (.npz)."""
-    np.savez(path, points=points, normals=normals)
+    return run_program("benchmarks.trial", asdict(job), job.threads, folder, limit)
 
 
 def main(folder: Path) -> None:
@@ -94,11 +75,18 @@ def main(folder: Path) -> None:
         "peak_memory_mb": process_peak_mb(),
         "libraries_memory_mb": memory_before,
     }
+    if not len(mesh.faces):
+        raise MeshError("The mesh is empty.")
     save_mesh(mesh, folder / "mesh.npz")
-    figures |= (
-        measure(mesh, load_mesh(Path(job.truth)), samples=job.samples).as_dict() | verify(mesh).as_dict() | details
-    )
+    figures |= _compared(mesh, load_truth(Path(job.truth)), job) | verify(mesh).as_dict() | details
     (folder / "figures.json").write_text(json.dumps(figures), encoding="utf-8")
+
+
+def _compared(mesh: Mesh, truth: Mesh | PointCloud, job: Job) -> dict[str, Any]:
+    figures = measure(mesh, truth, samples=job.samples).as_dict()
+    if job.samples_apart and isinstance(truth, Mesh):
+        figures |= between_samples(mesh, truth, job.samples_apart)
+    return figures
 
 
 if __name__ == "__main__":

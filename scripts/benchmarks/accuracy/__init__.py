@@ -1,0 +1,1 @@
+"""gnrecon and its peers on scans of known surfaces."""

@@ -1,0 +1,152 @@
+"""The analytic shapes: solids that are known exactly, of radius one about the origin.
+
+Some have plane faces and sharp edges: manifold3d makes them from boxes and extruded outlines, and the mesh is the
+shape. The others are zero levels of functions: a mesh approximates them to a few hundred-thousandths, and points drawn
+from it are brought onto the zero level itself by Newton's method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from sample_shapes import Distance, gradient, project, smooth_cut
+
+from gnrecon.cloud import Float, Frame
+from gnrecon.export import extract
+from gnrecon.export.metrics import sample_surface
+from gnrecon.mesh import Mesh
+
+FINE = 0.02
+"""Longest edge of the meshes of plane faces: long slivers would be drawn with smeared shades."""
+
+STEP = 1e-5
+"""Of the central differences."""
+
+CELLS = 256
+"""Of a zero level's mesh, along the box."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A shape.
+
+    Parameters
+    ----------
+    mesh : function that returns the surface as a fine mesh, closed and oriented outward
+    genus : of the surface, which has one component
+    function : the function whose zero level is the surface, negative inside; None where the mesh is the surface
+    """
+
+    mesh: Callable[[], Mesh]
+    genus: int
+    function: Distance | None = None
+
+    def draw(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+        """Return points on the surface, uniform by area, and their outward unit normals, both of shape (N, 3)."""
+        samples = sample_surface(self.mesh(), count, rng)
+        if self.function is None:
+            assert samples.normals is not None, "a mesh has normals"
+            return samples.points, samples.normals
+        points = project(self.function, samples.points)
+        slopes = gradient(self.function, points, STEP)
+        return points, slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """A function in the unit ball as the extraction knows fields (`gnrecon.export.SignedDistance`)."""
+
+    function: Distance
+    frame: Frame
+    bounds: Float
+
+    def sdf(self, points: Float) -> Float:
+        return self.function(points)
+
+    def gradient(self, points: Float) -> Float:
+        return gradient(self.function, points, STEP)
+
+
+def _zero_level(function: Distance) -> Callable[[], Mesh]:
+    @cache
+    def mesh() -> Mesh:
+        level = _Level(function, Frame(np.zeros(3), 1.0), np.array([[-1.03] * 3, [1.03] * 3]))
+        rough = extract(level, resolution=CELLS)
+        return rough.with_vertices(project(function, rough.vertices))
+
+    return mesh
+
+
+def _manifold(build: Callable[[Any], Any]) -> Callable[[], Mesh]:
+    """Return the function that makes the mesh of what `build` makes with manifold3d, scaled to radius one."""
+
+    @cache
+    def mesh() -> Mesh:
+        import manifold3d
+
+        data = build(manifold3d)
+        vertices = data.to_mesh64().vert_properties[:, :3]
+        radius = float(np.linalg.norm(vertices, axis=1).max())
+        data = data.scale([1 / radius] * 3).refine_to_length(FINE).to_mesh64()
+        return Mesh(data.vert_properties[:, :3], data.tri_verts.astype(np.int64))
+
+    return mesh
+
+
+def sphere(points: Float) -> Float:
+    """Return the distance to the unit sphere."""
+    return np.asarray(np.linalg.norm(points, axis=1) - 1.0)
+
+
+def torus(points: Float) -> Float:
+    """Return the distance to a torus about the z axis."""
+    return np.hypot(np.hypot(points[:, 0], points[:, 1]) - 0.7, points[:, 2]) - 0.3
+
+
+def gyroid(points: Float) -> Float:
+    """Return a first-order distance to a wall along the gyroid, 0.14 thick, within the unit ball, its rim rounded."""
+    wave = 2 * np.pi / 1.4
+    s, c = np.sin(wave * points), np.cos(wave * points)
+    middle = (s[:, 0] * c[:, 1] + s[:, 1] * c[:, 2] + s[:, 2] * c[:, 0]) / (1.5 * wave)
+    return smooth_cut(np.abs(middle) - 0.07, 1.0 - np.linalg.norm(points, axis=1), 0.06)
+
+
+def _block(m: Any) -> Any:
+    """A cube with a square channel along each axis; the three meet in its middle."""
+    channels = [m.Manifold.cube(size, True) for size in ([3.0, 0.8, 0.8], [0.8, 3.0, 0.8], [0.8, 0.8, 3.0])]
+    return m.Manifold.cube([2.0, 2.0, 2.0], True) - m.Manifold.batch_boolean(channels, m.OpType.Add)
+
+
+def _plate(m: Any) -> Any:
+    """A plate of a fiftieth of its length."""
+    return m.Manifold.cube([1.0, 0.7, 0.02], True)
+
+
+def _gear(m: Any) -> Any:
+    """A gear of fourteen straight-flanked teeth with a bore, a keyway and five lightening holes."""
+    teeth, root, tip = 14, 0.80, 1.0
+    turns = np.concatenate([np.array([-0.30, -0.14, 0.14, 0.30]) + tooth for tooth in range(teeth)])
+    reach = np.tile([root, tip, tip, root], teeth)
+    angles = 2 * np.pi * turns / teeth
+    outline = m.CrossSection([np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=1)])
+    bore = m.CrossSection.circle(0.22, 96) + m.CrossSection.square([0.12, 0.3]).translate([-0.06, 0.0])
+    holes = [
+        m.CrossSection.circle(0.13, 64).translate([0.52 * np.cos(a), 0.52 * np.sin(a)])
+        for a in 2 * np.pi * (np.arange(5) + 0.25) / 5
+    ]
+    section = outline - m.CrossSection.batch_boolean([bore, *holes], m.OpType.Add)
+    return m.Manifold.extrude(section, 0.36).translate([0.0, 0.0, -0.18])
+
+
+SOLIDS = {
+    "sphere": Solid(_zero_level(sphere), genus=0, function=sphere),
+    "torus": Solid(_zero_level(torus), genus=1, function=torus),
+    "block": Solid(_manifold(_block), genus=5),
+    "plate": Solid(_manifold(_plate), genus=0),
+    "gear": Solid(_manifold(_gear), genus=6),
+    "gyroid": Solid(_zero_level(gyroid), genus=10, function=gyroid),
+}
