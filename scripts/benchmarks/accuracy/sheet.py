@@ -35,5 +35,6 @@ def sheet_row(summary: dict[str, Any], problem: Problem, folder: Path) -> Row:
 
 
 def _title(method: str, figures: dict[str, Any], factor: float) -> str:
-    shape = "open" if figures["genus"] is None else f"genus {figures['genus']:g}"
+    unsound = "open" if figures["closed"] < 1 else "no manifold"
+    shape = unsound if figures["genus"] is None else f"genus {figures['genus']:g}"
     return f"{method_title(method, figures)}: {factor * figures['chamfer_mean']:.2f}, {shape}"
