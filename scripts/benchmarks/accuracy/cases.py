@@ -38,7 +38,7 @@ SRB: dict[str, Case] = {
 }
 VIPSS: dict[str, Case] = {
     "kitten": BareScan("kitten.xyz", "kitten_gt.obj", genus=1),
-    "mug": BareScan("mug.xyz", "mug_gt.obj", genus=1),
+    "mug": BareScan("mug.xyz", "mug_gt.obj", genus=2),
 }
 CLEAN: dict[str, Case] = {
     "sphere": AnalyticScan("sphere", 2000),
