@@ -92,7 +92,8 @@ def _manifold(build: Callable[[Any], Any]) -> Callable[[], Mesh]:
         vertices = data.to_mesh64().vert_properties[:, :3]
         radius = float(np.linalg.norm(vertices, axis=1).max())
         data = data.scale([1 / radius] * 3).refine_to_length(FINE).to_mesh64()
-        return Mesh(data.vert_properties[:, :3], data.tri_verts.astype(np.int64))
+        # A copy, because manifold3d complains at the end of what still looks into its memory.
+        return Mesh(np.array(data.vert_properties[:, :3]), data.tri_verts.astype(np.int64))
 
     return mesh
 
