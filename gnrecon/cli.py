@@ -101,6 +101,13 @@ Steps = Annotated[
         rich_help_panel=FIT,
     ),
 ]
+Quality = Annotated[
+    str,
+    typer.Option(
+        help="Time against accuracy: draft, normal or high; how much detail a part of the surface may have.",
+        rich_help_panel=FIT,
+    ),
+]
 NormalResidual = Annotated[
     str,
     typer.Option(help="Residual of the normals: vector, projection or cosine.", rich_help_panel=FIT),
@@ -238,6 +245,7 @@ def reconstruct_command(
     outliers: Outliers = "auto",
     widths: Widths = None,
     steps: Steps = None,
+    quality: Quality = "normal",
     normal_residual: NormalResidual = "vector",
     optimiser: Optimiser = "gn",
     solver: Solver = "auto",
@@ -300,6 +308,7 @@ def reconstruct_command(
         "outliers": outliers,
         "widths": None if widths is None else parse_widths(widths),
         "steps": steps,
+        "quality": quality,
         "normal_residual": normal_residual,
         "optimiser": optimiser,
         "solver": solver,
@@ -348,6 +357,7 @@ def batch_command(
     outliers: Outliers = "auto",
     widths: Widths = None,
     steps: Steps = None,
+    quality: Quality = "normal",
     normal_residual: NormalResidual = "vector",
     optimiser: Optimiser = "gn",
     solver: Solver = "auto",
@@ -395,6 +405,7 @@ def batch_command(
         "--outliers": outliers,
         "--widths": widths,
         "--steps": steps,
+        "--quality": quality,
         "--normal-residual": normal_residual,
         "--optimiser": optimiser,
         "--solver": solver,

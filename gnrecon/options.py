@@ -62,7 +62,7 @@ class Options:
         ``"2mm"``, or in spacings of the points as in ``"3s"``; the mesh is then open. By default nothing is cut.
     remesh, adaptive, simplify, faces, feature_angle
         Of the mesh's refinement, see `gnrecon.export.RefineOptions`.
-    widths, steps, normal_residual, optimiser, solver, search, seed, device
+    widths, steps, quality, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
         CPU threads of the fit; by default what torch chooses.
@@ -95,6 +95,7 @@ class Options:
     feature_angle: float = RefineOptions.feature_angle
     widths: tuple[int, ...] | None = None
     steps: int | None = None
+    quality: str = FitOptions.quality
     normal_residual: str = FitOptions.normals
     optimiser: str = FitOptions.optimiser
     solver: str = FitOptions.solver
@@ -185,6 +186,7 @@ class Options:
         return FitOptions(
             widths=None if self.widths is None else tuple(self.widths),
             steps=self.steps,
+            quality=self.quality,
             normals=self.normal_residual,
             optimiser=self.optimiser,
             solver=self.solver,

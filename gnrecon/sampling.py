@@ -59,10 +59,10 @@ class CoarseDistance:
 
         self._tree = cKDTree(points)
         self.spacing = float(np.median(self._tree.query(points, k=2)[0][:, 1]))
-        self._disks = _disk_radii(points, self._tree)
+        self._disks = disk_radii(points, self._tree)
         chosen = np.sort(rng.permutation(len(points))[:_SOURCES])
         self._sources = points[chosen]
-        self._radii = _disk_radii(self._sources, cKDTree(self._sources))
+        self._radii = disk_radii(self._sources, cKDTree(self._sources))
         self._dipoles = normals[chosen] * (self._radii**2 / 4)[:, None]
 
     def sample(self, x: Float) -> tuple[Float, Float]:
@@ -89,7 +89,7 @@ class CoarseDistance:
         return np.concatenate(parts)
 
 
-def _disk_radii(points: Float, tree: Any) -> Float:
+def disk_radii(points: Float, tree: Any) -> Float:
     """Radius of the disk that each point stands for, of shape (N,): that of its k-th neighbour's, shared by k."""
     k = min(_NEIGHBOURS, len(points) - 1)
     radii: Float = tree.query(points, k + 1)[0][:, -1] / np.sqrt(k)

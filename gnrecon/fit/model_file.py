@@ -16,6 +16,7 @@ from gnrecon.atomic import atomic_write
 from gnrecon.cloud import Frame
 from gnrecon.errors import InputError
 from gnrecon.field.siren import Siren
+from gnrecon.fit.detail_file import detail_of, detail_tensors
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Box
 from gnrecon.version import __version__
@@ -41,6 +42,8 @@ def save_sdf(sdf: NeuralSDF, path: str | Path, overwrite: bool = False) -> None:
     }
     if sdf.support is not None:
         tensors["support"] = torch.as_tensor(sdf.support)
+    if sdf.detail is not None:
+        tensors |= detail_tensors(sdf.detail)
     facts = {"format": FORMAT, "gnrecon": __version__, "widths": sdf.field.widths, "options": dict(sdf.options)}
     # One entry, because safetensors writes several in an order that differs from run to run.
     metadata = {"gnrecon": json.dumps(facts)}
@@ -74,7 +77,8 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
         frame = Frame(tensors["frame.center"].cpu().numpy(), float(tensors["frame.scale"]))
         lower, upper = tensors["box"].cpu().numpy()
         support = tensors["support"].cpu().numpy() if "support" in tensors else None
-        return NeuralSDF(field, tensors["theta"], frame, Box(lower, upper), dict(facts["options"]), support)
+        detail = detail_of(path, tensors)
+        return NeuralSDF(field, tensors["theta"], frame, Box(lower, upper), dict(facts["options"]), support, detail)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
     except (SafetensorError, KeyError, ValueError, TypeError) as error:

@@ -17,6 +17,7 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
 WIDE_STEPS, DEEP_STEPS, LEAST_POINTS_TO_REFINE = 4, 120, 1000
 UNITS_PER_POINT, LEAST_UNITS = 3, 1000
 POINTS_PER_UNIT, SPARSE_UNITS, DENSE_UNITS = 4, 2000, 3000
+QUALITIES = {"draft": 500, "normal": 1000, "high": 1500}
 SEARCHES = ("auto", "damping", "geodesic", "line")
 OPTIMISERS = {"gn": "Gauss-Newton", "adam": "Adam", "lbfgs": "L-BFGS"}
 BASELINE_STEPS = {"adam": 2000, "lbfgs": 40}
@@ -29,12 +30,16 @@ class FitOptions:
     Parameters
     ----------
     widths : tuple of int, optional
-        Hidden layers of the network; by default one of three units a point from 1,000 to 2,000, and of one for four
-        points from there to 3,000. One wide layer starts from random sine features and an exact linear solve; several
-        layers start smooth, as in the paper.
+        Hidden layers of one network for the whole shape. By default there is a smooth global layer and local detail of
+        the size that the data asks for, see `gnrecon.fit.adaptive`. One wide layer starts from random sine features
+        and an exact linear solve; several layers from random frequencies.
     steps : int, optional
-        Steps after the start; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or more, none for
-        fewer points, 120 for several layers; 2,000 of Adam, and 40 of L-BFGS, each of 20 iterations.
+        Steps after the start of one network; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or
+        more, none for fewer points, 120 for several layers; 2,000 of Adam, and 40 of L-BFGS, each of 20 iterations.
+        Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
+        point from 1,000 to 2,000, and of one for four points from there to 3,000.
+    quality : ``"draft"``, ``"normal"`` or ``"high"``
+        Features of the detail a cube, 500, 1,000 or 1,500, where there is detail.
     normals : ``"vector"``, ``"projection"`` or ``"cosine"``
         Residual of the given normals, see `gnrecon.residuals.first_order`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
@@ -58,6 +63,7 @@ class FitOptions:
 
     widths: tuple[int, ...] | None = None
     steps: int | None = None
+    quality: str = "normal"
     normals: str = "vector"
     optimiser: str = "gn"
     solver: str = "auto"
@@ -72,11 +78,24 @@ class FitOptions:
             raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
         if self.normals not in NORMAL_RESIDUALS:
             raise UsageError(f"The normal residual must be one of {', '.join(NORMAL_RESIDUALS)}, not {self.normals!r}.")
+        if self.quality not in QUALITIES:
+            raise UsageError(f"The quality must be one of {', '.join(QUALITIES)}, not {self.quality!r}.")
         for name, known in (("optimiser", OPTIMISERS), ("solver", SOLVERS)):
             if getattr(self, name) not in known:
                 raise UsageError(f"The {name} must be one of {', '.join(known)}, not {getattr(self, name)!r}.")
         if self.search not in SEARCHES:
             raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the data chooses network and detail, because nothing was asked that only one network can do."""
+        one = self.widths is not None or self.steps is not None
+        return not one and self.optimiser == "gn" and self.normals == "vector"
+
+    @property
+    def features(self) -> int:
+        """Features of the detail a cube."""
+        return QUALITIES[self.quality]
 
     def steps_for(self, points: int) -> int:
         """Return the most steps after the start, for a number of points.
@@ -84,6 +103,8 @@ class FitOptions:
         Below 1,000 points frequencies that follow the data fit it better and what lies between it worse (measured, see
         docs/accuracy.md), so that by default the exact linear solve is left as it is.
         """
+        if self.adaptive:
+            return 0
         if self.steps is not None:
             return self.steps
         if self.optimiser in BASELINE_STEPS:

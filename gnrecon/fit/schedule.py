@@ -1,15 +1,17 @@
-"""Samples in, a fitted signed distance field out: one wide layer by `wide`, several by `deep`."""
+"""Samples in, a fitted signed distance field out: by default `adaptive`, else one wide layer or several, as asked."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
+from gnrecon.fit.adaptive import finite, fit_adaptive
 from gnrecon.fit.deep import fit_deep
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
@@ -48,6 +50,19 @@ def fit(
     """
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
+    if options.adaptive:
+        sdf, fitted = fit_adaptive(samples, options, rng, advance)
+    else:
+        sdf, fitted = _fit_network(samples, options, rng, callback, advance)
+    if not finite(sdf):
+        raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
+    return replace(sdf, support=_support(samples)), fitted
+
+
+def _fit_network(
+    samples: Samples, options: FitOptions, rng: np.random.Generator, callback: Callback | None, advance: Advance
+) -> tuple[NeuralSDF, Solution]:
+    """Fit the one network that the options ask for."""
     scene = Scene.of(samples, options.device, rng)
     field = Siren(options.widths_for(len(samples)))
     steps = options.steps_for(len(samples))
@@ -60,10 +75,7 @@ def fit(
         advance(started + (1.0 - started) * record.step / steps)
 
     fitted = method(field, scene, options, rng, told, part(advance, 0.0, started))
-    if not bool(torch.isfinite(fitted.theta).all()):
-        raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
-    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict(), _support(samples))
-    return sdf, fitted
+    return NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict()), fitted
 
 
 def _support(samples: Samples) -> npt.NDArray[np.float32]:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.cloud import Float, Frame
+from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren, batches
 from gnrecon.sampling import Box
 
@@ -34,6 +35,7 @@ class NeuralSDF:
     options : what the fit was asked to do, as plain values
     support : points that the field was fitted to, of shape (N, 3), unit coordinates; where there were many, some of
         them; None where they are not known
+    detail : what is added to the network near the data of a dense scan, unit coordinates
     """
 
     field: Siren
@@ -42,6 +44,7 @@ class NeuralSDF:
     box: Box
     options: Mapping[str, Any] = dataclass_field(default_factory=dict)
     support: npt.NDArray[np.float32] | None = None
+    detail: Detail | None = None
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Write the field to one file, conventionally `.gnr`, see `gnrecon.fit.model_file`."""
@@ -58,7 +61,13 @@ class NeuralSDF:
 
     def single(self) -> NeuralSDF:
         """Return the same field in single precision: several times as fast; good to about 1e-3 of the radius."""
-        return replace(self, theta=self.theta.to(torch.float32))
+        detail = None if self.detail is None else self.detail.to(torch.float32)
+        return replace(self, theta=self.theta.to(torch.float32), detail=detail)
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters, those of the detail included."""
+        return len(self.theta) + (0 if self.detail is None else self.detail.count)
 
     @property
     def bounds(self) -> Float:
@@ -77,6 +86,8 @@ class NeuralSDF:
         values = np.empty(len(x))
         for rows in self._batches(len(x)):
             values[rows] = self.field.value(self.theta, self._tensor(x[rows])).cpu().numpy()
+        if self.detail is not None:
+            values += self.detail.value(x)
         return self.frame.scale * values
 
     def gradient(self, points: npt.ArrayLike) -> Float:
@@ -86,6 +97,8 @@ class NeuralSDF:
         gradients = np.empty((len(x), 3))
         for rows in self._batches(len(x)):
             gradients[rows] = self.field.value_and_gradient(self.theta, self._tensor(x[rows]))[1].cpu().numpy()
+        if self.detail is not None:
+            gradients += self.detail.gradient(x)
         return gradients
 
     def hessian(self, points: npt.ArrayLike) -> Float:
@@ -98,6 +111,8 @@ class NeuralSDF:
         hessians = np.empty((len(x), 3, 3))
         for rows in self._batches(len(x)):
             hessians[rows] = self.field.jet(theta, torch.as_tensor(x[rows]).to(theta)).hessian().cpu().numpy()
+        if self.detail is not None:
+            hessians += self.detail.to(torch.float64).hessian(x)
         return hessians / self.frame.scale
 
     def normals(self, points: npt.ArrayLike) -> Float:

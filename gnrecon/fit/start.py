@@ -16,6 +16,7 @@ layer, with a ridge that keeps its weights small: from large weights every direc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -30,8 +31,6 @@ from gnrecon.fit.terms import Term
 from gnrecon.linalg.cholesky import Cholesky
 from gnrecon.linalg.metric import identity
 
-LENGTH = 0.12
-DEGREES_OF_FREEDOM = 4.0
 RIDGE = 1e-8
 ROUNDS = 3
 ATTEMPTS = 6
@@ -46,17 +45,35 @@ TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
 """Terms of volume samples x, their coarse distances, and at most so many data points."""
 
 
-def random_features(width: int, rng: np.random.Generator, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return frequencies, of shape (width, 3), and phases, of shape (width,), of Matern-like sine features."""
+@dataclass(frozen=True)
+class Spectrum:
+    """Of random features: their length l, in radii, and nu, the degrees of freedom: the more, the smoother."""
+
+    length: float
+    degrees_of_freedom: float
+
+
+COARSE = Spectrum(0.12, 4.0)
+
+
+def random_features(
+    width: int, rng: np.random.Generator, like: Tensor, spectrum: Spectrum = COARSE
+) -> tuple[Tensor, Tensor]:
+    """Return frequencies, of shape (width, 3), and phases, of shape (width,), of sine features of a spectrum."""
     direction = rng.standard_normal((width, 3))
-    spread = np.sqrt(rng.chisquare(DEGREES_OF_FREEDOM, width) / DEGREES_OF_FREEDOM)
-    frequencies = direction / spread[:, None] / LENGTH
+    spread = np.sqrt(rng.chisquare(spectrum.degrees_of_freedom, width) / spectrum.degrees_of_freedom)
+    frequencies = direction / spread[:, None] / spectrum.length
     phases = rng.uniform(0.0, 2 * np.pi, width)
     return torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like)
 
 
 def wide_start(
-    field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator, advance: Advance = unheard
+    field: Siren,
+    scene: Scene,
+    terms_of: TermsOf,
+    rng: np.random.Generator,
+    spectrum: Spectrum = COARSE,
+    advance: Advance = unheard,
 ) -> Tensor:
     """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
 
@@ -68,7 +85,7 @@ def wide_start(
         When the linear system cannot be solved.
     """
     like = scene.points
-    frequencies, phases = random_features(field.widths[0], rng, like)
+    frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
     for round_number in range(ROUNDS):

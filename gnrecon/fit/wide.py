@@ -17,7 +17,7 @@ from gnrecon.fit.method import optimiser_for
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
-from gnrecon.fit.start import wide_start
+from gnrecon.fit.start import COARSE, Spectrum, wide_start
 from gnrecon.optim import Callback, GainRatioDamping, Solution, StopRule
 
 SUBSPACE_UNITS = 400
@@ -31,9 +31,10 @@ def fit_wide(
     rng: np.random.Generator,
     callback: Callback | None,
     advance: Advance = unheard,
+    spectrum: Spectrum = COARSE,
 ) -> Solution:
     """Fit a network of one hidden layer; `advance` is told of the share of the start that is done."""
-    theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng, advance)
+    theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng, spectrum, advance)
     whole = options.optimiser != "gn"
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:

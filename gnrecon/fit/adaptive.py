@@ -1,0 +1,74 @@
+"""The fit of any scan by default: a smooth global field, and detail that the data itself asks for.
+
+Both are sine features with output weights that solve linear systems, one Gauss-Newton step each, which is exact because
+the field is linear in them (variable projection). The global field, of at most `COARSE_POINTS` points and long
+features, gives sign, free space and the closing of holes; it is kept smooth, because what it learned of the noise no
+detail could take back. Some points are left out of it, on which length and noise of the detail are chosen (`choose`),
+so that clean scans are interpolated and noisy ones smoothed, without a setting. Then the detail is solved (`detail`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gnrecon.advance import Advance, part, unheard
+from gnrecon.cloud import Samples
+from gnrecon.field.siren import Siren
+from gnrecon.fit.choose import Mask
+from gnrecon.fit.detail import fit_detail
+from gnrecon.fit.options import FitOptions
+from gnrecon.fit.scene import Scene
+from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.start import Spectrum
+from gnrecon.fit.wide import fit_wide
+from gnrecon.optim import Solution
+
+COARSE_POINTS, COARSE_UNITS = 5000, 1000
+SMOOTH = Spectrum(length=0.25, degrees_of_freedom=12.0)
+
+HELD_SHARE, HELD_MOST = 6, 2000
+"""One point in so many is left out of the global field, up to so many."""
+
+SHARE = 0.25
+"""Share of the time after which the global field is there."""
+
+
+def fit_adaptive(
+    samples: Samples, options: FitOptions, rng: np.random.Generator, advance: Advance = unheard
+) -> tuple[NeuralSDF, Solution]:
+    """Fit a global field and its detail; `advance` is told of the share that is done.
+
+    Raises
+    ------
+    FitError
+        When a linear system cannot be solved.
+    """
+    order = rng.permutation(len(samples))
+    out = min(len(samples) // HELD_SHARE, HELD_MOST)
+    held: Mask = np.zeros(len(samples), dtype=bool)
+    held[order[:out]] = True
+    rows = np.sort(order[out:][:COARSE_POINTS])
+    seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
+    scene = Scene.of(seen, options.device, rng)
+    field = Siren((COARSE_UNITS,))
+    linear = replace(options, widths=field.widths, steps=0)
+    fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), SMOOTH)
+    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
+    told = part(advance, SHARE, 1.0)
+    detail = fit_detail(sdf, samples, held, options.features, rng, options.device, told)
+    noise = detail.position * samples.frame.scale
+    status = (
+        f"Solved the global field and {len(detail)} cubes of detail exactly; chosen from the data: features of length "
+        f"{float(np.median(detail.lengths)) * samples.frame.scale:.3g}, noise {noise:.2g} in position and "
+        f"{np.degrees(detail.angle):.2g} degrees in normals."
+    )
+    return replace(sdf, detail=detail), replace(fitted, status=status, method="Exact linear least squares.")
+
+
+def finite(sdf: NeuralSDF) -> bool:
+    """Whether all parameters of a field are finite."""
+    detail = sdf.detail
+    return bool(torch.isfinite(sdf.theta).all()) and (detail is None or bool(torch.isfinite(detail.amplitudes).all()))

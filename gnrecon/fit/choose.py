@@ -1,0 +1,145 @@
+"""Length and noise of a scan, chosen by what they predict where data is left out.
+
+Around some points of the scan a patch is fitted without some points, which the global field has not seen either, for
+several lengths and noises. The score of each is what the left-out points then say: their mean distance to the predicted surface,
+|f| / (n . grad f), and how far the gradient there is from their normal n, as a height over the radius of the disk that a
+point stands for. The distance alone would not do: where noisy points are closer than they are exact, a field that is
+zero and flat around all of them has none.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gnrecon.cloud import Float
+from gnrecon.fit.patch import Belief, Features, Patch, PatchSystem
+
+Mask = npt.NDArray[np.bool_]
+Int = npt.NDArray[np.integer]
+
+LENGTHS = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)
+POSITIONS = (0.02, 0.1, 0.3, 0.8)
+"""Lengths and noise of the positions that are tried, over the radius of a point's disk."""
+
+ANGLES = (0.03, 0.1, 0.3)
+FIRST = 2
+"""Number of the length that is tried first."""
+
+PATCHES, HELD_NEAR = 10, 20
+"""Patches, and how many left-out points each of them predicts."""
+
+MOST_POINTS = 2500
+FEATURES = 700
+LEAST_SLOPE = 0.05
+BEYOND = 1.5
+"""How far a patch's data reaches beyond what it predicts, in lengths."""
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What a global field leaves over at the points: everything of shape (N,) or (N, 3), unit coordinates."""
+
+    points: Float
+    normals: Float
+    value: Float
+    gradient: Float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def patch(self, rows: Int, center: Float, volume: Float, distance: Float, device: str) -> Patch:
+        """Return the patch of some rows, with samples of the volume and their distances to the data."""
+        wanted = self.normals[rows] - self.gradient[rows]
+        arrays = (self.points[rows], -self.value[rows], wanted, volume, distance, center)
+        return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
+
+
+def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
+    """Return the belief that predicts left-out points best.
+
+    Parameters
+    ----------
+    leftover : Leftover
+    held : mask of shape (N,), of the points that are left out
+    radius : of the disk that a point stands for, unit coordinates
+    rng : draws patches, features and what is left out
+    device : a torch device
+    """
+    trials = _Trials.draw(leftover, held, radius, rng, device)
+    best: dict[int, tuple[float, Belief]] = {}
+
+    def score(number: int) -> float:
+        if not 0 <= number < len(LENGTHS):
+            return np.inf
+        if number not in best:
+            best[number] = trials.best(LENGTHS[number] * radius)
+        return best[number][0]
+
+    at = FIRST
+    step = 1 if score(at + 1) < score(at) else -1
+    while score(at + step) < score(at):
+        at += step
+    return best[at][1]
+
+
+@dataclass(frozen=True)
+class _Trials:
+    """Patches with what they are to predict."""
+
+    leftover: Leftover
+    radius: float
+    features: Features
+    centers: Float
+    predicted: Sequence[Int]
+    held: Mask
+    device: str
+
+    @classmethod
+    def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> _Trials:
+        out = np.flatnonzero(held)
+        chosen = rng.choice(len(leftover), min(PATCHES, len(leftover)), replace=False)
+        near = cKDTree(leftover.points[out]).query(leftover.points[chosen], min(HELD_NEAR, len(out)))[1]
+        features = Features.draw(FEATURES, rng, torch.zeros(0, dtype=torch.float64, device=device))
+        centers = leftover.points[chosen]
+        return cls(leftover, radius, features, centers, [out[rows] for rows in np.atleast_2d(near)], held, device)
+
+    def best(self, length: float) -> tuple[float, Belief]:
+        """Return the least score that this length can have, and with which noise."""
+        choices = list(itertools.product(POSITIONS, ANGLES))
+        scores = np.mean([self._scores(number, length, choices) for number in range(len(self.centers))], axis=0)
+        least = int(np.argmin(scores))
+        position, angle = choices[least]
+        return float(scores[least]), Belief(length, position * self.radius, angle)
+
+    def _scores(self, number: int, length: float, choices: Sequence[tuple[float, float]]) -> list[float]:
+        """Return the scores of one patch for each choice of noise."""
+        center, predicted = self.centers[number], self.predicted[number]
+        reach = np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max() + BEYOND * length
+        inside = (np.abs(self.leftover.points - center) < reach).all(axis=1) & ~self.held
+        rows = np.flatnonzero(inside)
+        # Beyond this many the nearest tell enough, and time would grow with the length's square.
+        if len(rows) > MOST_POINTS:
+            far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
+            rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
+        none = np.zeros((0, 3)), np.zeros(0)
+        system = PatchSystem(self.leftover.patch(rows, center, *none, self.device), self.features, length)
+        target = self.leftover.patch(predicted, center, *none, self.device)
+        normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
+        return [self._score(system.solve(p * self.radius, a), target, normals, length) for p, a in choices]
+
+    def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
+        z = self.features.phase(target.points, target.center, length)
+        # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
+        missing = target.value - z.sin() @ amplitudes
+        turn = target.gradient - (z.cos() * (amplitudes / length)) @ self.features.frequencies
+        slope = 1.0 - (turn * normals).sum(dim=1)
+        distance = missing.abs() / slope.clamp_min(LEAST_SLOPE)
+        return float(distance.mean() + self.radius * turn.norm(dim=1).mean())

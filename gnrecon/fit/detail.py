@@ -1,0 +1,137 @@
+"""Detail for dense scans: what a global field leaves over is fitted in overlapping cubes, each by one linear solve.
+
+A scan holds far more detail than one network can learn in reasonable time, and detail is local: the surface here says
+nothing of the surface there. So a coarse global field gives sign, free space and the closing of holes, and each cube
+corrects it near the data (`patch`) with a length and noise that the data itself chose (`choose`). The cubes are
+blended smoothly (`field.partition`), so that the field stays one smooth function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from gnrecon.advance import Advance, unheard
+from gnrecon.cloud import Float, Samples
+from gnrecon.field.detail import Detail
+from gnrecon.field.partition import Partition
+from gnrecon.fit.choose import Int, Leftover, Mask, choose
+from gnrecon.fit.patch import Belief, Features, PatchSystem
+from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.sampling import disk_radii
+
+CELL = 5.0
+"""Edge of a cube, in lengths."""
+
+BEYOND = 2.0
+"""How far a cube's data reaches beyond it, in radii of a point's disk."""
+
+VOLUME, CLEAR = 400, 3.5
+"""Samples of the volume a cube, and how far from the data they lie at least, in radii of a point's disk."""
+
+LEAST_POINTS = 4
+CHOSEN = 0.2
+"""Share of the time after which length and noise are chosen."""
+
+LONGER = 4.0
+"""How much longer a cube's length may be, where points are sparse, than that of the whole scan."""
+
+
+def fit_detail(
+    sdf: NeuralSDF,
+    samples: Samples,
+    held: Mask,
+    features: int,
+    rng: np.random.Generator,
+    device: str,
+    advance: Advance = unheard,
+) -> Detail:
+    """Return what to add to a global field.
+
+    Parameters
+    ----------
+    sdf : the global field, in the samples' frame
+    samples : all of them
+    held : mask of shape (N,), of samples that the global field has not seen
+    features : number of features a cube
+    rng : draws features and samples of the volume
+    device : a torch device
+    advance : told of the share that is done
+    """
+    leftover = left_over(sdf, samples)
+    radii = disk_radii(samples.points, cKDTree(samples.points))
+    belief = choose(leftover, held, float(np.median(radii)), rng, device)
+    advance(CHOSEN)
+    work = _Work.of(leftover, radii, belief, features, rng, device)
+    return work.detail(rng, advance)
+
+
+def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
+    """Return the values and gradients of a field at samples, in unit coordinates."""
+    points = samples.frame.to_world(samples.points)
+    value = sdf.sdf(points) / samples.frame.scale
+    return Leftover(samples.points, samples.normals, value, sdf.gradient(points))
+
+
+@dataclass(frozen=True)
+class _Work:
+    leftover: Leftover
+    radii: Float
+    tree: cKDTree
+    belief: Belief
+    features: Features
+    partition: Partition
+    device: str
+
+    @classmethod
+    def of(
+        cls, leftover: Leftover, radii: Float, belief: Belief, count: int, rng: np.random.Generator, device: str
+    ) -> _Work:
+        like = torch.zeros(0, dtype=torch.float64, device=device)
+        cell = CELL * belief.length
+        # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
+        partition = Partition(leftover.points.min(axis=0) - 0.137 * cell, cell)
+        features = Features.draw(count, rng, like)
+        return cls(leftover, radii, cKDTree(leftover.points), belief, features, partition, device)
+
+    def detail(self, rng: np.random.Generator, advance: Advance) -> Detail:
+        """Fit all cubes that hold data."""
+        keys, _ = self.partition.members(self.leftover.points)
+        kept, lengths, amplitudes = [], [], []
+        for number, key in enumerate(keys):
+            center = self.partition.center(key)
+            rows = self._rows(center)
+            if len(rows) >= LEAST_POINTS:
+                length = self._length(rows)
+                volume, distance = self._volume(center, rng)
+                patch = self.leftover.patch(rows, center, volume, distance, self.device)
+                system = PatchSystem(patch, self.features, length)
+                kept.append(key)
+                lengths.append(length)
+                amplitudes.append(system.solve(self.belief.position, self.belief.angle))
+            advance(CHOSEN + (1.0 - CHOSEN) * (number + 1) / len(keys))
+        frequencies, phases = self.features.frequencies, self.features.phases
+        solved = torch.stack(amplitudes)
+        noise = self.belief.position, self.belief.angle
+        return Detail(self.partition, np.array(kept), np.array(lengths), frequencies, phases, solved, *noise)
+
+    def _rows(self, center: Float) -> Int:
+        """Return the rows of the data in a cube and a little beyond."""
+        reach = self.partition.reach + BEYOND * float(np.median(self.radii))
+        near = np.array(self.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64)
+        return np.sort(near)
+
+    def _length(self, rows: Int) -> float:
+        """Return the length of a cube: longer where its points lie farther apart."""
+        sparser = float(np.median(self.radii[rows]) / np.median(self.radii))
+        return self.belief.length * min(max(sparser, 1.0), LONGER)
+
+    def _volume(self, center: Float, rng: np.random.Generator) -> tuple[Float, Float]:
+        """Return samples of a cube that lie clear of the data, and their distances to it."""
+        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (VOLUME, 3))
+        distance, nearest = self.tree.query(x)
+        clear = distance > CLEAR * self.radii[nearest]
+        return x[clear], distance[clear]

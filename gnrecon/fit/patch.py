@@ -1,0 +1,132 @@
+"""The exact fit of one patch's sine features to what a global field leaves over at the points.
+
+A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) has, with independent normal a_j of variance 2 s^2 / m, the
+distribution of a smooth random function of size s and length l. Given points where f + c = 0 and grad(f + c) = n, up to
+a noise of the positions and one of the normals, and samples of the volume where c should be a small share of the
+distance to the data, its most probable amplitudes solve one linear system. It smooths as much as the noise asks for,
+and fades out where there is no data.
+Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 2.1, with the features of Rahimi
+and Recht (2007) and observations of the gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.linalg.cholesky import damped_factor, solve_factored
+from gnrecon.linalg.gram import gram
+
+DEGREES_OF_FREEDOM = 12.0
+"""Of the features' spectrum, a Student t distribution: the larger, the smoother; 4 is a Matern kernel's."""
+
+SIZE = 3.0
+"""Standard deviation s of the correction, over the root mean square of what is left over."""
+
+SHARE = 0.1
+"""Standard deviation of the correction in the volume, as a share of the distance to the data."""
+
+ATTEMPTS = 6
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is assumed of a scan and its surface, all standard deviations or lengths.
+
+    Parameters
+    ----------
+    length : over which the surface's shape varies, unit coordinates
+    position : of the points' noise along the normal, unit coordinates
+    angle : of the normals' noise, radians
+    """
+
+    length: float
+    position: float
+    angle: float
+
+
+@dataclass(frozen=True)
+class Features:
+    """Frequencies for a length of one, of shape (m, 3), and phases, of shape (m,)."""
+
+    frequencies: Tensor
+    phases: Tensor
+
+    @classmethod
+    def draw(cls, count: int, rng: np.random.Generator, like: Tensor) -> Features:
+        """Draw features; their kernel is smooth, see `DEGREES_OF_FREEDOM`."""
+        spread = np.sqrt(rng.chisquare(DEGREES_OF_FREEDOM, count) / DEGREES_OF_FREEDOM)
+        frequencies = rng.standard_normal((count, 3)) / spread[:, None]
+        phases = rng.uniform(0.0, 2 * np.pi, count)
+        return cls(torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like))
+
+    def __len__(self) -> int:
+        return len(self.phases)
+
+    def phase(self, x: Tensor, center: Tensor, length: float) -> Tensor:
+        """Return F . (x - center) / length + p, of shape (N, m)."""
+        return torch.addmm(self.phases, (x - center) / length, self.frequencies.T)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Data of a correction.
+
+    Parameters
+    ----------
+    points : of shape (N, 3), unit coordinates
+    value, gradient : what c and grad c should be there, of shape (N,) and (N, 3)
+    volume, distance : samples of shape (Q, 3), and how far from the data they are, of shape (Q,)
+    center : of shape (3,), origin of the features' coordinates
+    """
+
+    points: Tensor
+    value: Tensor
+    gradient: Tensor
+    volume: Tensor
+    distance: Tensor
+    center: Tensor
+
+    @property
+    def size(self) -> float:
+        """Root mean square of the wanted values, or a trace where there is nothing to correct."""
+        return max(float(self.value.square().mean().sqrt()), 1e-6)
+
+
+class PatchSystem:
+    """The normal equations of a patch, assembled once and solved for any noise."""
+
+    def __init__(self, patch: Patch, features: Features, length: float) -> None:
+        self._scale = SIZE * patch.size * (2.0 / len(features)) ** 0.5
+        z = features.phase(patch.points, patch.center, length)
+        sines, cosines = z.sin(), z.cos()
+        like, count = patch.value, len(features)
+        self._positions = gram([sines], count, like), sines.T @ patch.value
+        slopes = [cosines * (features.frequencies[:, axis] / length) for axis in range(3)]
+        wanted = patch.gradient.T
+        right = sum((rows.T @ target for rows, target in zip(slopes, wanted, strict=True)), torch.zeros(count).to(like))
+        self._angles = gram(slopes, count, like), right
+        free = features.phase(patch.volume, patch.center, length).sin() / (SHARE * patch.distance[:, None])
+        self._volume = gram([free], count, like)
+
+    def product(self, position: float, angle: float) -> Tensor:
+        """Return the precision of a / (s sqrt(2 / m)), less the identity, of shape (m, m), its lower triangle valid."""
+        return self._scale**2 * (self._positions[0] / position**2 + self._angles[0] / angle**2 + self._volume)
+
+    def solve(self, position: float, angle: float) -> Tensor:
+        """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
+
+        Where rounding makes the system indefinite, it is damped more.
+        """
+        product = self.product(position, angle)
+        right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2)
+        damping = torch.ones_like(right)
+        for _ in range(ATTEMPTS):
+            factor = damped_factor(product, damping)
+            if factor is not None:
+                return self._scale * solve_factored(factor, right)
+            damping = 10 * damping
+        return torch.zeros_like(right)
