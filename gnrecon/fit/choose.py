@@ -1,10 +1,10 @@
 """Length and noise of a scan, chosen by what they predict where data is left out.
 
 Around some points of the scan a patch is fitted without some points, which the global field has not seen either, for
-several lengths and noises. The score of each is what the left-out points then say: their mean distance to the predicted surface,
-|f| / (n . grad f), and how far the gradient there is from their normal n, as a height over the radius of the disk that a
-point stands for. The distance alone would not do: where noisy points are closer than they are exact, a field that is
-zero and flat around all of them has none.
+several lengths and noises. The score of each is what the left-out points then say: their mean distance to the predicted
+surface, |f| / (n . grad f), and how far the gradient there is from their normal n, as a height over the radius of the
+disk that a point stands for. The distance alone would not do: where noisy points are closer than they are exact, a
+field that is zero and flat around all of them has none.
 """
 
 from __future__ import annotations

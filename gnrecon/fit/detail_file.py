@@ -41,7 +41,7 @@ def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
     """
     if LATTICE not in tensors:
         return None
-    lattice, keys, lengths = (tensors[name].cpu().numpy() for name in (LATTICE, NOISE, KEYS, LENGTHS))
+    lattice, noise, keys, lengths = (tensors[name].cpu().numpy() for name in (LATTICE, NOISE, KEYS, LENGTHS))
     frequencies, phases, amplitudes = (tensors[name] for name in (FREQUENCIES, PHASES, AMPLITUDES))
     cubes, features = len(lengths), len(phases)
     shapes = (lattice.shape, noise.shape, keys.shape, lengths.shape, tuple(frequencies.shape), tuple(amplitudes.shape))

@@ -114,7 +114,10 @@ class PatchSystem:
 
     def product(self, position: float, angle: float) -> Tensor:
         """Return the precision of a / (s sqrt(2 / m)), less the identity, of shape (m, m), its lower triangle valid."""
-        return self._scale**2 * (self._positions[0] / position**2 + self._angles[0] / angle**2 + self._volume)
+        product: Tensor = self._scale**2 * (
+            self._positions[0] / position**2 + self._angles[0] / angle**2 + self._volume
+        )
+        return product
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
@@ -127,6 +130,7 @@ class PatchSystem:
         for _ in range(ATTEMPTS):
             factor = damped_factor(product, damping)
             if factor is not None:
-                return self._scale * solve_factored(factor, right)
+                amplitudes: Tensor = self._scale * solve_factored(factor, right)
+                return amplitudes
             damping = 10 * damping
         return torch.zeros_like(right)
