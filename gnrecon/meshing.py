@@ -91,9 +91,11 @@ def mesh_field(
     """
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
-        mesh, cells, dropped = _extracted(field, options, data, box, advance)
+        mesh, fast, cells, dropped = _extracted(field, options, data, box, advance)
     with stages("project"):
-        mesh = project(mesh, field, steps=2, advance=advance)
+        # The first step need not be exact, only the last.
+        mesh = project(mesh, fast, steps=1, advance=part(advance, 0.0, 0.3))
+        mesh = project(mesh, field, steps=1, advance=part(advance, 0.3, 1.0))
     refined: list[str] = []
     if options.refine().anything:
         with stages("refine"):
@@ -106,8 +108,11 @@ def mesh_field(
 
 def _extracted(
     field: MeshedField, options: Options, data: Float | None, box: Float, advance: Advance
-) -> tuple[Mesh, int, list[str]]:
-    """Extract, and again with more cells until the error is small enough; with the cells, and what was dropped."""
+) -> tuple[Mesh, SignedDistance, int, list[str]]:
+    """Extract, and again with more cells until the error is small enough.
+
+    Returns the field that was good enough for it, the cells, and what was dropped.
+    """
     cells, begin = options.cells(box), 0.0
     while True:
         # How often is not known before: each attempt gets half of what is left of the stage.
@@ -116,10 +121,10 @@ def _extracted(
         mesh = extract(fast, resolution=cells, bounds=box, data=data, advance=part(advance, begin, end))
         mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
         if options.max_error is None or cells >= MOST_REFINED:
-            return mesh, cells, dropped
+            return mesh, fast, cells, dropped
         error = error_once_projected(mesh, field, cells, box)
         if error <= SAFE * options.max_error:
-            return mesh, cells, dropped
+            return mesh, fast, cells, dropped
         cells, begin = min(finer(cells, error, SAFE * options.max_error), MOST_REFINED), end
 
 

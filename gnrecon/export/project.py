@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
-from gnrecon.export.protocol import SignedDistance
+from gnrecon.export.protocol import SignedDistance, sdf_and_gradient
 from gnrecon.mesh import Mesh, area_vectors, parts
 
 Mask = npt.NDArray[np.bool_]
@@ -101,7 +101,7 @@ def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
 def newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tuple[Float, Float, Float]:
     """Points of shape (N, 3) after Newton steps no farther than `limit` from `start`, with value and gradient there."""
     points = start.copy()
-    value, gradient = field.sdf(points), field.gradient(points)
+    value, gradient = sdf_and_gradient(field, points)
     low, high = field.bounds
     for _ in range(steps):
         slopes = np.linalg.norm(gradient, axis=1)
@@ -113,11 +113,10 @@ def newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tup
         rows, trial = rows[near], trial[near]
         if not len(rows):
             break
-        trial_value = field.sdf(trial)
+        trial_value, trial_gradient = sdf_and_gradient(field, trial)
         better = np.abs(trial_value) < np.abs(value[rows])
         rows = rows[better]
-        points[rows], value[rows] = trial[better], trial_value[better]
-        gradient[rows] = field.gradient(points[rows])
+        points[rows], value[rows], gradient[rows] = trial[better], trial_value[better], trial_gradient[better]
     return points, value, gradient
 
 

@@ -27,3 +27,15 @@ class SignedDistance(Protocol):
     def gradient(self, points: Float) -> Float:
         """Gradient of the distance, of shape (N, 3) and without unit, at file coordinates of shape (N, 3)."""
         ...
+
+
+def sdf_and_gradient(field: SignedDistance, points: Float) -> tuple[Float, Float]:
+    """Return the distance, of shape (N,), and its gradient, of shape (N, 3), at points, of shape (N, 3).
+
+    A field that can make both at once, by a method of this name, does: it costs about half.
+    """
+    both = getattr(field, "sdf_and_gradient", None)
+    if both is None:
+        return field.sdf(points), field.gradient(points)
+    value, gradient = both(points)
+    return value, gradient

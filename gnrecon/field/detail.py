@@ -76,9 +76,10 @@ class Detail:
         """Return d, of shape (N,), at x, of shape (N, 3)."""
         return self._blended(x, 0)[0]
 
-    def gradient(self, x: Float) -> Float:
-        """Return the gradient of d, of shape (N, 3), at x, of shape (N, 3)."""
-        return self._blended(x, 1)[1]
+    def value_and_gradient(self, x: Float) -> tuple[Float, Float]:
+        """Return d, of shape (N,), and its gradient, of shape (N, 3), at x, of shape (N, 3)."""
+        value, gradient = self._blended(x, 1)
+        return value, gradient
 
     def hessian(self, x: Float) -> Float:
         """Return the second derivatives of d, of shape (N, 3, 3), at x, of shape (N, 3)."""

@@ -17,7 +17,7 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
 WIDE_STEPS, DEEP_STEPS, LEAST_POINTS_TO_REFINE = 4, 120, 1000
 UNITS_PER_POINT, LEAST_UNITS = 3, 1000
 POINTS_PER_UNIT, SPARSE_UNITS, DENSE_UNITS = 4, 2000, 3000
-QUALITIES = {"draft": 500, "normal": 1000, "high": 1500}
+QUALITIES = {"draft": 300, "normal": 600, "high": 1000}
 SEARCHES = ("auto", "damping", "geodesic", "line")
 OPTIMISERS = {"gn": "Gauss-Newton", "adam": "Adam", "lbfgs": "L-BFGS"}
 BASELINE_STEPS = {"adam": 2000, "lbfgs": 40}
@@ -39,7 +39,7 @@ class FitOptions:
         Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
         point from 1,000 to 2,000, and of one for four points from there to 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
-        Features of the detail a cube, 500, 1,000 or 1,500, where there is detail.
+        Features of the detail a cube, 300, 600 or 1,000, where there is detail.
     normals : ``"vector"``, ``"projection"`` or ``"cosine"``
         Residual of the given normals, see `gnrecon.residuals.first_order`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``

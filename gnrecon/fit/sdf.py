@@ -92,14 +92,20 @@ class NeuralSDF:
 
     def gradient(self, points: npt.ArrayLike) -> Float:
         """Return the gradient of the distance, of shape (N, 3), at `points`, of shape (N, 3); it has no unit."""
+        return self.sdf_and_gradient(points)[1]
+
+    def sdf_and_gradient(self, points: npt.ArrayLike) -> tuple[Float, Float]:
+        """Return distances and gradients at once, as `sdf` and `gradient` do, at `points`, of shape (N, 3)."""
         x = self._unit(points)
-        # The frame's scale enters value and coordinate alike and cancels.
-        gradients = np.empty((len(x), 3))
+        # The frame's scale enters value and coordinate alike and cancels in the gradient.
+        values, gradients = np.empty(len(x)), np.empty((len(x), 3))
         for rows in self._batches(len(x)):
-            gradients[rows] = self.field.value_and_gradient(self.theta, self._tensor(x[rows]))[1].cpu().numpy()
+            value, gradient = self.field.value_and_gradient(self.theta, self._tensor(x[rows]))
+            values[rows], gradients[rows] = value.cpu().numpy(), gradient.cpu().numpy()
         if self.detail is not None:
-            gradients += self.detail.gradient(x)
-        return gradients
+            more = self.detail.value_and_gradient(x)
+            values, gradients = values + more[0], gradients + more[1]
+        return self.frame.scale * values, gradients
 
     def hessian(self, points: npt.ArrayLike) -> Float:
         """Return second derivatives of the distance, of shape (N, 3, 3), per file unit, at `points`, of shape (N, 3).
