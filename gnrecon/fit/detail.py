@@ -65,7 +65,7 @@ def fit_detail(
     radii = disk_radii(samples.points, cKDTree(samples.points))
     belief = choose(leftover, held, float(np.median(radii)), rng, device)
     advance(CHOSEN)
-    work = _Work.of(leftover, radii, belief, features, rng, device)
+    work = Cubes.of(leftover, radii, belief, features, rng, device)
     return work.detail(rng, advance)
 
 
@@ -77,7 +77,9 @@ def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
 
 
 @dataclass(frozen=True)
-class _Work:
+class Cubes:
+    """The cubes of a detail with the data that they are fitted to."""
+
     leftover: Leftover
     radii: Float
     tree: cKDTree
@@ -89,7 +91,7 @@ class _Work:
     @classmethod
     def of(
         cls, leftover: Leftover, radii: Float, belief: Belief, count: int, rng: np.random.Generator, device: str
-    ) -> _Work:
+    ) -> Cubes:
         like = torch.zeros(0, dtype=torch.float64, device=device)
         cell = CELL * belief.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
@@ -103,9 +105,9 @@ class _Work:
         kept, lengths, amplitudes = [], [], []
         for number, key in enumerate(keys):
             center = self.partition.center(key)
-            rows = self._rows(center)
+            rows = self.rows(center)
             if len(rows) >= LEAST_POINTS:
-                length = self._length(rows)
+                length = self.length(rows)
                 volume, distance = self._volume(center, rng)
                 patch = self.leftover.patch(rows, center, volume, distance, self.device)
                 system = PatchSystem(patch, self.features, length)
@@ -118,13 +120,13 @@ class _Work:
         noise = self.belief.position, self.belief.angle
         return Detail(self.partition, np.array(kept), np.array(lengths), frequencies, phases, solved, *noise)
 
-    def _rows(self, center: Float) -> Int:
+    def rows(self, center: Float) -> Int:
         """Return the rows of the data in a cube and a little beyond."""
         reach = self.partition.reach + BEYOND * float(np.median(self.radii))
         near = np.array(self.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64)
         return np.sort(near)
 
-    def _length(self, rows: Int) -> float:
+    def length(self, rows: Int) -> float:
         """Return the length of a cube: longer where its points lie farther apart."""
         sparser = float(np.median(self.radii[rows]) / np.median(self.radii))
         return self.belief.length * min(max(sparser, 1.0), LONGER)

@@ -64,6 +64,10 @@ class NeuralSDF:
         detail = None if self.detail is None else self.detail.to(torch.float32)
         return replace(self, theta=self.theta.to(torch.float32), detail=detail)
 
+    def coarse(self) -> NeuralSDF:
+        """Return the network alone, without detail."""
+        return replace(self, detail=None)
+
     @property
     def parameters(self) -> int:
         """Number of parameters, those of the detail included."""

@@ -15,6 +15,7 @@ error bar; the formula is the delta method.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from torch import Tensor
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.siren import batches
 from gnrecon.fit.data_rows import DataRows
+from gnrecon.fit.detail_uncertainty import DetailDeviation
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
 from gnrecon.fit.loss import normal_weight
@@ -39,6 +41,40 @@ LEAST_SLOPE = 0.1
 """Of the field, whose gradient should have length one; near its critical points the first order says nothing."""
 
 
+class Deviation(Protocol):
+    """Standard deviations of a field's values."""
+
+    def at(self, x: Float) -> Float:
+        """Return them, of shape (N,), at x, of shape (N, 3), unit coordinates."""
+        ...
+
+
+@dataclass(frozen=True)
+class NetworkDeviation:
+    """Standard deviations of one network.
+
+    Parameters
+    ----------
+    rows : the data that it was fitted to
+    whitener : of shape (p, p), single precision, with C = W^T W for the covariance C of the free parameters
+    """
+
+    rows: DataRows
+    whitener: Tensor
+
+    def at(self, x: Float) -> Float:
+        """Return the standard deviation of the network's value, of shape (N,), at x, of shape (N, 3)."""
+        points = torch.as_tensor(x).to(self.rows.theta)
+        parts = [self._at(points[rows]) for rows in batches(len(points), BATCH)]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def _at(self, x: Tensor) -> Float:
+        # Rows are made in double precision: frequencies are high, and phases must be exact before they are rounded.
+        variances = [(chunk.float() @ self.whitener.T).square().sum(1) for chunk in self.rows.values(x).dense()]
+        deviation: Float = torch.cat(variances).sqrt().double().cpu().numpy()
+        return deviation
+
+
 @dataclass(frozen=True)
 class Uncertainty:
     """Standard deviations of a fitted surface, along its normal.
@@ -46,15 +82,13 @@ class Uncertainty:
     Parameters
     ----------
     sdf : the fitted field
-    rows : the data that it was fitted to
-    whitener : of shape (p, p), single precision, with C = W^T W for the covariance C of the free parameters
+    deviation : of the field's values, before it is calibrated
     noise : of the points along the normal with which they and their normals fit together, file units
     factor : c, by which errors at left-out points exceed what C alone says
     """
 
     sdf: NeuralSDF
-    rows: DataRows
-    whitener: Tensor
+    deviation: Deviation
     noise: float
     factor: float
 
@@ -75,6 +109,9 @@ class Uncertainty:
         FitError
             When the matrix of the data cannot be factored, because it is not finite.
         """
+        if sdf.detail is not None:
+            local = DetailDeviation.of(sdf, samples)
+            return cls(sdf, local, sdf.detail.position * sdf.frame.scale, local.calibration(seed))
         rng = np.random.default_rng(seed)
         chosen = np.sort(rng.permutation(len(samples))[:MOST_POINTS])
         points, normals = (
@@ -85,28 +122,21 @@ class Uncertainty:
         rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)
         factor = calibration(rows, posterior, seed)
-        return cls(sdf, rows, posterior.whitener().float(), posterior.noise * sdf.frame.scale, factor)
+        return cls(sdf, NetworkDeviation(rows, posterior.whitener().float()), posterior.noise * sdf.frame.scale, factor)
 
     def sigma(self, points: npt.ArrayLike) -> Float:
         """Return the standard deviation of the surface, of shape (N,), at points on it, of shape (N, 3); file units.
 
         Away from the surface it is that of the level set through the point.
         """
-        unit = self.sdf.frame.to_unit(np.asarray(points, dtype=np.float64).reshape(-1, 3))
-        x = torch.as_tensor(unit).to(self.sdf.theta)
-        parts = [self._sigma(x[rows]) for rows in batches(len(x), BATCH)]
-        return np.concatenate([np.zeros(0), *parts])
+        x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        slope = np.maximum(np.linalg.norm(self.sdf.gradient(x), axis=1), LEAST_SLOPE)
+        sigma: Float = self.factor * self.sdf.frame.scale * self.deviation.at(self.sdf.frame.to_unit(x)) / slope
+        return sigma
 
     def describe(self) -> str:
         """Return the noise and the factor as a phrase."""
         return f"noise {self.noise:.3g}, calibrated by {self.factor:.3g} where data is left out"
-
-    def _sigma(self, x: Tensor) -> Float:
-        # Rows are made in double precision: frequencies are high, and phases must be exact before they are rounded.
-        variances = [(chunk.float() @ self.whitener.T).square().sum(1) for chunk in self.rows.values(x).dense()]
-        slope = self.sdf.field.value_and_gradient(self.sdf.theta, x)[1].norm(dim=1).clamp_min(LEAST_SLOPE)
-        sigma: Float = (torch.cat(variances).sqrt().double() / slope).cpu().numpy()
-        return self.factor * self.sdf.frame.scale * sigma
 
 
 def _spacing(points: Float) -> float:

@@ -83,7 +83,7 @@ def test_sigma_is_that_of_bayesian_regression(widths: tuple[int, ...]) -> None:
     frame = Frame(np.array([100.0, 200.0, 300.0]), 25.0)
     found = Uncertainty.of(NeuralSDF(field, theta, frame, BOX), Samples(data.numpy(), data.numpy(), frame))
     x = directions(9, seed=1)
-    covariance = torch.linalg.inv(plain_precision(found.rows, found.noise / frame.scale)[0])
+    covariance = torch.linalg.inv(plain_precision(found.deviation.rows, found.noise / frame.scale)[0])
     rows = plain_rows(field, theta, x, free_columns(field))[0]
     steep = field.value_and_gradient(theta, x)[1].norm(dim=1)
     assert (steep > 0.1).all()
