@@ -30,6 +30,10 @@ POSITIONS = (0.02, 0.1, 0.3, 0.8)
 """Lengths and noise of the positions that are tried, over the radius of a point's disk."""
 
 ANGLES = (0.03, 0.1, 0.3)
+CHOICES = tuple(itertools.product(POSITIONS, ANGLES))
+ALIKE = 0.025
+"""Share by which a score may exceed the best and yet count as alike."""
+
 FIRST = 2
 """Number of the length that is tried first."""
 
@@ -74,20 +78,45 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     device : a torch device
     """
     trials = _Trials.draw(leftover, held, radius, rng, device)
-    best: dict[int, tuple[float, Belief]] = {}
+    scores: dict[int, Float] = {}
 
-    def score(number: int) -> float:
+    def least(number: int) -> float:
+        """Return the least score of a length, over the noises."""
         if not 0 <= number < len(LENGTHS):
             return np.inf
-        if number not in best:
-            best[number] = trials.best(LENGTHS[number] * radius)
-        return best[number][0]
+        if number not in scores:
+            scores[number] = trials.scores(LENGTHS[number] * radius)
+        return float(scores[number].mean(axis=0).min())
 
     at = FIRST
-    step = 1 if score(at + 1) < score(at) else -1
-    while score(at + step) < score(at):
+    step = 1 if least(at + 1) < least(at) else -1
+    while least(at + step) < least(at):
         at += step
-    return best[at][1]
+    number, choice = _smoothest(scores)
+    position, angle = CHOICES[choice]
+    return Belief(LENGTHS[number] * radius, position * radius, angle)
+
+
+def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
+    """Return the number of the length and of the noise that assume most noise, and are as good as the best.
+
+    As good is what lies within its standard error of the best, patch against patch, or within a share. Noise that is
+    alike among neighbours, as that of scans that do not quite match, shows little where single points are left out.
+    Source: the one-standard-error rule, Hastie et al., The Elements of Statistical Learning (2009), section 7.10.
+
+    Parameters
+    ----------
+    scores : for each number of a length, of shape (patches, noises)
+    """
+    numbers = sorted(scores)
+    table = np.stack([scores[number] for number in numbers], axis=1)
+    mean = table.mean(axis=0)
+    best = np.unravel_index(int(np.argmin(mean)), mean.shape)
+    over = table - table[:, best[0], best[1]][:, None, None]
+    tolerance = np.maximum(over.std(axis=0) / np.sqrt(len(table)), ALIKE * mean[best])
+    alike = [(CHOICES[c][0], LENGTHS[numbers[n]], n, c) for n, c in np.argwhere(over.mean(axis=0) <= tolerance)]
+    _, _, row, choice = max(alike)
+    return numbers[int(row)], int(choice)
 
 
 @dataclass(frozen=True)
@@ -111,15 +140,11 @@ class _Trials:
         centers = leftover.points[chosen]
         return cls(leftover, radius, features, centers, [out[rows] for rows in np.atleast_2d(near)], held, device)
 
-    def best(self, length: float) -> tuple[float, Belief]:
-        """Return the least score that this length can have, and with which noise."""
-        choices = list(itertools.product(POSITIONS, ANGLES))
-        scores = np.mean([self._scores(number, length, choices) for number in range(len(self.centers))], axis=0)
-        least = int(np.argmin(scores))
-        position, angle = choices[least]
-        return float(scores[least]), Belief(length, position * self.radius, angle)
+    def scores(self, length: float) -> Float:
+        """Return the scores of a length, of shape (patches, noises), in radii."""
+        return np.array([self._scores(number, length) for number in range(len(self.centers))]) / self.radius
 
-    def _scores(self, number: int, length: float, choices: Sequence[tuple[float, float]]) -> list[float]:
+    def _scores(self, number: int, length: float) -> list[float]:
         """Return the scores of one patch for each choice of noise."""
         center, predicted = self.centers[number], self.predicted[number]
         reach = np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max() + BEYOND * length
@@ -133,7 +158,7 @@ class _Trials:
         system = PatchSystem(self.leftover.patch(rows, center, *none, self.device), self.features, length)
         target = self.leftover.patch(predicted, center, *none, self.device)
         normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
-        return [self._score(system.solve(p * self.radius, a), target, normals, length) for p, a in choices]
+        return [self._score(system.solve(p * self.radius, a), target, normals, length) for p, a in CHOICES]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
         z = self.features.phase(target.points, target.center, length)

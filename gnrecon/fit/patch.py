@@ -100,7 +100,7 @@ class PatchSystem:
     """The normal equations of a patch, assembled once and solved for any noise."""
 
     def __init__(self, patch: Patch, features: Features, length: float) -> None:
-        self._scale = SIZE * patch.size * (2.0 / len(features)) ** 0.5
+        self._scale = float(SIZE * patch.size * (2.0 / len(features)) ** 0.5)
         z = features.phase(patch.points, patch.center, length)
         sines, cosines = z.sin(), z.cos()
         like, count = patch.value, len(features)
