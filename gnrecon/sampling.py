@@ -16,8 +16,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from gnrecon.cloud import Float
+
+Mask = npt.NDArray[np.bool_]
 
 _SOURCES = 4000
 _NEIGHBOURS = 8
@@ -67,12 +70,18 @@ class CoarseDistance:
 
     def sample(self, x: Float) -> tuple[Float, Float]:
         """Return those of the points x, of shape (Q, 3), where the distance is known, and the distances there."""
+        known, distances = self.at(x)
+        return x[known], distances[known]
+
+    def at(self, x: Float) -> tuple[Mask, Float]:
+        """Return where the distance is known, and the distances, zero elsewhere, both (Q,), at x, of shape (Q, 3)."""
         # One worker: with several, Ctrl-C unwinds while scipy's threads still use the arrays, and the process crashes.
         distances, nearest = self._tree.query(x)
         known = distances > 2 * self._disks[nearest]
-        x, distances, disks = x[known], distances[known], self._disks[nearest[known]]
-        sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
-        return x, sign * np.sqrt(distances**2 - disks**2)
+        sign = np.where(self.winding_number(x[known]) > 0.5, -1.0, 1.0)
+        signed = np.zeros(len(x))
+        signed[known] = sign * np.sqrt(distances[known] ** 2 - self._disks[nearest[known]] ** 2)
+        return known, signed
 
     def winding_number(self, x: Float, batch: int = 2048) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""

@@ -59,11 +59,25 @@ class Leftover:
     def __len__(self) -> int:
         return len(self.points)
 
-    def patch(self, rows: Int, center: Float, volume: Float, distance: Float, device: str) -> Patch:
-        """Return the patch of some rows, with samples of the volume and their distances to the data."""
-        wanted = self.normals[rows] - self.gradient[rows]
-        arrays = (self.points[rows], -self.value[rows], wanted, volume, distance, center)
+    def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
+        """Return the patch of some rows, with samples of the volume."""
+        turn = self.normals[rows] - self.gradient[rows]
+        arrays = (self.points[rows], -self.value[rows], turn, volume.points, volume.wanted, volume.distance, center)
         return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Samples of space, of shape (Q, 3), what a correction should be there, and how far the data is, of shape (Q,)."""
+
+    points: Float
+    wanted: Float
+    distance: Float
+
+    @classmethod
+    def none(cls) -> Volume:
+        """Return no samples."""
+        return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
 def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
@@ -154,9 +168,8 @@ class _Trials:
         if len(rows) > MOST_POINTS:
             far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
             rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
-        none = np.zeros((0, 3)), np.zeros(0)
-        system = PatchSystem(self.leftover.patch(rows, center, *none, self.device), self.features, length)
-        target = self.leftover.patch(predicted, center, *none, self.device)
+        system = PatchSystem(self.leftover.patch(rows, center, Volume.none(), self.device), self.features, length)
+        target = self.leftover.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
         return [self._score(system.solve(p * self.radius, a), target, normals, length) for p, a in CHOICES]
 

@@ -18,10 +18,10 @@ from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.partition import Partition
-from gnrecon.fit.choose import Int, Leftover, Mask, choose
+from gnrecon.fit.choose import Int, Leftover, Mask, Volume, choose
 from gnrecon.fit.patch import Belief, Features, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.sampling import disk_radii
+from gnrecon.sampling import CoarseDistance, disk_radii
 
 CELL = 5.0
 """Edge of a cube, in lengths."""
@@ -65,8 +65,9 @@ def fit_detail(
     radii = disk_radii(samples.points, cKDTree(samples.points))
     belief = choose(leftover, held, float(np.median(radii)), rng, device)
     advance(CHOSEN)
+    coarse = CoarseDistance(samples.points, samples.normals, rng)
     work = Cubes.of(leftover, radii, belief, features, rng, device)
-    return work.detail(rng, advance)
+    return work.detail(sdf, coarse, rng, advance)
 
 
 def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
@@ -99,17 +100,17 @@ class Cubes:
         features = Features.draw(count, rng, like)
         return cls(leftover, radii, cKDTree(leftover.points), belief, features, partition, device)
 
-    def detail(self, rng: np.random.Generator, advance: Advance) -> Detail:
+    def detail(self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: Advance) -> Detail:
         """Fit all cubes that hold data."""
         keys, _ = self.partition.members(self.leftover.points)
+        volumes = self._volumes(sdf, coarse, keys, rng)
         kept, lengths, amplitudes = [], [], []
         for number, key in enumerate(keys):
             center = self.partition.center(key)
             rows = self.rows(center)
             if len(rows) >= LEAST_POINTS:
                 length = self.length(rows)
-                volume, distance = self._volume(center, rng)
-                patch = self.leftover.patch(rows, center, volume, distance, self.device)
+                patch = self.leftover.patch(rows, center, volumes[number], self.device)
                 system = PatchSystem(patch, self.features, length)
                 kept.append(key)
                 lengths.append(length)
@@ -131,9 +132,19 @@ class Cubes:
         sparser = float(np.median(self.radii[rows]) / np.median(self.radii))
         return self.belief.length * min(max(sparser, 1.0), LONGER)
 
-    def _volume(self, center: Float, rng: np.random.Generator) -> tuple[Float, Float]:
-        """Return samples of a cube that lie clear of the data, and their distances to it."""
-        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (VOLUME, 3))
+    def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
+        """Return samples of each cube that lie clear of the data, with what the coarse distance asks for there."""
+        centers = self.partition.center(keys)
+        x = centers[:, None, :] + self.partition.reach * rng.uniform(-1.0, 1.0, (len(keys), VOLUME, 3))
+        cube = np.repeat(np.arange(len(keys)), VOLUME)
+        x = x.reshape(-1, 3)
+        inside = ((x > sdf.box.lower) & (x < sdf.box.upper)).all(axis=1)
         distance, nearest = self.tree.query(x)
-        clear = distance > CLEAR * self.radii[nearest]
-        return x[clear], distance[clear]
+        clear = inside & (distance > CLEAR * self.radii[nearest])
+        x, cube, distance = x[clear], cube[clear], distance[clear]
+        known, signed = coarse.at(x)
+        wanted = signed - sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
+        return [
+            Volume(x[rows], wanted[rows], distance[rows])
+            for rows in (np.flatnonzero(known & (cube == number)) for number in range(len(keys)))
+        ]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.detail import Detail
-from gnrecon.fit.choose import Int, Leftover
+from gnrecon.fit.choose import Int, Leftover, Volume
 from gnrecon.fit.detail import Cubes, left_over
 from gnrecon.fit.patch import SIZE, Belief, Features, Patch, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
@@ -57,7 +57,8 @@ class DetailDeviation:
         belief = Belief(float(np.min(detail.lengths)), detail.position, detail.angle)
         features = Features(detail.frequencies, detail.phases)
         device = str(detail.phases.device)
-        cubes = Cubes(leftover, disk_radii(samples.points, tree), tree, belief, features, detail.partition, device)
+        radii = disk_radii(samples.points, tree)
+        cubes = Cubes(leftover, radii, tree, belief, features, detail.partition, device)
         return cls(detail, cubes, SIZE * float(np.sqrt(np.mean(leftover.value**2))))
 
     def at(self, x: Float) -> Float:
@@ -102,8 +103,7 @@ class DetailDeviation:
             yield self._of_cube(kept, center).scores(self.cubes.leftover, rows[out], self.detail.position)
 
     def _of_cube(self, rows: Int, center: Float) -> _OfCube:
-        none = np.zeros((0, 3)), np.zeros(0)
-        patch = self.cubes.leftover.patch(rows, center, *none, self.cubes.device)
+        patch = self.cubes.leftover.patch(rows, center, Volume.none(), self.cubes.device)
         length = self.cubes.length(rows)
         system = PatchSystem(patch, self.cubes.features, length)
         return _OfCube(patch, system, self.cubes.features, length, self.detail.position, self.detail.angle)

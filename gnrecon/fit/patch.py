@@ -2,9 +2,9 @@
 
 A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) has, with independent normal a_j of variance 2 s^2 / m, the
 distribution of a smooth random function of size s and length l. Given points where f + c = 0 and grad(f + c) = n, up to
-a noise of the positions and one of the normals, and samples of the volume where c should be a small share of the
-distance to the data, its most probable amplitudes solve one linear system. It smooths as much as the noise asks for,
-and fades out where there is no data.
+a noise of the positions and one of the normals, and samples of the volume where f + c is the coarse signed distance up
+to a share of it, its most probable amplitudes solve one linear system. It smooths as much as the noise asks for, and
+free space keeps its sign.
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 2.1, with the features of Rahimi
 and Recht (2007) and observations of the gradient.
 """
@@ -26,8 +26,8 @@ DEGREES_OF_FREEDOM = 12.0
 SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""
 
-SHARE = 0.1
-"""Standard deviation of the correction in the volume, as a share of the distance to the data."""
+SHARE = 0.15
+"""Standard deviation of the coarse distance in the volume, as a share of itself."""
 
 ATTEMPTS = 6
 
@@ -79,7 +79,8 @@ class Patch:
     ----------
     points : of shape (N, 3), unit coordinates
     value, gradient : what c and grad c should be there, of shape (N,) and (N, 3)
-    volume, distance : samples of shape (Q, 3), and how far from the data they are, of shape (Q,)
+    volume, wanted, distance : samples of shape (Q, 3), what c should be there, and how far from the data they are, both
+        of shape (Q,)
     center : of shape (3,), origin of the features' coordinates
     """
 
@@ -87,6 +88,7 @@ class Patch:
     value: Tensor
     gradient: Tensor
     volume: Tensor
+    wanted: Tensor
     distance: Tensor
     center: Tensor
 
@@ -110,7 +112,7 @@ class PatchSystem:
         right = sum((rows.T @ target for rows, target in zip(slopes, wanted, strict=True)), torch.zeros(count).to(like))
         self._angles = gram(slopes, count, like), right
         free = features.phase(patch.volume, patch.center, length).sin() / (SHARE * patch.distance[:, None])
-        self._volume = gram([free], count, like)
+        self._volume = gram([free], count, like), free.T @ (patch.wanted / (SHARE * patch.distance))
 
     @property
     def scale(self) -> float:
@@ -140,8 +142,8 @@ class PatchSystem:
 
         Where rounding makes the system indefinite, it is damped more.
         """
-        product = self._precision(position, angle) + self._scale**2 * self._volume
-        right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2)
+        product = self._precision(position, angle) + self._scale**2 * self._volume[0]
+        right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2 + self._volume[1])
         damping = torch.ones_like(right)
         for _ in range(ATTEMPTS):
             factor = damped_factor(product, damping)
