@@ -26,7 +26,7 @@ DEGREES_OF_FREEDOM = 12.0
 SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""
 
-SHARE = 0.15
+SHARE = 0.5
 """Standard deviation of the coarse distance in the volume, as a share of itself."""
 
 ATTEMPTS = 6
