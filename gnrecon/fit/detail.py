@@ -1,8 +1,8 @@
-"""Detail for dense scans: what a global field leaves over is fitted in overlapping cubes, each by one linear solve.
+"""Detail for a scan: what a global field leaves over is fitted in overlapping cubes, each by one linear solve.
 
 A scan holds far more detail than one network can learn in reasonable time, and detail is local: the surface here says
-nothing of the surface there. So a coarse global field gives sign, free space and the closing of holes, and each cube
-corrects it near the data (`patch`) with a length and noise that the data itself chose (`choose`). The cubes are
+nothing of the surface there. So a smooth global field gives the sign and closes holes, and each cube corrects it near
+the data (`patch`) with a length and noise that the data itself chose (`choose`). The cubes are
 blended smoothly (`field.partition`), so that the field stays one smooth function.
 """
 

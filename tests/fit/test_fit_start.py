@@ -10,8 +10,9 @@ from torch import Tensor
 
 from gnrecon.errors import FitError
 from gnrecon.field import Siren
+from gnrecon.fit.adaptive import SMOOTH
 from gnrecon.fit.problem import FieldProblem
-from gnrecon.fit.start import DEGREES_OF_FREEDOM, LENGTH, random_features, solve_last_layer
+from gnrecon.fit.start import COARSE, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.terms import Term
 from gnrecon.residuals import interface, normal_vector, signed_distance
 
@@ -74,16 +75,17 @@ def test_values_that_are_not_finite_end_with_a_sentence() -> None:
         solve_last_layer(field, broken, theta)
 
 
-def test_features_have_a_maternlike_spectrum() -> None:
-    """The kernel E[2 sin(w.x + b) sin(w.y + b)] = E[cos w.(x - y)] is Matern's, of smoothness nu / 2 = 2."""
+@pytest.mark.parametrize("spectrum", [COARSE, SMOOTH], ids=["coarse", "smooth"])
+def test_features_have_a_maternlike_spectrum(spectrum: Spectrum) -> None:
+    """The kernel E[2 sin(w.x + b) sin(w.y + b)] = E[cos w.(x - y)] is Matern's, of smoothness nu / 2."""
     like = torch.zeros(1, dtype=torch.float64)
-    frequencies, phases = random_features(200_000, np.random.default_rng(0), like)
+    frequencies, phases = random_features(200_000, np.random.default_rng(0), like, spectrum)
     assert frequencies.shape == (200_000, 3)
     assert float(phases.min()) >= 0.0
     assert float(phases.max()) <= 2 * np.pi
     for distance in (0.05, 0.12, 0.3):
-        smoothness = DEGREES_OF_FREEDOM / 2
-        s = np.sqrt(2 * smoothness) * distance / LENGTH
+        smoothness = spectrum.degrees_of_freedom / 2
+        s = np.sqrt(2 * smoothness) * distance / spectrum.length
         matern = 2 ** (1 - smoothness) / np.prod(np.arange(1, smoothness)) * s**smoothness * kv(smoothness, s)
         offset = distance * torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64)
         kernel = float(torch.cos(frequencies @ offset).mean())

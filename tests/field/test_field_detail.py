@@ -1,0 +1,61 @@
+"""Local detail against its formula written plainly, and against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gnrecon.field.detail import Detail
+from gnrecon.field.partition import Partition
+
+
+def detail(rng: np.random.Generator, cubes: int = 5, features: int = 7) -> Detail:
+    keys = np.array([[0, 0, k] for k in range(cubes)])
+    parts = (rng.standard_normal((features, 3)), rng.uniform(0, 6, features), rng.standard_normal((cubes, features)))
+    tensors = [torch.as_tensor(part) for part in parts]
+    return Detail(Partition(np.array([0.1, 0.2, 0.3]), 0.5), keys, rng.uniform(0.1, 0.3, cubes), *tensors, 1e-3, 0.1)
+
+
+def plainly(of: Detail, x: np.ndarray) -> float:
+    """d at one point, cube by cube."""
+    total = 0.0
+    for number, key in enumerate(of.keys):
+        center = of.partition.center(key)
+        if (np.abs(x - center) >= of.partition.reach).any():
+            continue
+        weight = float(next(of.partition.weight(torch.as_tensor(x[None]), torch.as_tensor(center), 0)))
+        y = (x - center) / of.lengths[number]
+        z = of.frequencies.numpy() @ y + of.phases.numpy()
+        total += weight * float(of.amplitudes[number].numpy() @ np.sin(z))
+    return total
+
+
+def points(of: Detail, rng: np.random.Generator, count: int = 60) -> np.ndarray:
+    return of.partition.origin + rng.uniform([-0.3, -0.3, -0.3], [0.8, 0.8, 2.8], (count, 3))
+
+
+def test_it_is_the_blend_of_its_cubes(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    x = points(of, rng)
+    np.testing.assert_allclose(of.value(x), [plainly(of, point) for point in x], atol=1e-12)
+    assert (of.value(of.partition.origin + np.array([[-5.0, 0, 0], [0.2, 0.2, 9.0]])) == 0).all()
+
+
+def test_derivatives_are_those_of_differences(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    x, h = points(of, rng), 1e-5
+    value, gradient = of.value_and_gradient(x)
+    np.testing.assert_array_equal(value, of.value(x))
+    steps = h * np.eye(3)
+    slopes = np.stack([(of.value(x + step) - of.value(x - step)) / (2 * h) for step in steps], axis=1)
+    np.testing.assert_allclose(gradient, slopes, atol=1e-6)
+    bends = [(of.value_and_gradient(x + step)[1] - of.value_and_gradient(x - step)[1]) / (2 * h) for step in steps]
+    np.testing.assert_allclose(of.hessian(x), np.stack(bends, axis=2), atol=1e-3)
+
+
+def test_single_precision_is_near_and_counts_are_right(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    x = points(of, rng)
+    np.testing.assert_allclose(of.to(torch.float32).value(x), of.value(x), atol=2e-6 * float(of.amplitudes.abs().sum()))
+    assert of.count == 5 * 7 + 7 * 3 + 7 + 5
+    assert of.as_dict(2.0)["position_noise"] == 2e-3

@@ -1,0 +1,64 @@
+"""The partition of unity: weights that sum to one, and derivatives against autodiff."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from gnrecon.field.partition import Partition
+
+
+@pytest.fixture(params=[0.2, 0.5, 1.0], ids=lambda overlap: f"overlap {overlap}")
+def partition(request: pytest.FixtureRequest) -> Partition:
+    return Partition(np.array([-1.03, 0.2, 7.0]), 0.31, request.param)
+
+
+def cloud(partition: Partition, rng: np.random.Generator, count: int = 300) -> np.ndarray:
+    return partition.origin + rng.uniform(-1.0, 1.0, (count, 3))
+
+
+def test_weights_sum_to_one_and_their_derivatives_to_zero(partition: Partition, rng: np.random.Generator) -> None:
+    x = cloud(partition, rng)
+    sums = [np.zeros(len(x)), np.zeros((len(x), 3)), np.zeros((len(x), 3, 3))]
+    keys, members = partition.members(x)
+    for key, rows in zip(keys, members, strict=True):
+        center = torch.as_tensor(partition.center(key))
+        for total, part in zip(sums, partition.weight(torch.as_tensor(x[rows]), center, 2), strict=True):
+            total[rows] += part.numpy()
+    np.testing.assert_allclose(sums[0], 1.0, atol=1e-12)
+    np.testing.assert_allclose(sums[1], 0.0, atol=1e-10)
+    np.testing.assert_allclose(sums[2], 0.0, atol=1e-7)
+
+
+def test_members_are_all_whose_weight_is_not_zero(partition: Partition, rng: np.random.Generator) -> None:
+    x = cloud(partition, rng, 40)
+    keys, members = partition.members(x)
+    found = {(tuple(key), int(row)) for key, rows in zip(keys.tolist(), members, strict=True) for row in rows}
+    own = np.floor((x - partition.origin) / partition.cell).astype(int)
+    for row, near in enumerate(own):
+        for offset in np.ndindex(5, 5, 5):
+            key = near + np.array(offset) - 2
+            weight = next(partition.weight(torch.as_tensor(x[[row]]), torch.as_tensor(partition.center(key)), 0))
+            assert ((tuple(key.tolist()), row) in found) == (float(weight) > 0)
+    assert keys.tolist() == sorted(keys.tolist())
+
+
+def test_derivatives_are_those_of_autodiff(partition: Partition, rng: np.random.Generator) -> None:
+    center = torch.as_tensor(partition.center((0, 0, 0)))
+    x = center + torch.as_tensor(rng.uniform(-1.0, 1.0, (50, 3))) * partition.reach
+
+    def weight(point: Tensor) -> Tensor:
+        return next(partition.weight(point[None], center, 0))[0]
+
+    _, gradient, bend = partition.weight(x, center, 2)
+    torch.testing.assert_close(gradient, vmap(jacrev(weight))(x), atol=1e-10, rtol=1e-9)
+    torch.testing.assert_close(bend, vmap(jacrev(jacrev(weight)))(x), atol=1e-7, rtol=1e-8)
+
+
+def test_no_points_have_no_members(partition: Partition) -> None:
+    keys, members = partition.members(np.zeros((0, 3)))
+    assert keys.shape == (0, 3)
+    assert members == []

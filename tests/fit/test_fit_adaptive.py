@@ -1,0 +1,155 @@
+"""The default fit: known shapes, with and without noise, and what it chose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Frame, Samples
+from gnrecon.errors import InputError
+from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
+from gnrecon.fit.choose import LENGTHS, Leftover, _smoothest, choose
+from gnrecon.fit.detail import left_over
+
+FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
+
+
+def torus(count: int, rng: np.random.Generator, noise: float = 0.0) -> Samples:
+    """Uniform points of the torus of radii 0.7 and 0.25, in unit coordinates, moved along their normals."""
+    u = rng.uniform(0, 2 * np.pi, 4 * count)
+    v = rng.uniform(0, 2 * np.pi, 4 * count)
+    kept = np.flatnonzero(rng.uniform(0, 0.95, 4 * count) < 0.7 + 0.25 * np.cos(v))[:count]
+    u, v = u[kept], v[kept]
+    normals = np.stack([np.cos(u) * np.cos(v), np.sin(u) * np.cos(v), np.sin(v)], axis=1)
+    ring = 0.7 * np.stack([np.cos(u), np.sin(u), 0 * u], axis=1)
+    return Samples(ring + (0.25 + noise * rng.standard_normal(count))[:, None] * normals, normals, FRAME)
+
+
+def distance(samples: Samples) -> np.ndarray:
+    x = samples.points
+    return np.hypot(np.hypot(x[:, 0], x[:, 1]) - 0.7, x[:, 2]) - 0.25
+
+
+@pytest.fixture(scope="module")
+def clean() -> tuple[Samples, NeuralSDF]:
+    samples = torus(1500, np.random.default_rng(5))
+    return samples, fit(samples, FitOptions(quality="draft"))[0]
+
+
+def test_a_clean_scan_is_interpolated(clean: tuple[Samples, NeuralSDF]) -> None:
+    sdf = clean[1]
+    assert sdf.detail is not None
+    unseen = torus(2000, np.random.default_rng(6))
+    world = FRAME.to_world(unseen.points)
+    assert np.abs(sdf.sdf(world)).mean() / FRAME.scale < 5e-4
+    assert np.abs(sdf.sdf(world)).mean() < 0.2 * np.abs(sdf.coarse().sdf(world)).mean()
+    assert np.einsum("ij,ij->i", sdf.normals(world), unseen.normals).mean() > 0.999
+
+
+def test_noise_is_seen_and_smoothed() -> None:
+    rng = np.random.default_rng(7)
+    noisy = torus(1500, rng, noise=0.01)
+    sdf, solution = fit(noisy, FitOptions(quality="draft"))
+    assert sdf.detail is not None
+    assert 0.002 < sdf.detail.position < 0.05
+    unseen = FRAME.to_world(torus(2000, rng).points)
+    assert np.abs(sdf.sdf(unseen)).mean() / FRAME.scale < 0.6 * 0.01 * np.sqrt(2 / np.pi)
+    assert "noise" in solution.status
+
+
+def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:
+    samples, sdf = clean
+    again = fit(samples, FitOptions(quality="draft"))[0]
+    x = FRAME.to_world(samples.points)
+    np.testing.assert_array_equal(again.sdf(x), sdf.sdf(x))
+
+
+def test_a_field_with_detail_is_saved_and_read(clean: tuple[Samples, NeuralSDF], tmp_path: Path) -> None:
+    samples, sdf = clean
+    path = tmp_path / "torus.gnr"
+    sdf.save(path)
+    read = NeuralSDF.load(path)
+    x = FRAME.to_world(samples.points + 0.01)
+    np.testing.assert_array_equal(read.sdf(x), sdf.sdf(x))
+    np.testing.assert_array_equal(read.hessian(x[:9]), sdf.hessian(x[:9]))
+    assert read.parameters == sdf.parameters > 10_000
+    assert read.detail is not None
+    assert read.detail.as_dict(1.0) == sdf.detail.as_dict(1.0)  # type: ignore[union-attr]
+
+
+def test_a_detail_that_does_not_fit_together_is_refused(clean: tuple[Samples, NeuralSDF], tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    path = tmp_path / "torus.gnr"
+    clean[1].save(path)
+    tensors = load_file(path)
+    from safetensors import safe_open
+
+    with safe_open(str(path), framework="pt") as file:
+        metadata = file.metadata()
+    save_file({**tensors, "detail.lengths": tensors["detail.lengths"][1:].clone()}, path, metadata)
+    with pytest.raises(InputError, match="do not fit together"):
+        NeuralSDF.load(path)
+    save_file({**tensors, "detail.lengths": -tensors["detail.lengths"]}, path, metadata)
+    with pytest.raises(InputError, match="not positive"):
+        NeuralSDF.load(path)
+
+
+def test_derivatives_of_the_whole_field(clean: tuple[Samples, NeuralSDF]) -> None:
+    samples, sdf = clean
+    x, h = FRAME.to_world(1.05 * samples.points[:40]), 1e-4
+    value, gradient = sdf.sdf_and_gradient(x)
+    np.testing.assert_allclose(value, sdf.sdf(x), rtol=1e-12, atol=1e-13)
+    slopes = [(sdf.sdf(x + step) - sdf.sdf(x - step)) / (2 * h) for step in h * np.eye(3)]
+    np.testing.assert_allclose(gradient, np.stack(slopes, axis=1), atol=1e-5)
+    bends = [(sdf.gradient(x + step) - sdf.gradient(x - step)) / (2 * h) for step in h * np.eye(3)]
+    np.testing.assert_allclose(sdf.hessian(x), np.stack(bends, axis=2), atol=1e-3)
+
+
+def test_uncertainty_grows_where_there_is_no_data() -> None:
+    samples = torus(1500, np.random.default_rng(5))
+    hole = samples.points[:, 0] > 0.6
+    holed = Samples(samples.points[~hole], samples.normals[~hole], FRAME)
+    sdf = fit(holed, FitOptions(quality="draft"))[0]
+    found = Uncertainty.of(sdf, holed)
+    inside, outside = (found.sigma(FRAME.to_world(samples.points[rows][:200])) for rows in (hole, ~hole))
+    assert np.median(inside) > 5 * np.median(outside)
+    errors = np.abs(distance(samples))[~hole][:200]
+    assert (errors <= 2 * outside / FRAME.scale + 1e-12).mean() > 0.9
+    assert found.factor >= 1.0
+    assert found.noise == pytest.approx(sdf.detail.position * FRAME.scale)  # type: ignore[union-attr]
+
+
+def test_the_score_does_not_reward_a_flat_field() -> None:
+    """Noisy points closer than they are exact: a field that is zero around all of them has no residuals."""
+    rng = np.random.default_rng(8)
+    noisy = torus(2500, rng, noise=0.02)
+    zero = np.zeros(len(noisy))
+    held = rng.random(len(noisy)) < 0.15
+    leftover = Leftover(noisy.points, noisy.normals, zero + distance(noisy), noisy.normals)
+    belief = choose(leftover, held, 0.02, rng)
+    assert belief.position >= 0.005
+
+
+def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
+    rng = np.random.default_rng(9)
+    alike = 1.0 + 0.001 * rng.standard_normal((10, 12))
+    assert _smoothest({2: alike, 3: alike}) == (3, 11)
+    better = alike.copy()
+    better[:, 4] -= 0.5
+    assert _smoothest({2: alike, 3: better}) == (3, 4)
+    assert len(LENGTHS) > 3
+
+
+def test_left_over_is_in_unit_coordinates(clean: tuple[Samples, NeuralSDF]) -> None:
+    samples, sdf = clean
+    leftover = left_over(sdf.coarse(), samples)
+    np.testing.assert_allclose(leftover.value * FRAME.scale, sdf.coarse().sdf(FRAME.to_world(samples.points)))
+
+
+def test_what_one_network_must_do_is_left_to_one() -> None:
+    assert FitOptions().adaptive
+    for other in ({"widths": (9,)}, {"steps": 3}, {"optimiser": "adam"}, {"normals": "cosine"}):
+        assert not FitOptions(**other).adaptive  # type: ignore[arg-type]

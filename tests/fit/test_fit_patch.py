@@ -1,0 +1,73 @@
+"""The solve of a patch against Bayesian regression with all matrices held whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gnrecon.fit.patch import SHARE, SIZE, Features, Patch, PatchSystem
+
+LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
+
+
+@pytest.fixture
+def features(rng: np.random.Generator) -> Features:
+    return Features.draw(30, rng, torch.zeros(0, dtype=torch.float64))
+
+
+@pytest.fixture
+def patch(rng: np.random.Generator) -> Patch:
+    shapes = [(20, 3), (20,), (20, 3), (8, 3), (8,)]
+    draws = [torch.as_tensor(rng.standard_normal(shape)) for shape in shapes]
+    return Patch(*draws, torch.as_tensor(rng.uniform(0.5, 1.0, 8)), torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64))
+
+
+def rows(features: Features, x: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Values of all features at x, (N, m), and their gradients, (N, 3, m), by autodiff."""
+
+    def value(point: Tensor) -> Tensor:
+        return torch.sin(features.frequencies @ ((point - center) / LENGTH) + features.phases)
+
+    gradients = torch.func.vmap(torch.func.jacrev(value))(x)
+    return torch.func.vmap(value)(x), gradients.mT
+
+
+def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor, Tensor]:
+    """J and r of data and volume, each row over its standard deviation, and the number of the data's rows."""
+    value, gradient = rows(features, patch.points, patch.center)
+    free = rows(features, patch.volume, patch.center)[0]
+    spread = (SHARE * patch.distance)[:, None]
+    J = torch.cat([value / POSITION, gradient.reshape(-1, len(features)) / ANGLE, free / spread])
+    r = torch.cat([patch.value / POSITION, patch.gradient.reshape(-1) / ANGLE, patch.wanted / spread[:, 0]])
+    return J, r, torch.tensor(len(value) * 4)
+
+
+def test_amplitudes_are_the_mode_of_bayesian_regression(patch: Patch, features: Features) -> None:
+    prior = SIZE * float(patch.value.square().mean().sqrt()) * (2 / len(features)) ** 0.5
+    J, r, _ = plainly(patch, features)
+    expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
+    found = PatchSystem(patch, features, LENGTH).solve(POSITION, ANGLE)
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_the_factor_is_that_of_the_datas_precision(patch: Patch, features: Features) -> None:
+    system = PatchSystem(patch, features, LENGTH)
+    J, _, count = plainly(patch, features)
+    data = system.scale * J[: int(count)]
+    factor = system.factor(POSITION, ANGLE)
+    assert factor is not None
+    torch.testing.assert_close(
+        factor @ factor.T, data.T @ data + torch.eye(len(features)).double(), rtol=1e-9, atol=1e-7
+    )
+
+
+def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:
+    system = PatchSystem(patch, features, LENGTH)
+    misfits = []
+    for noise in (1e-3, 1e-1, 1e1):
+        value = rows(features, patch.points, patch.center)[0] @ system.solve(noise, 100.0)
+        misfits.append(float((value - patch.value).norm()))
+    assert misfits == sorted(misfits)
+    assert misfits[-1] > 1.1 * misfits[0]
