@@ -34,6 +34,9 @@ CHOICES = tuple(itertools.product(POSITIONS, ANGLES))
 ALIKE = 0.025
 """Share by which a score may exceed the best and yet count as alike."""
 
+LEAST_NOISE = 1e-3
+"""Least noise of the positions, over the radius of a point's disk; below it rounding would decide."""
+
 FIRST = 2
 """Number of the length that is tried first."""
 
@@ -107,8 +110,8 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     while least(at + step) < least(at):
         at += step
     number, choice = _smoothest(scores)
-    position, angle = CHOICES[choice]
-    return Belief(LENGTHS[number] * radius, position * radius, angle)
+    position, angle = trials.noises()[choice]
+    return Belief(LENGTHS[number] * radius, position, angle)
 
 
 def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
@@ -154,6 +157,11 @@ class _Trials:
         centers = leftover.points[chosen]
         return cls(leftover, radius, features, centers, [out[rows] for rows in np.atleast_2d(near)], held, device)
 
+    def noises(self) -> list[tuple[float, float]]:
+        """Return the noises to try, of positions and normals; points are no noisier than what is left over says."""
+        most = max(float(np.sqrt(np.mean(self.leftover.value**2))), LEAST_NOISE * self.radius)
+        return [(min(position * self.radius, most), angle) for position, angle in CHOICES]
+
     def scores(self, length: float) -> Float:
         """Return the scores of a length, of shape (patches, noises), in radii."""
         return np.array([self._scores(number, length) for number in range(len(self.centers))]) / self.radius
@@ -171,7 +179,7 @@ class _Trials:
         system = PatchSystem(self.leftover.patch(rows, center, Volume.none(), self.device), self.features, length)
         target = self.leftover.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
-        return [self._score(system.solve(p * self.radius, a), target, normals, length) for p, a in CHOICES]
+        return [self._score(system.solve(p, a), target, normals, length) for p, a in self.noises()]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
         z = self.features.phase(target.points, target.center, length)

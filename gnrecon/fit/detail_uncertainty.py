@@ -1,14 +1,16 @@
 """The variance of local detail: that of the most probable amplitudes' distribution, cube by cube.
 
-Given the data in a cube, its correction is normal with the covariance that `patch` solves for. A point in several cubes
-gets the blend of their standard deviations, and where no cube reaches, far from all data, it gets the size that the
-correction has before any data is seen: there the surface is the global field's invention.
+Given the data in a cube, its correction is normal with the covariance that `patch` solves for; a point in several cubes
+gets the blend of their standard deviations. What the data does not say of the correction, it does not say of the global
+field either, which it would correct: the global field's own deviation counts by the share of the correction's that the
+data has left, from almost nothing at the points to all of it where no cube reaches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -32,6 +34,14 @@ COVERED = 0.9545
 ROWS = 4096
 
 
+class Deviation(Protocol):
+    """Standard deviations of a field's values."""
+
+    def at(self, x: Float) -> Float:
+        """Return them, of shape (N,), at x, of shape (N, 3), unit coordinates."""
+        ...
+
+
 @dataclass(frozen=True)
 class DetailDeviation:
     """Standard deviations of a field with detail.
@@ -40,16 +50,16 @@ class DetailDeviation:
     ----------
     detail : Detail
     cubes : the data that it was fitted to
-    far : standard deviation where no cube reaches, unit coordinates
+    coarse : of the global field
     """
 
     detail: Detail
     cubes: Cubes
-    far: float
+    coarse: Deviation
 
     @classmethod
-    def of(cls, sdf: NeuralSDF, samples: Samples) -> DetailDeviation:
-        """Gather what a field's detail was fitted to."""
+    def of(cls, sdf: NeuralSDF, samples: Samples, coarse: Deviation) -> DetailDeviation:
+        """Gather what a field's detail was fitted to; `coarse` is the deviation of its global field."""
         detail = sdf.detail
         assert detail is not None
         leftover = left_over(sdf.coarse(), samples)
@@ -59,13 +69,13 @@ class DetailDeviation:
         device = str(detail.phases.device)
         radii = disk_radii(samples.points, tree)
         cubes = Cubes(leftover, radii, tree, belief, features, detail.partition, device)
-        return cls(detail, cubes, SIZE * float(np.sqrt(np.mean(leftover.value**2))))
+        return cls(detail, cubes, coarse)
 
     def at(self, x: Float) -> Float:
         """Return the standard deviation of the field, of shape (N,), at x, of shape (N, 3), unit coordinates."""
         keys, members = self.detail.partition.members(x)
         fitted = {tuple(key) for key in self.detail.keys.tolist()}
-        blended, reached = np.zeros(len(x)), np.zeros(len(x))
+        blended, open_ = np.zeros(len(x)), np.ones(len(x))
         for key, rows in zip(keys, members, strict=True):
             if tuple(key.tolist()) not in fitted:
                 continue
@@ -75,10 +85,11 @@ class DetailDeviation:
                 some = rows[start : start + ROWS]
                 points = torch.as_tensor(x[some])
                 weight = next(self.detail.partition.weight(points, torch.as_tensor(center), 0)).numpy()
-                blended[some] += weight * of_cube.at(points.to(self.detail.phases))
-                reached[some] += weight
-        blended += np.maximum(1.0 - reached, 0.0) * self.far
-        return blended
+                deviation = of_cube.at(points.to(self.detail.phases))
+                blended[some] += weight * deviation
+                open_[some] -= weight * (1.0 - np.minimum(deviation / of_cube.size, 1.0))
+        whole: Float = np.hypot(blended, np.clip(open_, 0.0, 1.0) * self.coarse.at(x))
+        return whole
 
     def calibration(self, seed: int) -> float:
         """Return the factor, at least one, by which deviations must grow to cover what is left out; see `left_out`."""
@@ -119,6 +130,11 @@ class _OfCube:
     length: float
     position: float
     angle: float
+
+    @property
+    def size(self) -> float:
+        """Standard deviation of the correction before any data is seen."""
+        return SIZE * self.patch.size
 
     def at(self, x: Tensor) -> Float:
         """Return the standard deviation of the correction, of shape (N,), at x, of shape (N, 3)."""

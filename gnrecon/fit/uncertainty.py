@@ -14,8 +14,7 @@ error bar; the formula is the delta method.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +25,7 @@ from torch import Tensor
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.siren import batches
 from gnrecon.fit.data_rows import DataRows
-from gnrecon.fit.detail_uncertainty import DetailDeviation
+from gnrecon.fit.detail_uncertainty import DetailDeviation, Deviation
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
 from gnrecon.fit.loss import normal_weight
@@ -41,14 +40,6 @@ LEAST_SLOPE = 0.1
 """Of the field, whose gradient should have length one; near its critical points the first order says nothing."""
 
 
-class Deviation(Protocol):
-    """Standard deviations of a field's values."""
-
-    def at(self, x: Float) -> Float:
-        """Return them, of shape (N,), at x, of shape (N, 3), unit coordinates."""
-        ...
-
-
 @dataclass(frozen=True)
 class NetworkDeviation:
     """Standard deviations of one network.
@@ -57,16 +48,18 @@ class NetworkDeviation:
     ----------
     rows : the data that it was fitted to
     whitener : of shape (p, p), single precision, with C = W^T W for the covariance C of the free parameters
+    factor : by which all are multiplied
     """
 
     rows: DataRows
     whitener: Tensor
+    factor: float = 1.0
 
     def at(self, x: Float) -> Float:
         """Return the standard deviation of the network's value, of shape (N,), at x, of shape (N, 3)."""
         points = torch.as_tensor(x).to(self.rows.theta)
         parts = [self._at(points[rows]) for rows in batches(len(points), BATCH)]
-        return np.concatenate([np.zeros(0), *parts])
+        return self.factor * np.concatenate([np.zeros(0), *parts])
 
     def _at(self, x: Tensor) -> Float:
         # Rows are made in double precision: frequencies are high, and phases must be exact before they are rounded.
@@ -109,9 +102,6 @@ class Uncertainty:
         FitError
             When the matrix of the data cannot be factored, because it is not finite.
         """
-        if sdf.detail is not None:
-            local = DetailDeviation.of(sdf, samples)
-            return cls(sdf, local, sdf.detail.position * sdf.frame.scale, local.calibration(seed))
         rng = np.random.default_rng(seed)
         chosen = np.sort(rng.permutation(len(samples))[:MOST_POINTS])
         points, normals = (
@@ -122,7 +112,11 @@ class Uncertainty:
         rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)
         factor = calibration(rows, posterior, seed)
-        return cls(sdf, NetworkDeviation(rows, posterior.whitener().float()), posterior.noise * sdf.frame.scale, factor)
+        network = NetworkDeviation(rows, posterior.whitener().float())
+        if sdf.detail is None:
+            return cls(sdf, network, posterior.noise * sdf.frame.scale, factor)
+        local = DetailDeviation.of(sdf, samples, replace(network, factor=factor))
+        return cls(sdf, local, sdf.detail.position * sdf.frame.scale, local.calibration(seed))
 
     def sigma(self, points: npt.ArrayLike) -> Float:
         """Return the standard deviation of the surface, of shape (N,), at points on it, of shape (N, 3); file units.

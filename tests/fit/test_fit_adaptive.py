@@ -32,20 +32,46 @@ def distance(samples: Samples) -> np.ndarray:
     return np.hypot(np.hypot(x[:, 0], x[:, 1]) - 0.7, x[:, 2]) - 0.25
 
 
+def rippled(count: int, rng: np.random.Generator) -> Samples:
+    """Points of a sphere with ripples that a smooth field cannot follow: |x| = 0.8 + 0.02 sin 14x sin 14y."""
+
+    def level(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        radius, (sx, sy), (cx, cy) = np.linalg.norm(x, axis=1), np.sin(14 * x[:, :2]).T, np.cos(14 * x[:, :2]).T
+        gradient = x / radius[:, None] - 0.28 * np.stack([cx * sy, sx * cy, 0 * sx], axis=1)
+        return radius - 0.8 - 0.02 * sx * sy, gradient
+
+    x = rng.standard_normal((count, 3))
+    x *= 0.8 / np.linalg.norm(x, axis=1, keepdims=True)
+    for _ in range(20):
+        value, gradient = level(x)
+        x -= (value / np.einsum("ij,ij->i", gradient, gradient))[:, None] * gradient
+    gradient = level(x)[1]
+    return Samples(x, gradient / np.linalg.norm(gradient, axis=1, keepdims=True), FRAME)
+
+
 @pytest.fixture(scope="module")
 def clean() -> tuple[Samples, NeuralSDF]:
-    samples = torus(1500, np.random.default_rng(5))
+    samples = rippled(2500, np.random.default_rng(5))
     return samples, fit(samples, FitOptions(quality="draft"))[0]
 
 
 def test_a_clean_scan_is_interpolated(clean: tuple[Samples, NeuralSDF]) -> None:
     sdf = clean[1]
     assert sdf.detail is not None
-    unseen = torus(2000, np.random.default_rng(6))
+    unseen = rippled(2000, np.random.default_rng(6))
     world = FRAME.to_world(unseen.points)
-    assert np.abs(sdf.sdf(world)).mean() / FRAME.scale < 5e-4
+    assert np.abs(sdf.sdf(world)).mean() / FRAME.scale < 1e-3
     assert np.abs(sdf.sdf(world)).mean() < 0.2 * np.abs(sdf.coarse().sdf(world)).mean()
-    assert np.einsum("ij,ij->i", sdf.normals(world), unseen.normals).mean() > 0.999
+    assert np.einsum("ij,ij->i", sdf.normals(world), unseen.normals).mean() > 0.995
+
+
+def test_what_a_smooth_field_explains_is_no_noise() -> None:
+    samples = torus(1500, np.random.default_rng(5))
+    sdf, solution = fit(samples, FitOptions(quality="draft"))
+    assert sdf.detail is not None
+    assert sdf.detail.position < 1e-3
+    assert np.abs(sdf.sdf(FRAME.to_world(torus(2000, np.random.default_rng(6)).points))).mean() / FRAME.scale < 2e-4
+    assert "exactly" in solution.status
 
 
 def test_noise_is_seen_and_smoothed() -> None:
@@ -110,14 +136,14 @@ def test_derivatives_of_the_whole_field(clean: tuple[Samples, NeuralSDF]) -> Non
 
 def test_uncertainty_grows_where_there_is_no_data() -> None:
     samples = torus(1500, np.random.default_rng(5))
-    hole = samples.points[:, 0] > 0.6
+    hole = np.linalg.norm(samples.points - [0.7, 0.0, 0.25], axis=1) < 0.25
     holed = Samples(samples.points[~hole], samples.normals[~hole], FRAME)
     sdf = fit(holed, FitOptions(quality="draft"))[0]
     found = Uncertainty.of(sdf, holed)
     inside, outside = (found.sigma(FRAME.to_world(samples.points[rows][:200])) for rows in (hole, ~hole))
-    assert np.median(inside) > 5 * np.median(outside)
-    errors = np.abs(distance(samples))[~hole][:200]
-    assert (errors <= 2 * outside / FRAME.scale + 1e-12).mean() > 0.9
+    assert np.median(inside) > 3 * np.median(outside)
+    errors = np.abs(sdf.sdf(FRAME.to_world(samples.points[hole])))[:200]
+    assert (errors <= 3 * inside).mean() > 0.8
     assert found.factor >= 1.0
     assert found.noise == pytest.approx(sdf.detail.position * FRAME.scale)  # type: ignore[union-attr]
 
