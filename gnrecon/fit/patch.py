@@ -114,35 +114,13 @@ class PatchSystem:
         free = features.phase(patch.volume, patch.center, length).sin() / (SHARE * patch.distance[:, None])
         self._volume = gram([free], count, like), free.T @ (patch.wanted / (SHARE * patch.distance))
 
-    @property
-    def scale(self) -> float:
-        """Standard deviation of an amplitude before the data is seen."""
-        return self._scale
-
-    def _precision(self, position: float, angle: float) -> Tensor:
-        """Return what the data says of a over its standard deviation, of shape (m, m), its lower triangle valid."""
-        precision: Tensor = self._scale**2 * (self._positions[0] / position**2 + self._angles[0] / angle**2)
-        return precision
-
-    def factor(self, position: float, angle: float) -> Tensor | None:
-        """Return the lower Cholesky factor of the precision of a over its standard deviation, of shape (m, m).
-
-        The samples of the volume are left out: their errors are alike over whole regions, and taken as independent they
-        would make the middle of a hole look certain. None where rounding makes it indefinite.
-        """
-        precision = self._precision(position, angle)
-        for attempt in range(ATTEMPTS):
-            factor = damped_factor(precision, torch.full_like(precision[0], 10.0**attempt))
-            if factor is not None:
-                return factor
-        return None
-
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
 
         Where rounding makes the system indefinite, it is damped more.
         """
-        product = self._precision(position, angle) + self._scale**2 * self._volume[0]
+        data = self._positions[0] / position**2 + self._angles[0] / angle**2
+        product = self._scale**2 * (data + self._volume[0])
         right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2 + self._volume[1])
         damping = torch.ones_like(right)
         for _ in range(ATTEMPTS):

