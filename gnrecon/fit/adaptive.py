@@ -41,6 +41,8 @@ def fit_adaptive(
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a global field and its detail; `advance` is told of the share that is done.
 
+    An interrupt (Ctrl-C) while the detail is solved leaves the global field.
+
     Raises
     ------
     FitError
@@ -57,8 +59,11 @@ def fit_adaptive(
     linear = replace(options, widths=field.widths, steps=0)
     fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), SMOOTH)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
-    told = part(advance, SHARE, 1.0)
-    detail = fit_detail(sdf, samples, held, options.features, rng, options.device, told)
+    try:
+        detail = fit_detail(sdf, samples, held, options.features, rng, options.device, part(advance, SHARE, 1.0))
+    except KeyboardInterrupt:
+        status = "Interrupted before the detail was solved: this is the smooth global field alone."
+        return sdf, replace(fitted, status=status, interrupted=True)
     noise = detail.position * samples.frame.scale
     status = (
         f"Solved the global field and {len(detail)} cubes of detail exactly; chosen from the data: features of length "

@@ -9,7 +9,7 @@ import pytest
 
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import InputError
-from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
+from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, adaptive, fit
 from gnrecon.fit.choose import LENGTHS, Leftover, _smoothest, choose
 from gnrecon.fit.detail import left_over
 
@@ -178,3 +178,15 @@ def test_what_one_network_must_do_is_left_to_one() -> None:
     assert FitOptions().adaptive
     for other in ({"widths": (9,)}, {"steps": 3}, {"optimiser": "adam"}, {"normals": "cosine"}):
         assert not FitOptions(**other).adaptive  # type: ignore[arg-type]
+
+
+def test_an_interrupt_leaves_the_global_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*args: object) -> None:
+        del args
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(adaptive, "fit_detail", interrupted)
+    sdf, solution = fit(torus(600, np.random.default_rng(5)))
+    assert solution.interrupted
+    assert sdf.detail is None
+    assert "Interrupted" in solution.status
