@@ -28,6 +28,8 @@ from gnrecon.optim import Solution
 
 COARSE_POINTS, COARSE_UNITS = 5000, 1000
 SMOOTH = Spectrum(length=0.25, degrees_of_freedom=12.0)
+SPACINGS = 4.0
+"""Least length of the global field's features, in spacings of the points that it sees: shorter ones oscillate."""
 
 HELD_SHARE, HELD_MOST = 6, 2000
 """One point in so many is left out of the global field, up to so many."""
@@ -56,8 +58,9 @@ def fit_adaptive(
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
     field = Siren((COARSE_UNITS,))
+    spectrum = replace(SMOOTH, length=max(SMOOTH.length, SPACINGS * scene.coarse.spacing))
     linear = replace(options, widths=field.widths, steps=0)
-    fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), SMOOTH)
+    fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
     try:
         detail = fit_detail(sdf, samples, held, options.features, rng, options.device, part(advance, SHARE, 1.0))
