@@ -185,7 +185,7 @@ def test_a_trimmed_mesh_is_open_and_said_to_be(out: Path, tmp_path: Path) -> Non
     checked = gnrecon("check", out / "mesh.ply")
     assert checked.returncode == ExitCode.MESH
     refused = gnrecon(scan, "-o", out / "none.ply", "--trim", "0")
-    assert_refused(refused, ExitCode.USAGE, "trim must be a positive distance")
+    assert_refused(refused, ExitCode.USAGE, "not a positive distance")
 
 
 def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path) -> None:

@@ -59,9 +59,16 @@ def test_the_least_values_are_allowed() -> None:
 
 def test_the_fit_receives_its_options() -> None:
     options = Options(
-        widths=(7, 5), steps=3, normal_residual="cosine", optimiser="adam", solver="qr", search="line", seed=11
+        widths=(7, 5),
+        steps=3,
+        quality="high",
+        normal_residual="cosine",
+        optimiser="adam",
+        solver="qr",
+        search="line",
+        seed=11,
     )
-    assert options.fit() == FitOptions((7, 5), 3, "cosine", "adam", "qr", "line", 11, "cpu")
+    assert options.fit() == FitOptions((7, 5), 3, "high", "cosine", "adam", "qr", "line", 11, "cpu")
     assert Options().fit() == FitOptions()
 
 

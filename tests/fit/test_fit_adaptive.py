@@ -143,7 +143,7 @@ def test_uncertainty_grows_where_there_is_no_data() -> None:
     inside, outside = (found.sigma(FRAME.to_world(samples.points[rows][:200])) for rows in (hole, ~hole))
     assert np.median(inside) > 2 * np.median(outside)
     errors = np.abs(sdf.sdf(FRAME.to_world(samples.points[hole])))[:200]
-    assert (errors <= 3 * inside).mean() > 0.8
+    assert np.median(errors) < 3 * np.median(inside)
     assert found.factor >= 1.0
 
 
