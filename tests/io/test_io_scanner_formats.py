@@ -77,7 +77,7 @@ def test_las_headers_are_compared_with_the_size(
 def test_laz_that_is_cut_short(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = las(tmp_path / "a.laz", np.random.default_rng(0).uniform(0, 100, (60_000, 3)))
     path.write_bytes(path.read_bytes()[:-5000])
-    with pytest.raises(InputError, match="LAS or LAZ|compressed chunks"):
+    with pytest.raises(InputError, match=r"LAS or LAZ|compressed chunks"):
         read_cloud(path)
     assert capfd.readouterr() == ("", "")
 

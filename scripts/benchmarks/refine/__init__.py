@@ -1,0 +1,1 @@
+"""Refinement of meshes beside the libraries' own remeshing and simplification."""

@@ -1,0 +1,148 @@
+"""Remeshing and fewer faces: gnrecon beside pymeshlab's and manifold3d's own, on the same extracted meshes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.provenance import provenance
+from benchmarks.refine.shapes import SHAPES
+from gnrecon.atomic import write_text
+from gnrecon.errors import ExitCode
+from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
+from gnrecon.fit import NeuralSDF
+from gnrecon.mesh import Mesh
+
+CELLS, MODEL_CELLS = 48, 128
+FEWER = 10
+"""The share of faces that decimation keeps is one in so many."""
+
+Work = Callable[[Mesh], Mesh]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the benchmark as the arguments say; return the exit code.
+
+    Raises
+    ------
+    InputError
+        When the model cannot be read.
+    OutputError
+        When the result cannot be written.
+    """
+    parser = argparse.ArgumentParser(prog="bench refine", description=__doc__)
+    parser.add_argument("--model", type=Path, metavar="FILE", help="a fitted field (.gnr) to remesh as well")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers; an older file is replaced")
+    chosen = parser.parse_args(arguments)
+    fields: dict[str, tuple[SignedDistance, float, int]] = {
+        name: (shape, length, CELLS) for name, (shape, length) in SHAPES.items()
+    }
+    if chosen.model:
+        sdf = NeuralSDF.load(chosen.model)
+        fields[chosen.model.stem] = (sdf, float(np.ptp(sdf.bounds, axis=0).max()) / 60, MODEL_CELLS)
+    figures = [record for name, given in fields.items() for record in compare(name, *given)]
+    Console(highlight=False).print(table(figures))
+    if chosen.json:
+        report = provenance("refine", arguments) | {"figures": figures}
+        write_text(chosen.json, json.dumps(report, indent=2) + "\n", overwrite=True)
+    return ExitCode.OK
+
+
+def compare(name: str, field: SignedDistance, length: float, cells: int) -> list[dict[str, Any]]:
+    """Return the figures of each method on one field's extracted mesh."""
+    mesh = project(extract(field, resolution=cells), field, steps=2)
+    faces = len(mesh.faces) // FEWER
+    cell = float(np.ptp(field.bounds, axis=0).max()) / cells
+
+    def ours(options: RefineOptions) -> Work:
+        return lambda given: refine(given, field, options)[0]
+
+    methods: dict[str, Work] = {
+        "extracted": lambda given: given,
+        "remeshed by pymeshlab": lambda given: pymeshlab_remesh(given, length),
+        "remeshed by gnrecon": ours(RefineOptions(remesh=length)),
+        "collapsed by pymeshlab": lambda given: pymeshlab_collapse(given, faces),
+        "fewer faces by gnrecon": ours(RefineOptions(faces=faces)),
+        "simplified by manifold3d": lambda given: manifold_simplify(given, cell / 4),
+        "simplified by gnrecon": ours(RefineOptions(simplify=cell / 4)),
+    }
+    return [{"field": name, "method": method} | measured(work, mesh, field) for method, work in methods.items()]
+
+
+def measured(work: Work, mesh: Mesh, field: SignedDistance) -> dict[str, Any]:
+    """Return what a method makes of a mesh: its faces, their least angles, and how far off the field it lies."""
+    begin = time.process_time()
+    made = work(mesh)
+    seconds = time.process_time() - begin
+    angles = quality(made).angle_degrees
+    corners = made.vertices[made.faces]
+    between = np.concatenate([corners.mean(axis=1), (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2])
+    return {
+        "faces": len(made.faces),
+        "least_angle": angles["min"],
+        "angle_p1": angles["p1"],
+        "vertices_off": float(np.abs(field.sdf(made.vertices)).max()),
+        "between_off": float(np.abs(field.sdf(between)).max()),
+        "cpu_seconds": seconds,
+    }
+
+
+def pymeshlab_remesh(mesh: Mesh, length: float) -> Mesh:
+    """Remesh by pymeshlab's isotropic explicit remeshing, ten iterations, features of 30 degrees kept."""
+    import pymeshlab
+
+    def work(meshes: Any) -> None:
+        size = pymeshlab.PureValue(length)
+        meshes.meshing_isotropic_explicit_remeshing(iterations=10, targetlen=size, featuredeg=30)
+
+    return _by_pymeshlab(mesh, work)
+
+
+def pymeshlab_collapse(mesh: Mesh, faces: int) -> Mesh:
+    """Collapse edges by pymeshlab's quadric edge collapse, topology kept."""
+    return _by_pymeshlab(
+        mesh,
+        lambda meshes: meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True),
+    )
+
+
+def _by_pymeshlab(mesh: Mesh, work: Callable[[Any], None]) -> Mesh:
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
+    work(meshes)
+    result = meshes.current_mesh()
+    return Mesh(result.vertex_matrix(), result.face_matrix().astype(np.int64))
+
+
+def manifold_simplify(mesh: Mesh, tolerance: float) -> Mesh:
+    """Simplify by manifold3d within a tolerance."""
+    import manifold3d
+
+    arrays = mesh.vertices.astype(np.float64), mesh.faces.astype(np.uint64)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(*arrays)).simplify(tolerance)
+    result = solid.to_mesh64()
+    return Mesh(np.array(result.vert_properties)[:, :3], np.array(result.tri_verts).astype(np.int64))
+
+
+def table(figures: Sequence[dict[str, Any]]) -> Table:
+    """Return the figures as a table."""
+    titles = ("method", "faces", "least angle", "1st percentile", "vertices off", "between off", "CPU s")
+    shown = Table(*titles, title="Distances: at most, to the zero level.")
+    for number, record in enumerate(figures):
+        if number == 0 or figures[number - 1]["field"] != record["field"]:
+            shown.add_section()
+            shown.add_row(f"[bold]{record['field']}[/bold]")
+        angles = f"{record['least_angle']:.1f}", f"{record['angle_p1']:.1f}"
+        off = f"{record['vertices_off']:.1e}", f"{record['between_off']:.1e}"
+        shown.add_row(record["method"], f"{record['faces']:,}", *angles, *off, f"{record['cpu_seconds']:.1f}")
+    return shown
