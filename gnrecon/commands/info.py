@@ -47,8 +47,9 @@ def _plan(cloud: PointCloud, reading: Reading, options: Options) -> dict[str, An
     fit = options.fit()
     return {
         "points": len(samples),
-        "widths": list(fit.widths_for(len(samples))),
+        "widths": None if fit.adaptive else list(fit.widths_for(len(samples))),
         "steps": fit.steps_for(len(samples)),
+        "detail_features": fit.features if fit.adaptive else None,
         "remarks": [*reading.remarks(), *counts.remarks()],
     }
 
@@ -71,6 +72,9 @@ def _describe(facts: Survey, cloud: PointCloud) -> list[str]:
 
 
 def _sentences(plan: dict[str, Any]) -> list[str]:
-    widths = ", ".join(map(str, plan["widths"]))
-    sentence = f"A run would fit {plan['points']:,} points with layers of {widths} sines, in {plan['steps']} steps."
+    if plan["widths"] is None:
+        network = f"a smooth global field and local detail of {plan['detail_features']:,} sines a cube"
+    else:
+        network = f"layers of {', '.join(map(str, plan['widths']))} sines, in {plan['steps']} steps"
+    sentence = f"A run would fit {plan['points']:,} points with {network}."
     return [*plan["remarks"], sentence]
