@@ -24,6 +24,7 @@ ROWS = [
     {"field"},
     {"residuals"},
     {"sampling"},
+    {"levelset"},
     {"fit", "ingest", "io", "export"},
     {"options", "report", "schema", "shapes"},
     {"meshing", "adorn", "page"},
