@@ -15,14 +15,17 @@ class Layout:
     """Layer sizes of a fully connected network, input and output included, e.g. ``(3, 32, 32, 1)``.
 
     The parameter vector theta holds, layer by layer, the weights W (out, in) row by row and then the biases b (out).
+    Hidden units that take several numbers have as many rows in their layer.
     """
 
     sizes: tuple[int, ...]
+    unit_inputs: int = 1
 
     @property
     def shapes(self) -> tuple[tuple[int, int], ...]:
         """(out, in) of each layer."""
-        return tuple((out, into) for into, out in pairwise(self.sizes))
+        *hidden, (into, out) = pairwise(self.sizes)
+        return (*((self.unit_inputs * units, before) for before, units in hidden), (out, into))
 
     @property
     def count(self) -> int:

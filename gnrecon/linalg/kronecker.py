@@ -121,9 +121,8 @@ Sides = tuple[list[Tensor], list[Tensor]]
 
 def _by_outputs(layer: LayerRows) -> Sides:
     ins = [pad(layer.inputs, (0, 1), value=1.0)]
-    if layer.right is None or layer.tangents is None:
-        return [layer.left], ins
-    return [layer.left, layer.right], [*ins, pad(layer.tangents, (0, 1))]
+    ins += [pad(tangents, (0, 1)) for _, tangents in layer.pairs]
+    return [layer.left, *(right for right, _ in layer.pairs)], ins
 
 
 def _by_inputs(layer: LayerRows) -> Sides:

@@ -1,8 +1,9 @@
-"""The paper's constraints as residuals of a field's value and gradient."""
+"""The paper's constraints as residuals of a field's value, gradient and second derivatives."""
 
 from gnrecon.residuals.first_order import (
     Linearised,
     Residual,
+    design_region,
     eikonal,
     interface,
     normal_cosine,
@@ -10,14 +11,29 @@ from gnrecon.residuals.first_order import (
     normal_vector,
     signed_distance,
 )
+from gnrecon.residuals.formula import from_formula
+from gnrecon.residuals.second_order import (
+    SecondOrder,
+    clipped_strain,
+    gauss_curvature,
+    mean_curvature,
+    surface_strain,
+)
 
 __all__ = [
     "Linearised",
     "Residual",
+    "SecondOrder",
+    "clipped_strain",
+    "design_region",
     "eikonal",
+    "from_formula",
+    "gauss_curvature",
     "interface",
+    "mean_curvature",
     "normal_cosine",
     "normal_projection",
     "normal_vector",
     "signed_distance",
+    "surface_strain",
 ]

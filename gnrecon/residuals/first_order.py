@@ -15,11 +15,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals r, of shape (N, m), and their derivatives by f, (N, m), and by grad f, (N, m, 3); None means zero."""
+    """Residuals r, of shape (N, m), and their derivatives; None means zero.
+
+    The derivatives are those by f, (N, m), by grad f, (N, m, 3), and by Hess f, (N, m, 3, 3) and symmetric.
+    """
 
     residual: Tensor
     by_value: Tensor | None
     by_gradient: Tensor | None
+    by_hessian: Tensor | None = None
 
 
 Residual = Callable[[Tensor, Tensor, Tensor | None], Linearised]
@@ -31,8 +35,19 @@ def interface(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lineari
     return Linearised(value[:, None], torch.ones_like(value)[:, None], None)
 
 
+def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The point, which lies outside of the design region, is not inside of the shape: r = min(0, f)."""
+    del gradient, target
+    within = value < 0
+    return Linearised(torch.where(within, value, 0.0)[:, None], within.to(value)[:, None], None)
+
+
 def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
-    """The value is known: r = f - target, targets of shape (N,)."""
+    """The value is known: r = f - target, targets of shape (N,).
+
+    In the paper's table this is *supervised*; and it is *connectedness*, where the points are the critical ones that
+    join components and the targets the values that would join them.
+    """
     del gradient
     assert target is not None, "signed distances are the targets of this residual"
     return Linearised((value - target)[:, None], torch.ones_like(value)[:, None], None)

@@ -19,10 +19,11 @@ def randn(generator: torch.Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=F64)
 
 
-def layer_rows(generator: torch.Generator, rows: int, into: int, out: int, tangents: bool) -> LayerRows:
-    """Random rows of one layer."""
-    right, along = (randn(generator, rows, out), randn(generator, rows, into)) if tangents else (None, None)
-    return LayerRows(randn(generator, rows, out), randn(generator, rows, into), right, along)
+def layer_rows(generator: torch.Generator, rows: int, into: int, out: int, pairs: int) -> LayerRows:
+    """Random rows of one layer, with so many outer products beside the first."""
+    made = [(randn(generator, rows, out), randn(generator, rows, into)) for _ in range(pairs)]
+    right, along = made[0] if made else (None, None)
+    return LayerRows(randn(generator, rows, out), randn(generator, rows, into), right, along, tuple(made[1:]))
 
 
 def multiplied_out(layer: LayerRows) -> Tensor:
@@ -31,8 +32,8 @@ def multiplied_out(layer: LayerRows) -> Tensor:
     for n in range(len(layer)):
         one = torch.ones(1, dtype=F64)
         matrix = torch.outer(layer.left[n].double(), torch.cat([layer.inputs[n].double(), one]))
-        if layer.right is not None and layer.tangents is not None:
-            matrix = matrix + torch.outer(layer.right[n].double(), torch.cat([layer.tangents[n].double(), 0.0 * one]))
+        for right, tangents in layer.pairs:
+            matrix = matrix + torch.outer(right[n].double(), torch.cat([tangents[n].double(), 0.0 * one]))
         rows.append(torch.cat([matrix[:, :-1].flatten(), matrix[:, -1]]))
     return torch.stack(rows) if rows else torch.zeros(0, layer.size, dtype=F64)
 
@@ -43,26 +44,27 @@ def cast(layer: LayerRows, dtype: torch.dtype) -> LayerRows:
     left, inputs, right, tangents = (None if part is None else part.to(dtype) for part in parts)
     assert left is not None
     assert inputs is not None
-    return LayerRows(left, inputs, right, tangents)
+    further = tuple((right.to(dtype), tangents.to(dtype)) for right, tangents in layer.further)
+    return LayerRows(left, inputs, right, tangents, further)
 
 
 def layered(
     seed: int,
-    rows: Sequence[tuple[int, bool]] = ((9, False), (14, True), (1, True)),
+    rows: Sequence[tuple[int, int]] = ((9, 0), (14, 1), (1, 1), (5, 4)),
     widths: Sequence[int] = (3, 4, 1),
     units: Sequence[Sequence[int] | None] | None = None,
     stored: torch.dtype = F64,
 ) -> tuple[LayeredJacobian, Tensor]:
-    """A Jacobian of blocks (rows, whether they hold tangents) of a network, and its dense matrix.
+    """A Jacobian of blocks (rows, how many outer products beside the first) of a network, and its dense matrix.
 
     `units` chooses output units of each layer.
     """
     generator = torch.Generator().manual_seed(seed)
     blocks = []
-    for count, tangents in rows:
+    for count, pairs in rows:
         block = []
         for k, (into, out) in enumerate(pairwise(widths)):
-            layer = layer_rows(generator, count, into, out, tangents).times(10.0 ** (-k) * torch.ones(count, dtype=F64))
+            layer = layer_rows(generator, count, into, out, pairs).times(10.0 ** (-k) * torch.ones(count, dtype=F64))
             chosen = None if units is None else units[k]
             layer = layer if chosen is None else layer.into(torch.tensor(chosen, dtype=torch.long))
             block.append(cast(layer, stored))

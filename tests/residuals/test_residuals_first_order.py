@@ -19,6 +19,7 @@ Formula = Callable[[Tensor, Tensor, Tensor], Tensor]
 # Residuals, of shape (m,), of one point's value (), gradient (3,) and target () or (3,).
 FORMULAS: dict[str, Formula] = {
     "interface": lambda f, _g, _t: f[None],
+    "design_region": lambda f, _g, _t: torch.minimum(f, torch.zeros_like(f))[None],
     "signed_distance": lambda f, _g, t: (f - t)[None],
     "normal_vector": lambda _f, g, t: g - t,
     "normal_projection": lambda _f, g, t: (g @ t)[None] - 1,
@@ -37,7 +38,7 @@ def by_name(name: str) -> Residual:
 
 
 def targets(name: str, generator: torch.Generator, count: int) -> Tensor | None:
-    if name in ("interface", "eikonal"):
+    if name in ("interface", "design_region", "eikonal"):
         return None
     if name == "signed_distance":
         return torch.randn(count, generator=generator, dtype=torch.float64)
@@ -46,7 +47,10 @@ def targets(name: str, generator: torch.Generator, count: int) -> Tensor | None:
 
 
 def test_every_residual_is_tested() -> None:
-    assert set(residuals.__all__) - {"Linearised", "Residual"} == set(FORMULAS)
+    # Those with second derivatives are in test_residuals_second_order.
+    second = {name for name in residuals.__all__ if isinstance(getattr(residuals, name), residuals.SecondOrder)}
+    makers = {"Linearised", "Residual", "SecondOrder", "clipped_strain", "from_formula"}
+    assert set(residuals.__all__) - makers - second == set(FORMULAS)
 
 
 @each_residual
@@ -83,10 +87,12 @@ def test_an_exact_distance_has_no_residual(name: str, seed: int) -> None:
     x = (center + (radius + distance)[:, None] * normals).requires_grad_()
     value = (x - center).norm(dim=1) - radius
     (gradient,) = torch.autograd.grad(value.sum(), x)
-    target = {"interface": None, "eikonal": None, "signed_distance": distance}.get(name, normals)
+    known = {"interface": None, "design_region": None, "eikonal": None, "signed_distance": distance}
+    target = known.get(name, normals)
     residual = by_name(name)(value.detach(), gradient, target).residual
     torch.testing.assert_close(residual, torch.zeros_like(residual), rtol=0, atol=1e-12)
-    moved = by_name(name)(value.detach() + 0.1, 1.2 * gradient.roll(1, dims=1), target).residual
+    inward = -0.3 if name == "design_region" else 0.1
+    moved = by_name(name)(value.detach() + inward, 1.2 * gradient.roll(1, dims=1), target).residual
     assert float(moved.abs().max()) > 0.05
 
 
