@@ -13,6 +13,7 @@ mean square, so that sqrt(d^2 - rho^2) is used. Samples nearer than 2 rho tell n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,9 @@ Mask = npt.NDArray[np.bool_]
 
 _SOURCES = 4000
 _NEIGHBOURS = 8
+
+KNOWN = 2.0
+"""How far from the points a distance is known at least, in radii of the disk that the nearest one stands for."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,42 @@ def near_surface(points: Float, spread: float, count: int, rng: np.random.Genera
     return points[rng.integers(len(points), size=count)] + spread * rng.standard_normal((count, 3))
 
 
+@dataclass(frozen=True)
+class Density:
+    """How densely points lie; everything is found when it is first asked for.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3)
+    """
+
+    points: Float
+
+    @cached_property
+    def tree(self) -> Any:
+        """A `scipy.spatial.cKDTree` of the points."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance from a point to its nearest neighbour."""
+        return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
+
+    @cached_property
+    def disks(self) -> Float:
+        """Radius of the disk that each point stands for, of shape (N,): that of its k-th neighbour's, shared by k."""
+        k = min(_NEIGHBOURS, len(self.points) - 1)
+        radii: Float = self.tree.query(self.points, k + 1)[0][:, -1] / np.sqrt(k)
+        return radii
+
+    @cached_property
+    def radius(self) -> float:
+        """Median of the disks' radii."""
+        return float(np.median(self.disks))
+
+
 class CoarseDistance:
     """Signed distance to a cloud, coarse, its sign reliable beyond the spacing of the points; negative inside.
 
@@ -55,33 +95,33 @@ class CoarseDistance:
     ----------
     points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
     rng : draws the subset of at most 4,000 points that the winding number sums over
+    density : of the points, where it is known already
     """
 
-    def __init__(self, points: Float, normals: Float, rng: np.random.Generator) -> None:
-        from scipy.spatial import cKDTree
-
-        self._tree = cKDTree(points)
-        self.spacing = float(np.median(self._tree.query(points, k=2)[0][:, 1]))
-        self._disks = disk_radii(points, self._tree)
+    def __init__(self, points: Float, normals: Float, rng: np.random.Generator, density: Density | None = None) -> None:
+        self._density = density or Density(points)
+        self.spacing = self._density.spacing
         chosen = np.sort(rng.permutation(len(points))[:_SOURCES])
         self._sources = points[chosen]
-        self._radii = disk_radii(self._sources, cKDTree(self._sources))
+        self._radii = Density(self._sources).disks
         self._dipoles = normals[chosen] * (self._radii**2 / 4)[:, None]
 
     def sample(self, x: Float) -> tuple[Float, Float]:
         """Return those of the points x, of shape (Q, 3), where the distance is known, and the distances there."""
-        known, distances = self.at(x)
-        return x[known], distances[known]
+        known, signed, _ = self.at(x)
+        return x[known], signed
 
-    def at(self, x: Float) -> tuple[Mask, Float]:
-        """Return where the distance is known, and the distances, zero elsewhere, both (Q,), at x, of shape (Q, 3)."""
+    def at(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float]:
+        """Return which of the points x, of shape (Q, 3), lie more than `clear` disks' radii from their nearest point.
+
+        Of these, in their order, follow the signed distances, and those to the nearest point itself.
+        """
         # One worker: with several, Ctrl-C unwinds while scipy's threads still use the arrays, and the process crashes.
-        distances, nearest = self._tree.query(x)
-        known = distances > 2 * self._disks[nearest]
-        sign = np.where(self.winding_number(x[known]) > 0.5, -1.0, 1.0)
-        signed = np.zeros(len(x))
-        signed[known] = sign * np.sqrt(distances[known] ** 2 - self._disks[nearest[known]] ** 2)
-        return known, signed
+        distances, nearest = self._density.tree.query(x)
+        known = distances > clear * self._density.disks[nearest]
+        x, distances, disks = x[known], distances[known], self._density.disks[nearest[known]]
+        sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
+        return known, sign * np.sqrt(distances**2 - disks**2), distances
 
     def winding_number(self, x: Float, batch: int = 2048) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
@@ -96,10 +136,3 @@ class CoarseDistance:
             flux = offset - q @ self._dipoles.T
             parts.append((flux / (square * np.sqrt(square))).sum(axis=1))
         return np.concatenate(parts)
-
-
-def disk_radii(points: Float, tree: Any) -> Float:
-    """Radius of the disk that each point stands for, of shape (N,): that of its k-th neighbour's, shared by k."""
-    k = min(_NEIGHBOURS, len(points) - 1)
-    radii: Float = tree.query(points, k + 1)[0][:, -1] / np.sqrt(k)
-    return radii

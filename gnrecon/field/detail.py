@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.cloud import Float
+from gnrecon.field.features import Features
 from gnrecon.field.partition import Int, Partition
 
 ROWS = 2048
@@ -32,7 +33,8 @@ class Detail:
         Of the cubes that have features, in order.
     lengths : array of shape (B,)
         Length scale of each cube's features, unit coordinates.
-    frequencies, phases : of shape (m, 3) and (m,)
+    features : Features
+        Of all cubes, m in number.
     amplitudes : of shape (B, m)
     position, angle : float
         Standard deviations of the data's noise that the amplitudes were solved for: of positions along the normal, in
@@ -42,8 +44,7 @@ class Detail:
     partition: Partition
     keys: Int
     lengths: Float
-    frequencies: Tensor
-    phases: Tensor
+    features: Features
     amplitudes: Tensor
     position: float
     angle: float
@@ -54,13 +55,13 @@ class Detail:
     @property
     def count(self) -> int:
         """Number of parameters."""
-        return self.amplitudes.numel() + self.frequencies.numel() + self.phases.numel() + len(self.lengths)
+        return self.amplitudes.numel() + 4 * len(self.features) + len(self.lengths)
 
     def as_dict(self, scale: float) -> dict[str, float]:
         """Return what the data chose, as plain values; lengths in the unit of which `scale` make a radius."""
         return {
             "cubes": len(self),
-            "features": self.amplitudes.shape[1],
+            "features": len(self.features),
             "cell": scale * self.partition.cell,
             "length": scale * float(np.median(self.lengths)),
             "position_noise": scale * self.position,
@@ -69,8 +70,7 @@ class Detail:
 
     def to(self, dtype: torch.dtype) -> Detail:
         """Return the same detail with features of another precision."""
-        parts = {name: getattr(self, name).to(dtype) for name in ("frequencies", "phases", "amplitudes")}
-        return replace(self, **parts)
+        return replace(self, features=self.features.to(dtype), amplitudes=self.amplitudes.to(dtype))
 
     def value(self, x: Float) -> Float:
         """Return d, of shape (N,), at x, of shape (N, 3)."""
@@ -105,24 +105,12 @@ class Detail:
         center = torch.as_tensor(self.partition.center(self.keys[number]))
         points = torch.as_tensor(x)
         weight = list(self.partition.weight(points, center, order))
-        own = [part.double().cpu() for part in self._own((points - center) / self.lengths[number], number, order)]
+        sums = self.features.sums(self.amplitudes[number], points, center, float(self.lengths[number]), order)
+        own = [part.double().cpu() for part in sums]
         parts = [weight[0] * own[0]]
         if order >= 1:
             parts.append(weight[0][:, None] * own[1] + own[0][:, None] * weight[1])
         if order >= 2:
             cross = weight[1][:, :, None] * own[1][:, None, :]
             parts.append(weight[0][:, None, None] * own[2] + cross + cross.mT + own[0][:, None, None] * weight[2])
-        return parts
-
-    def _own(self, y: Tensor, number: int, order: int) -> list[Tensor]:
-        """Return cube b's function at local coordinates y, of shape (N, 3), and its derivatives in space."""
-        amplitudes, length = self.amplitudes[number], float(self.lengths[number])
-        z = torch.addmm(self.phases, y.to(self.frequencies), self.frequencies.T)
-        sines = z.sin()
-        parts = [sines @ amplitudes]
-        if order >= 1:
-            parts.append((z.cos() * (amplitudes / length)) @ self.frequencies)
-        if order >= 2:
-            squares = (self.frequencies[:, :, None] * self.frequencies[:, None, :]).reshape(-1, 9)
-            parts.append(-((sines * (amplitudes / length**2)) @ squares).reshape(-1, 3, 3))
         return parts

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
@@ -67,16 +66,10 @@ def fit_adaptive(
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(fitted, status=status, interrupted=True)
-    noise = detail.position * samples.frame.scale
+    chosen = detail.as_dict(samples.frame.scale)
     status = (
-        f"Solved the global field and {len(detail)} cubes of detail exactly; chosen from the data: features of length "
-        f"{float(np.median(detail.lengths)) * samples.frame.scale:.3g}, noise {noise:.2g} in position and "
-        f"{np.degrees(detail.angle):.2g} degrees in normals."
+        f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
+        f"length {chosen['length']:.3g}, noise {chosen['position_noise']:.2g} in position and "
+        f"{chosen['angle_noise']:.2g} degrees in normals."
     )
     return replace(sdf, detail=detail), replace(fitted, status=status, method="Exact linear least squares.")
-
-
-def finite(sdf: NeuralSDF) -> bool:
-    """Whether all parameters of a field are finite."""
-    detail = sdf.detail
-    return bool(torch.isfinite(sdf.theta).all()) and (detail is None or bool(torch.isfinite(detail.amplitudes).all()))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.cloud import Float
-from gnrecon.fit.patch import Belief, Features, Patch, PatchSystem
+from gnrecon.field.features import Features
+from gnrecon.fit.patch import Belief, Patch, PatchSystem
+from gnrecon.sampling import Density
 
 Mask = npt.NDArray[np.bool_]
 Int = npt.NDArray[np.integer]
@@ -61,6 +64,15 @@ class Leftover:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def density(self) -> Density:
+        """How densely the points lie."""
+        return Density(self.points)
+
+    def within(self, center: Float, reach: float) -> Int:
+        """Return the rows of the points in the cube of half an edge `reach` about a centre, in order."""
+        return np.sort(np.array(self.density.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64))
 
     def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
         """Return the patch of some rows, with samples of the volume."""
@@ -110,7 +122,7 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     while least(at + step) < least(at):
         at += step
     number, choice = _smoothest(scores)
-    position, angle = trials.noises()[choice]
+    position, angle = trials.noises[choice]
     return Belief(LENGTHS[number] * radius, position, angle)
 
 
@@ -152,11 +164,14 @@ class _Trials:
     def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> _Trials:
         out = np.flatnonzero(held)
         chosen = rng.choice(len(leftover), min(PATCHES, len(leftover)), replace=False)
-        near = cKDTree(leftover.points[out]).query(leftover.points[chosen], min(HELD_NEAR, len(out)))[1]
+        # As a list, so that the answer has two dimensions also where a single point is left out.
+        ranks = list(range(1, min(HELD_NEAR, len(out)) + 1))
+        near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
         features = Features.draw(FEATURES, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = leftover.points[chosen]
-        return cls(leftover, radius, features, centers, [out[rows] for rows in np.atleast_2d(near)], held, device)
+        return cls(leftover, radius, features, centers, list(out[near]), held, device)
 
+    @cached_property
     def noises(self) -> list[tuple[float, float]]:
         """Return the noises to try, of positions and normals; points are no noisier than what is left over says."""
         most = max(float(np.sqrt(np.mean(self.leftover.value**2))), LEAST_NOISE * self.radius)
@@ -170,8 +185,8 @@ class _Trials:
         """Return the scores of one patch for each choice of noise."""
         center, predicted = self.centers[number], self.predicted[number]
         reach = np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max() + BEYOND * length
-        inside = (np.abs(self.leftover.points - center) < reach).all(axis=1) & ~self.held
-        rows = np.flatnonzero(inside)
+        rows = self.leftover.within(center, reach)
+        rows = rows[~self.held[rows]]
         # Beyond this many the nearest tell enough, and time would grow with the length's square.
         if len(rows) > MOST_POINTS:
             far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
@@ -179,13 +194,12 @@ class _Trials:
         system = PatchSystem(self.leftover.patch(rows, center, Volume.none(), self.device), self.features, length)
         target = self.leftover.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
-        return [self._score(system.solve(p, a), target, normals, length) for p, a in self.noises()]
+        return [self._score(system.solve(p, a), target, normals, length) for p, a in self.noises]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
-        z = self.features.phase(target.points, target.center, length)
+        value, gradient = self.features.sums(amplitudes, target.points, target.center, length, 1)
         # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
-        missing = target.value - z.sin() @ amplitudes
-        turn = target.gradient - (z.cos() * (amplitudes / length)) @ self.features.frequencies
+        missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
         distance = missing.abs() / slope.clamp_min(LEAST_SLOPE)
         return float(distance.mean() + self.radius * turn.norm(dim=1).mean())

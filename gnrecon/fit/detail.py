@@ -2,8 +2,8 @@
 
 A scan holds far more detail than one network can learn in reasonable time, and detail is local: the surface here says
 nothing of the surface there. So a smooth global field gives the sign and closes holes, and each cube corrects it near
-the data (`patch`) with a length and noise that the data itself chose (`choose`). The cubes are
-blended smoothly (`field.partition`), so that the field stays one smooth function.
+the data (`patch`) with a length and noise that the data itself chose (`choose`). The cubes are blended smoothly
+(`field.partition`), so that the field stays one smooth function.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.field.detail import Detail
+from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
 from gnrecon.fit.choose import Int, Leftover, Mask, Volume, choose
-from gnrecon.fit.patch import Belief, Features, PatchSystem
+from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.sampling import CoarseDistance, disk_radii
+from gnrecon.sampling import CoarseDistance
 
 CELL = 5.0
 """Edge of a cube, in lengths."""
@@ -62,74 +62,63 @@ def fit_detail(
     advance : told of the share that is done
     """
     leftover = left_over(sdf, samples)
-    radii = disk_radii(samples.points, cKDTree(samples.points))
-    belief = choose(leftover, held, float(np.median(radii)), rng, device)
+    belief = choose(leftover, held, leftover.density.radius, rng, device)
     advance(CHOSEN)
-    coarse = CoarseDistance(samples.points, samples.normals, rng)
-    work = Cubes.of(leftover, radii, belief, features, rng, device)
-    return work.detail(sdf, coarse, rng, advance)
+    coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
+    return _Cubes.of(leftover, belief, features, rng, device).detail(sdf, coarse, rng, advance)
 
 
 def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
     """Return the values and gradients of a field at samples, in unit coordinates."""
     points = samples.frame.to_world(samples.points)
-    value = sdf.sdf(points) / samples.frame.scale
-    return Leftover(samples.points, samples.normals, value, sdf.gradient(points))
+    value, gradient = sdf.sdf_and_gradient(points)
+    return Leftover(samples.points, samples.normals, value / samples.frame.scale, gradient)
 
 
 @dataclass(frozen=True)
-class Cubes:
+class _Cubes:
     """The cubes of a detail with the data that they are fitted to."""
 
     leftover: Leftover
-    radii: Float
-    tree: cKDTree
     belief: Belief
     features: Features
     partition: Partition
     device: str
 
     @classmethod
-    def of(
-        cls, leftover: Leftover, radii: Float, belief: Belief, count: int, rng: np.random.Generator, device: str
-    ) -> Cubes:
+    def of(cls, leftover: Leftover, belief: Belief, count: int, rng: np.random.Generator, device: str) -> _Cubes:
         like = torch.zeros(0, dtype=torch.float64, device=device)
         cell = CELL * belief.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(leftover.points.min(axis=0) - 0.137 * cell, cell)
         features = Features.draw(count, rng, like)
-        return cls(leftover, radii, cKDTree(leftover.points), belief, features, partition, device)
+        return cls(leftover, belief, features, partition, device)
 
     def detail(self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: Advance) -> Detail:
         """Fit all cubes that hold data."""
         keys, _ = self.partition.members(self.leftover.points)
         volumes = self._volumes(sdf, coarse, keys, rng)
+        reach = self.partition.reach + BEYOND * self.leftover.density.radius
         kept, lengths, amplitudes = [], [], []
         for number, key in enumerate(keys):
             center = self.partition.center(key)
-            rows = self.rows(center)
+            rows = self.leftover.within(center, reach)
             if len(rows) >= LEAST_POINTS:
-                length = self.length(rows)
+                length = self._length(rows)
                 patch = self.leftover.patch(rows, center, volumes[number], self.device)
                 system = PatchSystem(patch, self.features, length)
                 kept.append(key)
                 lengths.append(length)
                 amplitudes.append(system.solve(self.belief.position, self.belief.angle))
             advance(CHOSEN + (1.0 - CHOSEN) * (number + 1) / len(keys))
-        frequencies, phases = self.features.frequencies, self.features.phases
         solved = torch.stack(amplitudes)
         noise = self.belief.position, self.belief.angle
-        return Detail(self.partition, np.array(kept), np.array(lengths), frequencies, phases, solved, *noise)
+        return Detail(self.partition, np.array(kept), np.array(lengths), self.features, solved, *noise)
 
-    def rows(self, center: Float) -> Int:
-        """Return the rows of the data in a cube and a little beyond."""
-        reach = self.partition.reach + BEYOND * float(np.median(self.radii))
-        near = np.array(self.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64)
-        return np.sort(near)
-
-    def length(self, rows: Int) -> float:
+    def _length(self, rows: Int) -> float:
         """Return the length of a cube: longer where its points lie farther apart."""
-        sparser = float(np.median(self.radii[rows]) / np.median(self.radii))
+        density = self.leftover.density
+        sparser = float(np.median(density.disks[rows]) / density.radius)
         return self.belief.length * min(max(sparser, 1.0), LONGER)
 
     def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
@@ -139,12 +128,10 @@ class Cubes:
         cube = np.repeat(np.arange(len(keys)), VOLUME)
         x = x.reshape(-1, 3)
         inside = ((x > sdf.box.lower) & (x < sdf.box.upper)).all(axis=1)
-        distance, nearest = self.tree.query(x)
-        clear = inside & (distance > CLEAR * self.radii[nearest])
-        x, cube, distance = x[clear], cube[clear], distance[clear]
-        known, signed = coarse.at(x)
+        x, cube = x[inside], cube[inside]
+        clear, signed, distance = coarse.at(x, CLEAR)
+        x, cube = x[clear], cube[clear]
         wanted = signed - sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
-        return [
-            Volume(x[rows], wanted[rows], distance[rows])
-            for rows in (np.flatnonzero(known & (cube == number)) for number in range(len(keys)))
-        ]
+        ends = np.searchsorted(cube, np.arange(1, len(keys)))
+        parts = (np.split(values, ends) for values in (x, wanted, distance))
+        return [Volume(*of_cube) for of_cube in zip(*parts, strict=True)]

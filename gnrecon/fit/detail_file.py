@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gnrecon.errors import InputError
 from gnrecon.field.detail import Detail
+from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
 
 LATTICE, NOISE, KEYS, LENGTHS = "detail.lattice", "detail.noise", "detail.keys", "detail.lengths"
@@ -24,8 +25,8 @@ def detail_tensors(detail: Detail) -> dict[str, Tensor]:
         NOISE: torch.tensor([detail.position, detail.angle], dtype=torch.float64),
         KEYS: torch.as_tensor(detail.keys),
         LENGTHS: torch.as_tensor(detail.lengths),
-        FREQUENCIES: detail.frequencies,
-        PHASES: detail.phases,
+        FREQUENCIES: detail.features.frequencies,
+        PHASES: detail.features.phases,
         AMPLITUDES: detail.amplitudes,
     }
     return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -50,4 +51,5 @@ def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
     if not ((lengths > 0).all() and (noise > 0).all() and lattice[3] > 0 and 0 < lattice[4] <= 1):
         raise InputError(f"{path} holds a detail whose lengths or noise are not positive.")
     partition = Partition(lattice[:3], float(lattice[3]), float(lattice[4]))
-    return Detail(partition, keys, lengths, frequencies, phases, amplitudes, float(noise[0]), float(noise[1]))
+    of_all = Features(frequencies, phases)
+    return Detail(partition, keys, lengths, of_all, amplitudes, float(noise[0]), float(noise[1]))

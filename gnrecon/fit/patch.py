@@ -13,15 +13,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.field.features import Features
 from gnrecon.linalg.cholesky import damped_factor, solve_factored
 from gnrecon.linalg.gram import gram
-
-DEGREES_OF_FREEDOM = 12.0
-"""Of the features' spectrum, a Student t distribution: the larger, the smoother; 4 is a Matern kernel's."""
 
 SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""
@@ -46,29 +43,6 @@ class Belief:
     length: float
     position: float
     angle: float
-
-
-@dataclass(frozen=True)
-class Features:
-    """Frequencies for a length of one, of shape (m, 3), and phases, of shape (m,)."""
-
-    frequencies: Tensor
-    phases: Tensor
-
-    @classmethod
-    def draw(cls, count: int, rng: np.random.Generator, like: Tensor) -> Features:
-        """Draw features; their kernel is smooth, see `DEGREES_OF_FREEDOM`."""
-        spread = np.sqrt(rng.chisquare(DEGREES_OF_FREEDOM, count) / DEGREES_OF_FREEDOM)
-        frequencies = rng.standard_normal((count, 3)) / spread[:, None]
-        phases = rng.uniform(0.0, 2 * np.pi, count)
-        return cls(torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like))
-
-    def __len__(self) -> int:
-        return len(self.phases)
-
-    def phase(self, x: Tensor, center: Tensor, length: float) -> Tensor:
-        """Return F . (x - center) / length + p, of shape (N, m)."""
-        return torch.addmm(self.phases, (x - center) / length, self.frequencies.T)
 
 
 @dataclass(frozen=True)

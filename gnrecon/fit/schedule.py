@@ -11,7 +11,7 @@ from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
-from gnrecon.fit.adaptive import finite, fit_adaptive
+from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.deep import fit_deep
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
@@ -54,7 +54,7 @@ def fit(
         sdf, fitted = fit_adaptive(samples, options, rng, advance)
     else:
         sdf, fitted = _fit_network(samples, options, rng, callback, advance)
-    if not finite(sdf):
+    if not sdf.finite:
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
     return replace(sdf, support=_support(samples)), fitted
 

@@ -69,6 +69,12 @@ class NeuralSDF:
         return replace(self, detail=None)
 
     @property
+    def finite(self) -> bool:
+        """Whether all parameters that were fitted are finite."""
+        parts = [self.theta] if self.detail is None else [self.theta, self.detail.amplitudes]
+        return all(bool(torch.isfinite(values).all()) for values in parts)
+
+    @property
     def parameters(self) -> int:
         """Number of parameters, those of the detail included."""
         return len(self.theta) + (0 if self.detail is None else self.detail.count)

@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.cloud import Float, Samples
@@ -34,6 +33,7 @@ from gnrecon.fit.loss import normal_weight
 from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.sampling import Density
 
 MOST_POINTS = 20_000
 """Data points that count; more of them are thinned at random, so that sigma is rather too large."""
@@ -111,7 +111,7 @@ class Uncertainty:
             torch.as_tensor(values[chosen]).to(sdf.theta) for values in (samples.points, samples.normals)
         )
         residual = NORMAL_RESIDUALS[sdf.options.get("normals", FitOptions.normals)]
-        weight = normal_weight(_spacing(samples.points))
+        weight = normal_weight(Density(samples.points).spacing)
         rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)
         factor = calibration(rows, posterior, seed)
@@ -137,8 +137,3 @@ def _stand_in(sdf: NeuralSDF, samples: Samples) -> NeuralSDF:
     """Return one layer of features that is fitted to the same samples by a linear solve."""
     asked = FitOptions(steps=0, seed=int(sdf.options.get("seed", 0)), device=str(sdf.theta.device))
     return fit(samples, asked)[0]
-
-
-def _spacing(points: Float) -> float:
-    """Return the median distance from a point to its nearest neighbour, as the fit's weights take it."""
-    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))

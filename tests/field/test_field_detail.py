@@ -6,14 +6,23 @@ import numpy as np
 import torch
 
 from gnrecon.field.detail import Detail
+from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
 
 
 def detail(rng: np.random.Generator, cubes: int = 5, features: int = 7) -> Detail:
     keys = np.array([[0, 0, k] for k in range(cubes)])
     parts = (rng.standard_normal((features, 3)), rng.uniform(0, 6, features), rng.standard_normal((cubes, features)))
-    tensors = [torch.as_tensor(part) for part in parts]
-    return Detail(Partition(np.array([0.1, 0.2, 0.3]), 0.5), keys, rng.uniform(0.1, 0.3, cubes), *tensors, 1e-3, 0.1)
+    frequencies, phases, amplitudes = (torch.as_tensor(part) for part in parts)
+    return Detail(
+        Partition(np.array([0.1, 0.2, 0.3]), 0.5),
+        keys,
+        rng.uniform(0.1, 0.3, cubes),
+        Features(frequencies, phases),
+        amplitudes,
+        1e-3,
+        0.1,
+    )
 
 
 def plainly(of: Detail, x: np.ndarray) -> float:
@@ -25,7 +34,7 @@ def plainly(of: Detail, x: np.ndarray) -> float:
             continue
         weight = float(next(of.partition.weight(torch.as_tensor(x[None]), torch.as_tensor(center), 0)))
         y = (x - center) / of.lengths[number]
-        z = of.frequencies.numpy() @ y + of.phases.numpy()
+        z = of.features.frequencies.numpy() @ y + of.features.phases.numpy()
         total += weight * float(of.amplitudes[number].numpy() @ np.sin(z))
     return total
 

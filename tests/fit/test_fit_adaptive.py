@@ -85,6 +85,13 @@ def test_noise_is_seen_and_smoothed() -> None:
     assert "noise" in solution.status
 
 
+def test_ten_points_are_enough() -> None:
+    directions = np.random.default_rng(0).standard_normal((10, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    sdf, _ = fit(Samples(0.8 * directions, directions, FRAME), FitOptions(quality="draft"))
+    assert np.sqrt(np.mean(sdf.sdf(sdf.data) ** 2)) < 0.1 * FRAME.scale
+
+
 def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:
     samples, sdf = clean
     again = fit(samples, FitOptions(quality="draft"))[0]

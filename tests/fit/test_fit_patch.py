@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gnrecon.fit.patch import SHARE, SIZE, Features, Patch, PatchSystem
+from gnrecon.field.features import Features
+from gnrecon.fit.patch import SHARE, SIZE, Patch, PatchSystem
 
 LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
 
