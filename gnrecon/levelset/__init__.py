@@ -7,6 +7,7 @@ from gnrecon.levelset.level_set import LevelSet, Value, ValueAndGradient
 from gnrecon.levelset.newton import Projection, nearest, project
 from gnrecon.levelset.parametric import ParametricSurface
 from gnrecon.levelset.sample import SurfaceSample, sample_surface
+from gnrecon.levelset.transport import derivative_along, transported
 
 __all__ = [
     "ChamferDivergence",
@@ -20,9 +21,11 @@ __all__ = [
     "catenoid",
     "chamfer_divergence",
     "cone",
+    "derivative_along",
     "enneper",
     "find_crossings",
     "nearest",
     "project",
     "sample_surface",
+    "transported",
 ]
