@@ -25,6 +25,7 @@ from gnrecon.system_packages import LIBRARIES, install_command, loading_fault, m
 
 PACKAGES = {
     "fpsample": "fpsample",
+    "gudhi": "gudhi",
     "jinja2": "jinja2",
     "laspy": "laspy",
     "lazrs": "lazrs",
