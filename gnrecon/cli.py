@@ -49,6 +49,22 @@ ReadPoints = Annotated[
         help="Most points to keep while reading; larger scans are thinned by voxels on the way.", rich_help_panel=POINTS
     ),
 ]
+Crop = Annotated[
+    list[str],
+    typer.Option(
+        metavar="BOX",
+        help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; given again, points in any of the boxes stay.",
+        rich_help_panel=POINTS,
+    ),
+]
+ClipPlane = Annotated[
+    list[str],
+    typer.Option(
+        metavar="PLANE",
+        help="Plane a,b,c,d in file units: points with a x + b y + c z + d below 0 are dropped; may be given again.",
+        rich_help_panel=POINTS,
+    ),
+]
 Units = Annotated[
     str | None,
     typer.Option(
@@ -236,6 +252,8 @@ def reconstruct_command(
     output: Output,
     format: Format = None,
     read_points: ReadPoints = 2_000_000,
+    crop: Crop = (),  # type: ignore[assignment]
+    clip_plane: ClipPlane = (),  # type: ignore[assignment]
     units: Units = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
@@ -299,6 +317,8 @@ def reconstruct_command(
 
     options = {
         "read_points": read_points,
+        "crop": crop,
+        "clip_plane": clip_plane,
         "units": units,
         "fraction": fraction,
         "max_points": max_points,
@@ -348,6 +368,8 @@ def batch_command(
         typer.Option("--format", help="Format of the meshes: obj, ply, stl, off, glb or 3mf.", rich_help_panel=OUTPUT),
     ] = "obj",
     read_points: ReadPoints = 2_000_000,
+    crop: Crop = (),  # type: ignore[assignment]
+    clip_plane: ClipPlane = (),  # type: ignore[assignment]
     units: Units = None,
     fraction: Fraction = None,
     max_points: MaxPoints = None,
@@ -424,6 +446,8 @@ def batch_command(
         "--feature-angle": feature_angle,
     }
     passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
+    passed += [word for box in crop for word in ("--crop", box)]
+    passed += [word for plane in clip_plane for word in ("--clip-plane", plane)]
     passed += ["--curvature"] * curvature + ["--uncertainty"] * uncertainty + ["--adaptive"] * adaptive
     passed += ["--overwrite"] * overwrite + ["--debug"] * debug
     raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, pages=pages, quiet=quiet))

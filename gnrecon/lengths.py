@@ -78,3 +78,20 @@ def parse_box(text: str) -> tuple[tuple[float, float, float], tuple[float, float
     if not all(map(math.isfinite, (x, y, z, u, v, w))) or not (x < u and y < v and z < w):
         raise UsageError(f"{text!r} is not a box: its lower corner must come first, and each side have some length.")
     return (x, y, z), (u, v, w)
+
+
+def parse_plane(text: str) -> tuple[float, float, float, float]:
+    """Return the numbers a, b, c and d of a plane a x + b y + c z + d = 0, written as ``a,b,c,d``.
+
+    Raises
+    ------
+    UsageError
+        When these are not four finite numbers, or the first three are all zero.
+    """
+    try:
+        a, b, c, d = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"{text!r} is not a plane: four numbers a,b,c,d are expected.") from None
+    if not all(map(math.isfinite, (a, b, c, d))) or not any((a, b, c)):
+        raise UsageError(f"{text!r} is not a plane: its numbers must be finite, and a,b,c not all zero.")
+    return a, b, c, d

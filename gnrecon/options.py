@@ -12,7 +12,8 @@ from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.options import FitOptions
 from gnrecon.io import MOST_POINTS
-from gnrecon.lengths import METRES, parse_reach
+from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
+from gnrecon.region import Region
 
 RESOLUTION = 256
 """Cells where nothing else was asked for."""
@@ -27,6 +28,11 @@ class Options:
     read_points : int
         Most points to keep of a scan while it is read: of a larger one, the first point in each of as many equal cubes
         stays, and memory does not grow with the file.
+    crop : sequence of str
+        Boxes ``"xmin,ymin,zmin,xmax,ymax,zmax"`` in file units; points outside of all of them are not read. A single
+        box may be given as it is.
+    clip_plane : sequence of str
+        Planes ``"a,b,c,d"``; points with a x + b y + c z + d < 0 for any of them are not read.
     units : str, optional
         The scan's own unit, a name of `gnrecon.lengths.METRES`; with it, lengths may have other units, as in ``"2mm"``.
     fraction : float in (0, 1], optional
@@ -74,6 +80,8 @@ class Options:
     """
 
     read_points: int = MOST_POINTS
+    crop: tuple[str, ...] = ()
+    clip_plane: tuple[str, ...] = ()
     units: str | None = None
     fraction: float | None = None
     max_points: int | None = None
@@ -107,6 +115,10 @@ class Options:
     def __post_init__(self) -> None:
         if self.resolution is None and self.edge_length is None:
             object.__setattr__(self, "resolution", RESOLUTION)
+        for name in ("crop", "clip_plane"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+        self.region()
         self._check_fineness()
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
@@ -156,6 +168,16 @@ class Options:
         """Return the arguments of `gnrecon.ingest.prepare`."""
         names = ("outliers", "fraction", "max_points", "spacing", "subsample", "holdout", "units", "seed")
         return {name: getattr(self, name) for name in names}
+
+    def region(self) -> Region:
+        """Return where points are wanted.
+
+        Raises
+        ------
+        UsageError
+            When a text is no box or no plane.
+        """
+        return Region(tuple(map(parse_box, self.crop)), tuple(map(parse_plane, self.clip_plane)))
 
     def trim_at(self, spacing: float) -> float | None:
         """Return the distance beyond which the surface is cut off, in the unit of the points' spacing.

@@ -36,11 +36,12 @@ from gnrecon.export import (
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.ingest import IngestCounts, prepare
-from gnrecon.io import Reading, as_cloud, read_reference, read_scans, to_open3d, to_trimesh, write_mesh
+from gnrecon.io import Reading, as_cloud, cropped, read_reference, read_scans, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
+from gnrecon.region import Region
 from gnrecon.report import Stages, plain, versions
 from gnrecon.schema import SCHEMA_VERSION
 
@@ -83,7 +84,7 @@ class Reconstruction:
     uncertainty : Uncertainty, optional
         Standard deviations of the surface, where they were asked for.
     cloud : PointCloud, optional
-        The scan as it was read.
+        The scan as it was read, without what was cropped.
     """
 
     mesh: Mesh
@@ -155,7 +156,7 @@ def reconstruct(
     require_device(chosen.device)
     with limited(chosen.threads):
         return _run(
-            lambda: read_source(source, normals, format, chosen.read_points),
+            lambda: read_source(source, normals, format, chosen.read_points, chosen.region()),
             source,
             reference,
             progress or Progress(),
@@ -265,18 +266,19 @@ def require_device(device: str) -> None:
         raise UsageError("The device is 'cuda', but torch sees no CUDA GPU; `gnrecon doctor` tells what it sees.")
 
 
-def read_source(source: Any, normals: Any, format: str | None, most: int) -> tuple[PointCloud, Reading]:
-    """Return the cloud that `reconstruct` makes of its source, and what was read; `most` bounds what is kept of files.
+def read_source(source: Any, normals: Any, format: str | None, most: int, region: Region) -> tuple[PointCloud, Reading]:
+    """Return the cloud that `reconstruct` makes of its source, and what was read.
+
+    Of files, at most `most` points are kept; of all sources, those in the region.
 
     Raises
     ------
     InputError, UsageError
-        When it cannot be read, or is nothing that holds points.
+        When it cannot be read, is nothing that holds points, or none lie in the region.
     """
     if files := _files(source):
-        return read_scans(files, format, most)
-    cloud = as_cloud(source, normals)
-    return cloud, Reading((), len(cloud), len(cloud))
+        return read_scans(files, format, most, region)
+    return cropped(as_cloud(source, normals), region)
 
 
 def _files(source: Any) -> list[str | Path]:

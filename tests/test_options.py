@@ -42,7 +42,7 @@ from gnrecon.options import Options
         ({"simplify": 0.0}, "tolerance to simplify to must be positive, not 0"),
         ({"faces": 2}, "number of faces must be at least 4, not 2"),
         ({"feature_angle": 120.0}, "feature angle must be from 5 to 90 degrees, not 120"),
-        ({"detail": 3}, "no option 'detail'; the options are read_points, units, fraction"),
+        ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
     ],
 )
 def test_values_out_of_range_and_unknown_names(values: dict[str, Any], sentence: str) -> None:

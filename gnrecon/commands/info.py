@@ -27,7 +27,7 @@ def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = No
         When the scan cannot be read, or no surface can be fitted to it.
     """
     chosen = Options.of(**options)
-    cloud, reading = read_source(list(scans), None, format, chosen.read_points)
+    cloud, reading = read_source(list(scans), None, format, chosen.read_points, chosen.region())
     facts = survey(cloud)
     if facts is None:
         raise InputError("The scan holds fewer than 25 finite and distinct points, so that nothing can be told of it.")

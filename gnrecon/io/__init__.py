@@ -4,7 +4,7 @@ from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
 from gnrecon.io.objects import as_cloud, to_open3d, to_trimesh
 from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
-from gnrecon.io.scans import MOST_POINTS, Reading, read_scans
+from gnrecon.io.scans import MOST_POINTS, Reading, cropped, read_scans
 from gnrecon.io.unpack import extension_of
 from gnrecon.io.write import check_writable, holds, write_cloud, write_mesh, written_origin
 
@@ -17,6 +17,7 @@ __all__ = [
     "as_cloud",
     "atomic_write",
     "check_writable",
+    "cropped",
     "extension_of",
     "holds",
     "read_any",

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.io.contents import Contents, Float, joined
+from gnrecon.region import Region
 
 _REACH = 1 << 20
 """Cubes from the first point in each direction: three such numbers fit into one key of 64 bits."""
@@ -22,18 +23,20 @@ _DIGITS = 2.0**-40
 
 
 class Gatherer:
-    """Keeps at most `most` points of all that it is given.
+    """Keeps at most `most` points of all that it is given in a region.
 
     Attributes
     ----------
     seen : how many points it was given
+    cropped : how many of them lie outside of the region
     non_finite : how many of them were dropped because a coordinate was not finite, while thinning
     side : of the cubes, in file units; None while every point is kept
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, region: Region | None = None) -> None:
         self.most = most
-        self.seen = self.non_finite = 0
+        self.region = region or Region()
+        self.seen = self.cropped = self.non_finite = 0
         self.side: float | None = None
         self._pieces: list[Contents] = []
         self._first: Float | None = None
@@ -41,8 +44,12 @@ class Gatherer:
     def add(self, contents: Contents) -> None:
         """Take a chunk, which holds no faces once there are more points than may be kept."""
         self.seen += len(contents.points)
+        if not self.region.everything:
+            rows = np.flatnonzero(self.region.holds(contents.points))
+            self.cropped += len(contents.points) - len(rows)
+            contents = _selected(contents, rows)
         self._pieces.append(contents)
-        if self.side is not None or self.seen > self.most:
+        if self.side is not None or self.seen - self.cropped > self.most:
             self._thin()
 
     def gathered(self) -> Contents:

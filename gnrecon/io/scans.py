@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError
+from gnrecon.errors import InputError, UsageError
 from gnrecon.io.chunks import SETTLED, chunks
 from gnrecon.io.contents import Contents
 from gnrecon.io.gather import Gatherer
 from gnrecon.io.read import check_file, extension_for, reading
 from gnrecon.io.unpack import plain_file
 from gnrecon.mesh import Mesh
+from gnrecon.region import Region
 
 MOST_POINTS = 2_000_000
 """Points that are kept of a scan by default: a surface is described well by far fewer."""
@@ -29,6 +30,7 @@ class Reading:
     files : their names, as they were given
     points : points in all files together
     kept : how many of them were kept
+    cropped : dropped, because they lie outside of the wanted region
     non_finite : dropped while reading a scan that is too large to be kept, because a coordinate was not finite
     side : of the cubes of which the first point each was kept, in file units; None where every point was
     unread : what else the files hold, in words
@@ -37,6 +39,7 @@ class Reading:
     files: tuple[str, ...]
     points: int
     kept: int
+    cropped: int = 0
     non_finite: int = 0
     side: float | None = None
     unread: tuple[str, ...] = ()
@@ -48,15 +51,21 @@ class Reading:
     def remarks(self) -> list[str]:
         """Return a sentence for what was not taken as it came."""
         sentences = [f"Not read: {', '.join(self.unread)}."] if self.unread else []
+        if self.cropped:
+            sentences.append(f"Dropped {self.cropped:,} of {self.points:,} points outside of the wanted region.")
         if self.side is not None:
+            wanted = self.points - self.cropped
             sentences.append(
-                f"Kept {self.kept:,} of {self.points:,} points, the first one in each cube of side {self.side:.4g}."
+                f"Kept {self.kept:,} of {wanted:,} points, the first one in each cube of side {self.side:.4g}."
             )
         return sentences
 
 
 def read_scans(
-    paths: Sequence[str | Path], format: str | None = None, most: int = MOST_POINTS
+    paths: Sequence[str | Path],
+    format: str | None = None,
+    most: int = MOST_POINTS,
+    region: Region | None = None,
 ) -> tuple[PointCloud, Reading]:
     """Read the points of all files into one cloud, in the files' own units, and say what was read.
 
@@ -69,20 +78,50 @@ def read_scans(
     paths : files whose coordinates have a common frame, by themselves or by the poses that they hold
     format : extension that says how all of them are read; by default each file's own
     most : points to keep, at least 1
+    region : where points are wanted, in the common frame; by default everywhere
 
     Raises
     ------
     InputError, UsageError
-        As `read_cloud` does.
+        As `read_cloud` does, and when no point lies in the region.
     """
-    gatherer = Gatherer(most)
+    gatherer = Gatherer(most, region)
     extensions = [_gather(Path(path), format, gatherer) for path in paths]
     found = gatherer.gathered()
     for settle in {SETTLED[extension] for extension in extensions if extension in SETTLED}:
         found = settle(found)
     cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
+    require_points(cloud, gatherer.seen)
     files = tuple(str(path) for path in paths)
-    return cloud, Reading(files, gatherer.seen, len(cloud), gatherer.non_finite, gatherer.side, found.unread)
+    counts = (gatherer.seen, len(cloud), gatherer.cropped, gatherer.non_finite)
+    return cloud, Reading(files, *counts, gatherer.side, found.unread)
+
+
+def cropped(cloud: PointCloud, region: Region) -> tuple[PointCloud, Reading]:
+    """Return the points of a cloud in a region, and what was dropped.
+
+    Raises
+    ------
+    UsageError
+        When there are none.
+    """
+    inside = cloud if region.everything else cloud.select(region.holds(cloud.points))
+    require_points(inside, len(cloud))
+    return inside, Reading((), len(cloud), len(inside), len(cloud) - len(inside))
+
+
+def require_points(cloud: PointCloud, before: int) -> None:
+    """Refuse a region that holds none of `before` points.
+
+    Raises
+    ------
+    UsageError
+        With the sentence that says so.
+    """
+    if before and not len(cloud):
+        raise UsageError(
+            f"None of the {before:,} points lies in the region that is wanted; gnrecon info tells the scan's box."
+        )
 
 
 def _gather(path: Path, format: str | None, gatherer: Gatherer) -> str:
