@@ -26,7 +26,7 @@ ROWS = [
     {"sampling"},
     {"levelset"},
     {"fit", "ingest", "io", "export"},
-    {"options", "report", "schema", "shapes"},
+    {"options", "report", "schema", "shapes", "design"},
     {"meshing", "adorn", "page"},
     {"shaping"},
     {"pipeline"},
