@@ -99,7 +99,24 @@ Holdout = Annotated[
 Outliers = Annotated[
     str,
     typer.Option(
-        help="Remove scattered points: auto (unless more than 5 % would go), on or off.", rich_help_panel=POINTS
+        help="Remove scattered points: auto (unless more than 5 % would go), on or off; or by another rule, "
+        "statistical:2 (deviations) or radius:3s,4 (fewer than 4 others within 3 spacings).",
+        rich_help_panel=POINTS,
+    ),
+]
+Clusters = Annotated[
+    str,
+    typer.Option(
+        help="Remove small clusters that are farther from the rest than they are large: auto, on or off, as above.",
+        rich_help_panel=POINTS,
+    ),
+]
+SmoothScan = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WIDTH",
+        help="Smooth the points by moving least squares over this width: in file units or, as 8s, in their spacings.",
+        rich_help_panel=POINTS,
     ),
 ]
 Widths = Annotated[
@@ -261,6 +278,8 @@ def reconstruct_command(
     subsample: Subsample = "random",
     holdout: Holdout = None,
     outliers: Outliers = "auto",
+    clusters: Clusters = "auto",
+    smooth_scan: SmoothScan = None,
     widths: Widths = None,
     steps: Steps = None,
     quality: Quality = "normal",
@@ -326,6 +345,8 @@ def reconstruct_command(
         "subsample": subsample,
         "holdout": holdout,
         "outliers": outliers,
+        "clusters": clusters,
+        "smooth_scan": smooth_scan,
         "widths": None if widths is None else parse_widths(widths),
         "steps": steps,
         "quality": quality,
@@ -377,6 +398,8 @@ def batch_command(
     subsample: Subsample = "random",
     holdout: Holdout = None,
     outliers: Outliers = "auto",
+    clusters: Clusters = "auto",
+    smooth_scan: SmoothScan = None,
     widths: Widths = None,
     steps: Steps = None,
     quality: Quality = "normal",
@@ -425,6 +448,8 @@ def batch_command(
         "--subsample": subsample,
         "--holdout": holdout,
         "--outliers": outliers,
+        "--clusters": clusters,
+        "--smooth-scan": smooth_scan,
         "--widths": widths,
         "--steps": steps,
         "--quality": quality,

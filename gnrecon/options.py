@@ -11,6 +11,7 @@ from gnrecon.errors import UsageError
 from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.options import FitOptions
+from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.io import MOST_POINTS
 from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.region import Region
@@ -46,8 +47,14 @@ class Options:
         How the kept points are chosen, see `gnrecon.ingest.subsample`.
     holdout : float in (0, 1), optional
         Share of the points that the fit does not see; how far they lie from its surface is reported.
-    outliers : ``"auto"``, ``"on"`` or ``"off"``
-        Whether scattered points are removed; ``"auto"`` leaves them when they are more than 5 % of all.
+    outliers : str
+        Whether scattered points are removed: ``"auto"`` leaves them when they are more than 5 % of all, ``"on"``,
+        ``"off"``; ``"statistical:2"`` and ``"radius:3s,4"`` use other rules, see `gnrecon.ingest.outlier_rules`.
+    clusters : ``"auto"``, ``"on"`` or ``"off"``
+        The same for small isolated clusters, see `gnrecon.ingest.clusters`.
+    smooth_scan : float or str, optional
+        Width over which the points are smoothed by moving least squares before the fit, in file units, in another unit
+        as in ``"2mm"``, or in spacings of the points as in ``"8s"``, see `gnrecon.ingest.smooth`.
     attributes : str
         Of the vertices: ``"auto"`` carries over all that the scan holds of its points (colours, labels, measured
         values) and adds ``distance``, to the nearest of them; ``"none"``; or names of these, separated by commas.
@@ -89,6 +96,8 @@ class Options:
     subsample: str = "random"
     holdout: float | None = None
     outliers: str = "auto"
+    clusters: str = "auto"
+    smooth_scan: float | str | None = None
     attributes: str = "auto"
     curvature: bool = False
     uncertainty: bool = False
@@ -119,6 +128,8 @@ class Options:
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
         self.region()
+        parse_outliers(self.outliers, self.units)
+        require_mode(self.clusters)
         self._check_fineness()
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
@@ -133,8 +144,9 @@ class Options:
         if not all(name.strip() for name in self.attributes.split(",")):
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
         self.trim_at(spacing=1.0)
-        if self.spacing is not None:
-            parse_reach(str(self.spacing), 1.0, self.units)
+        for length in (self.spacing, self.smooth_scan):
+            if length is not None:
+                parse_reach(str(length), 1.0, self.units)
         if self.holdout is not None and not 0 < self.holdout < 1:
             raise UsageError(f"The share of points to hold out is {self.holdout}, but must lie between 0 and 1.")
         self.fit()
@@ -166,7 +178,18 @@ class Options:
 
     def ingest(self) -> dict[str, Any]:
         """Return the arguments of `gnrecon.ingest.prepare`."""
-        names = ("outliers", "fraction", "max_points", "spacing", "subsample", "holdout", "units", "seed")
+        names = (
+            "outliers",
+            "clusters",
+            "smooth_scan",
+            "fraction",
+            "max_points",
+            "spacing",
+            "subsample",
+            "holdout",
+            "units",
+            "seed",
+        )
         return {name: getattr(self, name) for name in names}
 
     def region(self) -> Region:

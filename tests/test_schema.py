@@ -29,6 +29,13 @@ RUNS: dict[str, dict[str, Any]] = {
     "plain": {"steps": 0},
     "thinned": {"steps": 0, "max_points": None, "fraction": 0.5, "subsample": "voxel", "threads": 1},
     "held out": {"steps": 0, "max_points": None, "spacing": "1.5s", "subsample": "farthest", "holdout": 0.1},
+    "cleaned": {
+        "steps": 0,
+        "smooth_scan": "8s",
+        "outliers": "statistical:3",
+        "clusters": "on",
+        "crop": "-2,-2,-2,2,2,2",
+    },
     "gauss-newton": {"steps": 2},
     "line": {"steps": 2, "search": "line", "solver": "qr"},
     "trimmed": {"steps": 0, "trim": "3s", "curvature": True},
@@ -121,7 +128,7 @@ def test_the_numbers_of_a_report_hold(name: str, report_of: Callable[[str], Repo
     shape = report["mesh"]["quality"]
     assert sum(shape["histogram"]["counts"]) == 3 * report["mesh"]["faces"]
     assert shape["edge_length"]["min"] <= shape["edge_length"]["mean"] <= shape["edge_length"]["max"]
-    dropped = ("non_finite", "zero_normals", "duplicates", "outliers", "held_out", "thinned")
+    dropped = ("non_finite", "zero_normals", "duplicates", "repeated", "outliers", "clusters", "held_out", "thinned")
     assert ingest["read"] == ingest["kept"] + sum(ingest[reason] for reason in dropped) == 1200
     if RUNS[name].get("threads"):
         assert resources["threads"] == RUNS[name]["threads"]

@@ -9,29 +9,40 @@ import numpy.typing as npt
 
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import InputError, UsageError
+from gnrecon.ingest.clusters import isolated_clusters
 from gnrecon.ingest.counts import IngestCounts
+from gnrecon.ingest.outlier_rules import MODES, outliers_by_rule, parse_outliers
 from gnrecon.ingest.outliers import find_outliers
+from gnrecon.ingest.repeats import repeated_points
 
 Float = npt.NDArray[np.float64]
 
 LEAST_POINTS = 10
 _FLAT = 1e-4  # ratio of extents below which a cloud counts as a plane or a line
-_OUTLIERS = ("auto", "on", "off")
 
 
 def clean(
-    cloud: PointCloud, outliers: str = "auto", max_outlier_share: float = 0.05
+    cloud: PointCloud,
+    outliers: str = "auto",
+    max_outlier_share: float = 0.05,
+    *,
+    clusters: str = "auto",
+    units: str | None = None,
 ) -> tuple[PointCloud, IngestCounts]:
     """Return the usable points, with unit normals where the cloud has some, and what was dropped.
 
     Dropped are points that are not finite, exact duplicates (the first stays), points without a direction where most
-    have one (where most have none, all normals are discarded), and outliers.
+    have one (where most have none, all normals are discarded), copies of points in a scan that is there twice, see
+    `repeats`, outliers, and isolated clusters, see `clusters`.
 
     Parameters
     ----------
     outliers : ``"auto"`` drops outliers unless they are more than `max_outlier_share` of the points, which points to a
-        property of the scan rather than to stray points; ``"on"`` drops them always, ``"off"`` never
+        property of the scan rather than to stray points; ``"on"`` drops them always, ``"off"`` never;
+        ``"statistical:2"`` and ``"radius:3s,4"`` drop what other rules call so, see `outlier_rules`
     max_outlier_share : share in [0, 1]
+    clusters : ``"auto"``, ``"on"`` or ``"off"``, the same for isolated clusters
+    units : the cloud's unit, for a distance in another one
 
     Raises
     ------
@@ -40,8 +51,8 @@ def clean(
     InputError
         When fewer than 10 points remain, or all lie on a line or in a plane.
     """
-    if outliers not in _OUTLIERS:
-        raise UsageError(f"The outlier mode {outliers!r} is unknown; expected one of {', '.join(_OUTLIERS)}.")
+    rule = parse_outliers(outliers, units)
+    require_mode(clusters)
     if not 0 <= max_outlier_share <= 1:
         raise UsageError(f"The largest share of outliers is {max_outlier_share}, but must lie in [0, 1].")
     counts = IngestCounts(read=len(cloud))
@@ -52,7 +63,16 @@ def clean(
     counts = replace(counts, zero_normals=dropped, duplicates=len(cloud) - len(first))
     cloud = cloud.select(np.sort(first))
     _require(cloud, counts)
-    cloud, counts = _without_outliers(cloud, counts, outliers, max_outlier_share)
+    repeated = repeated_points(_centred(cloud))
+    cloud, counts = cloud.select(~repeated), replace(counts, repeated=int(repeated.sum()))
+    if rule.name in MODES:
+        cloud, dropped, left = _without(cloud, find_outliers(_centred(cloud)), rule.name, max_outlier_share)
+    else:
+        cloud, dropped, left = _without(cloud, outliers_by_rule(_centred(cloud), rule, units), "on", 1.0)
+    counts = replace(counts, outliers=dropped, outliers_found=left)
+    _require(cloud, counts)
+    cloud, dropped, left = _without(cloud, isolated_clusters(_centred(cloud)), clusters, max_outlier_share)
+    counts = replace(counts, clusters=dropped, clusters_found=left)
     _require(cloud, counts)
     _require_volume(cloud.points)
     return cloud, replace(counts, kept=len(cloud), normals="missing" if cloud.normals is None else "given")
@@ -72,15 +92,32 @@ def _with_directions(cloud: PointCloud) -> tuple[PointCloud, int]:
     return kept.with_normals(scaled / np.linalg.norm(scaled, axis=1, keepdims=True)), int((~usable).sum())
 
 
-def _without_outliers(
-    cloud: PointCloud, counts: IngestCounts, mode: str, max_share: float
-) -> tuple[PointCloud, IngestCounts]:
-    # About the mean, because differences of far-off coordinates lose digits.
-    mask = find_outliers(cloud.points - cloud.points.mean(axis=0))
+def _centred(cloud: PointCloud) -> Float:
+    """The points about their mean, because differences of far-off coordinates lose digits."""
+    centred: Float = cloud.points - cloud.points.mean(axis=0)
+    return centred
+
+
+def _without(
+    cloud: PointCloud, mask: npt.NDArray[np.bool_], mode: str, max_share: float
+) -> tuple[PointCloud, int, int]:
+    """Drop the points of a mask if the mode allows it; how many were dropped, and how many were left alone."""
     found = int(mask.sum())
     if mode == "on" or (mode == "auto" and found <= max_share * len(cloud)):
-        return cloud.select(~mask), replace(counts, outliers=found)
-    return cloud, replace(counts, outliers_found=found)
+        return cloud.select(~mask), found, 0
+    return cloud, 0, found
+
+
+def require_mode(clusters: str) -> None:
+    """Refuse what is no mode of dropping isolated clusters.
+
+    Raises
+    ------
+    UsageError
+        With the sentence that says so.
+    """
+    if clusters not in MODES:
+        raise UsageError(f"The mode for isolated clusters is {clusters!r}, but must be one of {', '.join(MODES)}.")
 
 
 def _require(cloud: PointCloud, counts: IngestCounts) -> None:

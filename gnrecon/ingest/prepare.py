@@ -12,6 +12,7 @@ from gnrecon.errors import UsageError
 from gnrecon.ingest.clean import LEAST_POINTS, clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.normals import flip_if_inward, oriented_normals
+from gnrecon.ingest.smooth import smoothed
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample as thin
 from gnrecon.lengths import parse_reach
@@ -27,6 +28,8 @@ def prepare(
     cloud: PointCloud,
     *,
     outliers: str = "auto",
+    clusters: str = "auto",
+    smooth_scan: float | str | None = None,
     fraction: float | None = None,
     max_points: int | None = None,
     spacing: float | str | None = None,
@@ -36,18 +39,19 @@ def prepare(
     seed: int = 0,
     advance: Advance = unheard,
 ) -> tuple[Samples, IngestCounts]:
-    """Clean a cloud, orient it, thin it, and move it into the unit ball, in this order.
+    """Clean a cloud, orient it, smooth it if asked to, thin it, and move it into the unit ball, in this order.
 
     Normals are estimated before thinning, because all points together tell them better.
 
     Parameters
     ----------
     cloud : in file units
-    outliers : ``"auto"``, ``"on"`` or ``"off"``, see `clean`
+    outliers, clusters : ``"auto"``, ``"on"`` or ``"off"``, and for outliers other rules, see `clean`
+    smooth_scan : width of the surroundings that smoothing takes in, see `smooth`; may be given as a spacing may
     fraction, max_points, spacing, subsample, seed : how many points to keep and how to choose them, see `subsample`,
         where `subsample` is called `method`; a spacing may be given in mean spacings of the points, as ``"2s"``
     holdout : share of the points, in (0, 1), that are kept from the fit as `Samples.held_out`
-    units : the cloud's unit, for a spacing in another one, as ``"2mm"``
+    units : the cloud's unit, for a length in another one, as ``"2mm"``
     advance : told of the share that is done after each of them
 
     Raises
@@ -57,7 +61,7 @@ def prepare(
     UsageError
         When an argument is out of its range, or thinning would leave fewer than 10 points.
     """
-    cleaned, counts = clean(cloud, outliers)
+    cleaned, counts = clean(cloud, outliers, clusters=clusters, units=units)
     advance(CLEANED)
     if cleaned.normals is None:
         normals, how = oriented_normals(cleaned.points)
@@ -68,11 +72,17 @@ def prepare(
     oriented = cleaned.with_normals(normals)
     oriented, held_out = _hold_out(oriented, holdout, seed)
     # Distances between points are those of the whole cloud.
-    apart = None if spacing is None else parse_reach(str(spacing), mean_spacing(cleaned.points), units)
+    apart, width = (
+        None if text is None else parse_reach(str(text), mean_spacing(cleaned.points), units)
+        for text in (spacing, smooth_scan)
+    )
+    oriented, moved = _smooth(oriented, width)
     kept = thin(oriented, fraction=fraction, max_points=max_points, spacing=apart, method=subsample, seed=seed)
     if len(kept) < LEAST_POINTS:
         raise UsageError(f"Subsampling leaves {len(kept)} points, but a surface needs at least {LEAST_POINTS}.")
-    counts = replace(counts, thinned=len(oriented) - len(kept), held_out=len(held_out), kept=len(kept), normals=how)
+    counts = replace(
+        counts, moved=moved, thinned=len(oriented) - len(kept), held_out=len(held_out), kept=len(kept), normals=how
+    )
     assert kept.normals is not None
     frame = Frame.of(kept.points)
     return Samples(frame.to_unit(kept.points), kept.normals, frame, _held_samples(held_out, frame)), counts
@@ -85,6 +95,16 @@ def _hold_out(cloud: PointCloud, share: float | None, seed: int) -> tuple[PointC
     held = np.zeros(len(cloud), bool)
     held[np.random.default_rng([seed, _HELD_OUT]).permutation(len(cloud))[: round((share or 0.0) * len(cloud))]] = True
     return cloud.select(~held), cloud.select(held)
+
+
+def _smooth(cloud: PointCloud, width: float | None) -> tuple[PointCloud, float | None]:
+    """Smooth the points over a width, if there is one, and tell how far they moved in the root mean square."""
+    if width is None or cloud.normals is None:
+        return cloud, None
+    centre = cloud.points.mean(axis=0)
+    points, normals = smoothed(cloud.points - centre, cloud.normals, width)
+    moved = float(np.sqrt(((points - (cloud.points - centre)) ** 2).sum(axis=1).mean()))
+    return replace(cloud, points=points + centre, normals=normals), moved
 
 
 def _held_samples(held_out: PointCloud, frame: Frame) -> Samples | None:

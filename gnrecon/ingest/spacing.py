@@ -8,6 +8,7 @@ import numpy.typing as npt
 Float = npt.NDArray[np.float64]
 
 _QUERIES = 20_000
+_NEIGHBOURS = 8
 
 
 def mean_spacing(points: Float) -> float:
@@ -15,8 +16,23 @@ def mean_spacing(points: Float) -> float:
 
     In large clouds it is taken over evenly chosen rows.
     """
+    return float(np.median(_distances(points, 1)[:, -1]))
+
+
+def neighbour_spacing(points: Float) -> float:
+    """Return the distance of points that fill a plane as densely as these fill their surface, in the median.
+
+    It is the side of the square that each point has for itself, from the disk that holds its 8 nearest neighbours, and
+    so is hardly moved by pairs of close points; `points` has shape (N, 3), N > 8.
+    """
+    return float(np.median(_distances(points, _NEIGHBOURS)[:, -1]) * np.sqrt(np.pi / _NEIGHBOURS))
+
+
+def _distances(points: Float, count: int) -> Float:
+    """Distances to the `count` nearest other points, of shape (Q, count), at evenly chosen rows."""
     from scipy.spatial import cKDTree
 
     centred = points - points.mean(axis=0)
     stride = -(-len(points) // _QUERIES)
-    return float(np.median(cKDTree(centred).query(centred[::stride], 2)[0][:, 1]))
+    distances: Float = cKDTree(centred).query(centred[::stride], count + 1)[0][:, 1:]
+    return distances

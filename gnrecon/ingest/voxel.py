@@ -25,10 +25,10 @@ def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -
     """
     extent = float(np.ptp(points, axis=0).max())
     low, high = np.log(_FINEST), 0.0
-    cells = _cells(points, extent * _FINEST)
+    cells = cells_of(points, 0.0)
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        coarser = _cells(points, extent * float(np.exp(middle)))
+        coarser = cells_of(points, extent * float(np.exp(middle)))
         if coarser.max() + 1 >= count:
             low, cells = middle, coarser
         else:
@@ -47,11 +47,15 @@ def voxel_representatives_of_side(points: Float, side: float, rng: np.random.Gen
     side : positive; below a millionth of the extent, cubes of that size are taken
     """
     del rng  # nothing is left to chance
-    return _nearest_to_means(points, _cells(points, max(side, float(np.ptp(points, axis=0).max()) * _FINEST)))
+    return _nearest_to_means(points, cells_of(points, side))
 
 
-def _cells(points: Float, size: float) -> Rows:
-    """Return for each point the number, from 0, of the occupied cube of side `size` that holds it; shape (N,)."""
+def cells_of(points: Float, size: float) -> Rows:
+    """Return for each point the number, from 0, of the occupied cube of side `size` that holds it; shape (N,).
+
+    Cubes are no smaller than a millionth of the extent.
+    """
+    size = max(size, float(np.ptp(points, axis=0).max()) * _FINEST)
     corner = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     sides = corner.max(axis=0) + 1
     key = (corner[:, 0] * sides[1] + corner[:, 1]) * sides[2] + corner[:, 2]

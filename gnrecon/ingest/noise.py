@@ -1,0 +1,96 @@
+"""How noisy a cloud is: the spread of points about smooth patches of their surface, with curvature taken out of it.
+
+A quadric is fitted to neighbourhoods of two sizes. What remains of noise is the same in both; what remains of the
+surface, being of third order, grows with the sixth power of the reach in square, so that the two tell both apart
+(Richardson's extrapolation). Each size's variance is the median over the cloud, divided by that of the chi-square
+distribution, so that edges and outliers count little. Where noise is large against the neighbourhoods, their planes
+are not those of the surface and the spread comes out too small; they are doubled until they reach six times as far.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.stats import chi2
+
+Float = npt.NDArray[np.float64]
+
+_SIZES = (10, 15)
+"""Points of the smallest neighbourhoods."""
+
+LEAST_POINTS = 16
+_QUERIES = 4000
+_WIDE = 6.0  # least reach, in units of the noise
+_DOUBLINGS = 6
+_SHARE = 32
+"""A neighbourhood has no more than one in so many points."""
+
+_NONE = 0.005
+"""Of the spacing, below which noise is rounding."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise along the normal, in the unit of the points.
+
+    Parameters
+    ----------
+    deviation : standard deviation; 0 where the surface itself accounts for all of the spread; None where it cannot be
+        told, because neighbourhoods that are wide enough would span much of the shape
+    limit : what it is at most, because some of the spread may be the surface's own
+    """
+
+    deviation: float | None
+    limit: float
+
+
+def estimate_noise(points: Float, spacing: float) -> Noise:
+    """Return the noise of a cloud.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), centred, distinct, N >= 16
+    spacing : of the points
+    """
+    tree = cKDTree(points)
+    chosen = points[np.random.default_rng(0).permutation(len(points))[:_QUERIES]]
+    for doubling in range(_DOUBLINGS + 1):
+        small, large = _spread(tree, chosen, _SIZES[0] << doubling), _spread(tree, chosen, _SIZES[1] << doubling)
+        reached = small[1] >= _WIDE * small[0]
+        if reached or (_SIZES[1] << doubling + 1) * _SHARE > len(points):
+            break
+    deviation = _extrapolated(*small, *large)
+    if not reached and deviation > _NONE * spacing:
+        return Noise(None, max(small[0], deviation))
+    return Noise(0.0 if deviation <= _NONE * spacing else deviation, max(small[0], deviation))
+
+
+def _extrapolated(near: float, near_reach: float, far: float, far_reach: float) -> float:
+    """The spread that a neighbourhood of no reach would have."""
+    a, b = near_reach**6, far_reach**6
+    return float(np.sqrt(max(near**2 * b - far**2 * a, 0.0) / (b - a))) if b > a else near
+
+
+def _spread(tree: cKDTree, chosen: Float, size: int) -> tuple[float, float]:
+    """The spread about quadrics of `size` points, and how far these reach, in the median."""
+    distances, rows = tree.query(chosen, size)
+    u, v, w = np.moveaxis(local_frames(tree.data[rows]), 2, 0)
+    columns = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+    basis = np.linalg.qr(columns)[0]
+    rest = w - np.einsum("gkc,gc->gk", basis, np.einsum("gkc,gk->gc", basis, w))
+    freedom = size - columns.shape[2]
+    squares = (rest**2).sum(axis=1) * distances[:, -1] ** 2
+    return float(np.sqrt(np.median(squares) / chi2.median(freedom))), float(np.median(distances[:, -1]))
+
+
+def local_frames(groups: Float) -> Float:
+    """Neighbourhoods, of shape (G, k, 3), in units of their reach: two axes in their plane, one along its normal."""
+    centred = groups - groups[:, :1]
+    centred = centred / np.linalg.norm(centred, axis=2).max(axis=1)[:, None, None]
+    spread = centred - centred.mean(axis=1, keepdims=True)
+    axes = np.linalg.eigh(np.einsum("gki,gkj->gij", spread, spread))[1][:, :, ::-1]
+    local: Float = np.einsum("gki,gij->gkj", centred, axes)
+    return local
