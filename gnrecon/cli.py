@@ -119,6 +119,14 @@ SmoothScan = Annotated[
         rich_help_panel=POINTS,
     ),
 ]
+Orient = Annotated[
+    str,
+    typer.Option(
+        help="Normals: auto (estimated where there are none, turned where they look inward), given (as they are), "
+        "signs (their sides found anew) or estimate (all anew).",
+        rich_help_panel=POINTS,
+    ),
+]
 Widths = Annotated[
     str | None,
     typer.Option(
@@ -280,6 +288,7 @@ def reconstruct_command(
     outliers: Outliers = "auto",
     clusters: Clusters = "auto",
     smooth_scan: SmoothScan = None,
+    orient: Orient = "auto",
     widths: Widths = None,
     steps: Steps = None,
     quality: Quality = "normal",
@@ -347,6 +356,7 @@ def reconstruct_command(
         "outliers": outliers,
         "clusters": clusters,
         "smooth_scan": smooth_scan,
+        "orient": orient,
         "widths": None if widths is None else parse_widths(widths),
         "steps": steps,
         "quality": quality,
@@ -400,6 +410,7 @@ def batch_command(
     outliers: Outliers = "auto",
     clusters: Clusters = "auto",
     smooth_scan: SmoothScan = None,
+    orient: Orient = "auto",
     widths: Widths = None,
     steps: Steps = None,
     quality: Quality = "normal",
@@ -450,6 +461,7 @@ def batch_command(
         "--outliers": outliers,
         "--clusters": clusters,
         "--smooth-scan": smooth_scan,
+        "--orient": orient,
         "--widths": widths,
         "--steps": steps,
         "--quality": quality,

@@ -127,12 +127,15 @@ class Samples:
     frame : Frame
     held_out : Samples, optional
         Points that were kept from the fit, so that it can be checked at them, in the same frame.
+    estimated : bool
+        Whether the normals, or their sides, were estimated from the points, so that they may be wrong in places.
     """
 
     points: Float
     normals: Float
     frame: Frame
     held_out: Samples | None = None
+    estimated: bool = False
 
     def __len__(self) -> int:
         return len(self.points)

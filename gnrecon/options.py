@@ -12,6 +12,7 @@ from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.options import FitOptions
 from gnrecon.ingest import parse_outliers, require_mode
+from gnrecon.ingest.orient import require_orientation
 from gnrecon.io import MOST_POINTS
 from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.region import Region
@@ -55,6 +56,10 @@ class Options:
     smooth_scan : float or str, optional
         Width over which the points are smoothed by moving least squares before the fit, in file units, in another unit
         as in ``"2mm"``, or in spacings of the points as in ``"8s"``, see `gnrecon.ingest.smooth`.
+    orient : ``"auto"``, ``"given"``, ``"signs"`` or ``"estimate"``
+        Normals are estimated where the scan has none. Those that it has: ``"auto"`` turns all around where they look
+        into a closed surface, ``"given"`` takes them as they are, ``"signs"`` finds the side of each anew and
+        ``"estimate"`` discards them.
     attributes : str
         Of the vertices: ``"auto"`` carries over all that the scan holds of its points (colours, labels, measured
         values) and adds ``distance``, to the nearest of them; ``"none"``; or names of these, separated by commas.
@@ -98,6 +103,7 @@ class Options:
     outliers: str = "auto"
     clusters: str = "auto"
     smooth_scan: float | str | None = None
+    orient: str = "auto"
     attributes: str = "auto"
     curvature: bool = False
     uncertainty: bool = False
@@ -149,6 +155,7 @@ class Options:
                 parse_reach(str(length), 1.0, self.units)
         if self.holdout is not None and not 0 < self.holdout < 1:
             raise UsageError(f"The share of points to hold out is {self.holdout}, but must lie between 0 and 1.")
+        require_orientation(self.orient)
         self.fit()
         self.refine()
 
@@ -187,6 +194,7 @@ class Options:
             "spacing",
             "subsample",
             "holdout",
+            "orient",
             "units",
             "seed",
         )

@@ -74,7 +74,7 @@ def test_the_fit_receives_its_options() -> None:
 
 def test_ingest_receives_its_options() -> None:
     chosen = {"outliers": "off", "fraction": 0.5, "max_points": 100, "subsample": "voxel", "seed": 4}
-    chosen |= {"spacing": "2s", "holdout": 0.1, "units": "mm", "clusters": "on", "smooth_scan": "8s"}
+    chosen |= {"spacing": "2s", "holdout": 0.1, "units": "mm", "clusters": "on", "smooth_scan": "8s", "orient": "signs"}
     assert Options(**chosen).ingest() == chosen
     parameters = inspect.signature(prepare).parameters
     for name, value in Options().ingest().items():

@@ -25,6 +25,8 @@ class IngestCounts:
     thinned : left out by subsampling
     kept : what remains
     normals : how they came about, such as ``"given"``, ``"given, flipped"`` or ``"estimated"``
+    confidence : share of the points that speak for the side of their normal, see `Orientation`; None where it was given
+    flipped : share of the given normals that were turned around
     """
 
     read: int
@@ -41,6 +43,8 @@ class IngestCounts:
     thinned: int = 0
     kept: int = 0
     normals: str = "missing"
+    confidence: float | None = None
+    flipped: float = 0.0
 
     def as_dict(self) -> dict[str, int | float | str | None]:
         """Return the fields by name, for reports."""
@@ -66,5 +70,11 @@ class IngestCounts:
                 f"Smoothed the points, which moved by {self.moved:.3g} file units in the root mean square."
             )
         if self.normals != "given":
-            sentences.append(f"Normals: {self.normals}.")
+            sentences.append(f"Normals: {self.normals}{self._told()}.")
         return sentences
+
+    def _told(self) -> str:
+        turned = f"; {100 * self.flipped:.3g} % turned around" if 0 < self.flipped < 1 else ""
+        if self.confidence is None:
+            return turned
+        return f"{turned}; {100 * self.confidence:.0f} % of the points confirm their side"

@@ -11,7 +11,7 @@ from gnrecon.cloud import Frame, PointCloud, Samples
 from gnrecon.errors import UsageError
 from gnrecon.ingest.clean import LEAST_POINTS, clean
 from gnrecon.ingest.counts import IngestCounts
-from gnrecon.ingest.normals import flip_if_inward, oriented_normals
+from gnrecon.ingest.orient import require_orientation, with_outward_normals
 from gnrecon.ingest.smooth import smoothed
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample as thin
@@ -35,6 +35,7 @@ def prepare(
     spacing: float | str | None = None,
     subsample: str = "random",
     holdout: float | None = None,
+    orient: str = "auto",
     units: str | None = None,
     seed: int = 0,
     advance: Advance = unheard,
@@ -51,6 +52,7 @@ def prepare(
     fraction, max_points, spacing, subsample, seed : how many points to keep and how to choose them, see `subsample`,
         where `subsample` is called `method`; a spacing may be given in mean spacings of the points, as ``"2s"``
     holdout : share of the points, in (0, 1), that are kept from the fit as `Samples.held_out`
+    orient : which normals and sides are estimated, see `with_outward_normals`
     units : the cloud's unit, for a length in another one, as ``"2mm"``
     advance : told of the share that is done after each of them
 
@@ -61,15 +63,11 @@ def prepare(
     UsageError
         When an argument is out of its range, or thinning would leave fewer than 10 points.
     """
+    require_orientation(orient)
     cleaned, counts = clean(cloud, outliers, clusters=clusters, units=units)
     advance(CLEANED)
-    if cleaned.normals is None:
-        normals, how = oriented_normals(cleaned.points)
-    else:
-        normals, flipped = flip_if_inward(cleaned.points, cleaned.normals)
-        how = "given, flipped" if flipped else "given"
+    oriented, orientation = with_outward_normals(cleaned, orient)
     advance(ORIENTED)
-    oriented = cleaned.with_normals(normals)
     oriented, held_out = _hold_out(oriented, holdout, seed)
     # Distances between points are those of the whole cloud.
     apart, width = (
@@ -80,12 +78,12 @@ def prepare(
     kept = thin(oriented, fraction=fraction, max_points=max_points, spacing=apart, method=subsample, seed=seed)
     if len(kept) < LEAST_POINTS:
         raise UsageError(f"Subsampling leaves {len(kept)} points, but a surface needs at least {LEAST_POINTS}.")
-    counts = replace(
-        counts, moved=moved, thinned=len(oriented) - len(kept), held_out=len(held_out), kept=len(kept), normals=how
-    )
+    counts = replace(counts, moved=moved, thinned=len(oriented) - len(kept), held_out=len(held_out), kept=len(kept))
+    counts = replace(counts, normals=orientation.how, confidence=orientation.confidence, flipped=orientation.flipped)
     assert kept.normals is not None
     frame = Frame.of(kept.points)
-    return Samples(frame.to_unit(kept.points), kept.normals, frame, _held_samples(held_out, frame)), counts
+    held = _held_samples(held_out, frame)
+    return Samples(frame.to_unit(kept.points), kept.normals, frame, held, orientation.estimated), counts
 
 
 def _hold_out(cloud: PointCloud, share: float | None, seed: int) -> tuple[PointCloud, PointCloud]:

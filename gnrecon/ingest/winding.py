@@ -52,3 +52,8 @@ def outwardness(points: Float, normals: Float) -> float:
 def disorder(points: Float, normals: Float) -> float:
     """Return the mean distance of the winding number from 1/2: near 0 only for a consistent outward orientation."""
     return float(np.minimum(np.abs(winding_on_surface(points, normals) - 0.5), 1.0).mean())
+
+
+def agreement(points: Float, normals: Float) -> float:
+    """Return the share of the points, in [0, 1], at which the winding number is nearer to 1/2 than to 0 and to 1."""
+    return float((np.abs(winding_on_surface(points, normals) - 0.5) < 0.25).mean())

@@ -1,0 +1,70 @@
+"""Directions of normals where neighbourhoods are hard: noise, sharp edges, thin plates; and their plain oracle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_clouds import Float, sphere, torus
+
+from gnrecon.ingest.directions import directions, tangent_planes
+
+
+def degrees(found: Float, truth: Float) -> Float:
+    """Angles between lines, of shape (N,)."""
+    return np.degrees(np.arccos(np.clip(np.abs(np.einsum("ij,ij->i", found, truth)), 0, 1)))
+
+
+def cube(count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Points on the surface of a cube of side 2, and their normals."""
+    axis, side = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count)
+    points, normals = rng.uniform(-1, 1, (count, 3)), np.zeros((count, 3))
+    points[np.arange(count), axis] = side
+    normals[np.arange(count), axis] = side
+    return points, normals
+
+
+def test_planes_are_those_of_a_singular_value_decomposition(rng: np.random.Generator) -> None:
+    points = torus(300, rng)[0]
+    found = tangent_planes(points, 12)
+    for row in range(0, 300, 17):
+        near = points[np.argsort(np.linalg.norm(points - points[row], axis=1))[:12]]
+        axis = np.linalg.svd(near - near.mean(axis=0))[2][2]
+        assert abs(found[row] @ axis) == pytest.approx(1)
+
+
+def test_smooth_and_clean_clouds(rng: np.random.Generator) -> None:
+    for points, truth in (sphere(2000, rng), torus(3000, rng)):
+        assert np.median(degrees(directions(points), truth)) < 3
+
+
+def test_noise_asks_more_neighbours(rng: np.random.Generator) -> None:
+    points, truth = torus(6000, rng)
+    noisy = points + 0.015 * rng.standard_normal(points.shape)
+    adaptive, narrow = (degrees(found, truth).mean() for found in (directions(noisy), tangent_planes(noisy, 12)))
+    assert adaptive < 0.75 * narrow
+
+
+def test_sharp_edges_are_not_blurred(rng: np.random.Generator) -> None:
+    points, truth = cube(4000, rng)
+    adaptive, plain = (degrees(found, truth) for found in (directions(points), tangent_planes(points, 12)))
+    assert (adaptive > 10).mean() < 0.4 * (plain > 10).mean()
+    assert adaptive.mean() < 0.5 * plain.mean()
+
+
+def test_a_plate_as_thin_as_its_points_are_apart(rng: np.random.Generator) -> None:
+    points, truth = cube(4000, rng)
+    flat = np.abs(truth[:, 2]) == 1
+    points = points[flat] * [1, 1, 0.015]
+    assert (degrees(directions(points), truth[flat]) < 10).mean() > 0.9
+    assert (degrees(tangent_planes(points, 12), truth[flat]) < 10).mean() < 0.7
+
+
+@pytest.mark.parametrize("count", [4, 7, 10, 25])
+def test_few_points_have_directions_of_unit_length(count: int, rng: np.random.Generator) -> None:
+    found = directions(sphere(count, rng)[0])
+    assert np.allclose(np.linalg.norm(found, axis=1), 1)
+
+
+def test_points_on_a_line_do_no_harm() -> None:
+    points = np.column_stack([np.linspace(-1, 1, 200), np.zeros(200), np.zeros(200)])
+    assert np.isfinite(directions(points)).all()

@@ -1,0 +1,117 @@
+"""Normals by where the scanner stood, and what is done with those that a cloud has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_clouds import Float, sphere, torus
+
+from gnrecon.cloud import PointCloud
+from gnrecon.errors import UsageError
+from gnrecon.ingest import prepare
+from gnrecon.ingest.normals import oriented_normals
+from gnrecon.ingest.sight import towards_scanner
+from gnrecon.io import read_scans
+
+SCANNERS = np.array([[9.0, 0, 0], [-5, 8, 0], [-5, -8, 3], [0, 0, -9]])
+
+
+def seen(points: Float, normals: Float) -> tuple[Float, Float, Float]:
+    """The points of a convex shape that a scanner sees at 3 degrees or more, their normals and that scanner."""
+    parts = []
+    for scanner in SCANNERS:
+        sight = scanner - points
+        cosines = np.einsum("ij,ij->i", sight, normals) / np.linalg.norm(sight, axis=1)
+        rows = cosines > np.sin(np.radians(3))
+        parts.append((points[rows], normals[rows], np.broadcast_to(scanner, points[rows].shape)))
+    found = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+    return found[0], found[1], found[2]
+
+
+def test_normals_look_at_the_scanner(rng: np.random.Generator) -> None:
+    points, truth, origins = seen(*sphere(3000, rng))
+    points, first = np.unique(points, axis=0, return_index=True)
+    found = oriented_normals(points, origins[first])
+    assert found.how == "estimated, oriented by origins"
+    assert (np.einsum("ij,ij->i", found.normals, truth[first]) > 0).all()
+    assert found.confidence is not None
+    assert 0.85 < found.confidence < 1
+
+
+def test_open_scans_of_the_inside_look_inward(rng: np.random.Generator) -> None:
+    points, truth = sphere(2000, rng)
+    found = oriented_normals(points, np.zeros_like(points))
+    assert (np.einsum("ij,ij->i", found.normals, truth) < 0).all()
+    assert found.confidence == 1
+
+
+def test_unknown_and_grazing_origins_follow_their_neighbours(rng: np.random.Generator) -> None:
+    points, truth = sphere(2000, rng)
+    origins = 3 * points
+    origins[rng.permutation(2000)[:600]] = np.nan
+    turned = truth * rng.choice([-1.0, 1.0], (2000, 1))
+    normals, share = towards_scanner(points, turned, origins) or (truth, 0.0)
+    assert np.allclose(normals, truth)
+    assert share == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("known", [0.0, 0.3])
+def test_few_known_origins_do_not_decide(known: float, rng: np.random.Generator) -> None:
+    points, truth = sphere(1000, rng)
+    origins = np.where(np.arange(1000)[:, None] < 1000 * known, 3 * points, np.nan)
+    assert towards_scanner(points, truth, origins) is None
+    assert oriented_normals(points, origins).how == "estimated"
+    assert towards_scanner(points, truth, None) is None
+
+
+def test_what_is_done_with_given_normals(rng: np.random.Generator) -> None:
+    points, truth = torus(1500, rng)
+    mixed = PointCloud(points, truth * np.where(points[:, :1] > 0.9, -1.0, 1.0))
+    inward = PointCloud(points, -truth)
+    told = {
+        (name, mode): prepare(cloud, orient=mode)
+        for name, cloud in (("mixed", mixed), ("inward", inward))
+        for mode in ("auto", "given", "signs", "estimate")
+    }
+    right = {key: (np.einsum("ij,ij->i", samples.normals, truth) > 0).mean() for key, (samples, _) in told.items()}
+    how = {key: counts.normals for key, (_, counts) in told.items()}
+    share = float((points[:, 0] > 0.9).mean())
+    assert right["mixed", "auto"] == right["mixed", "given"] == pytest.approx(1 - share)
+    assert right["inward", "given"] == 0
+    assert right["inward", "auto"] == 1
+    assert min(right[name, mode] for name in ("mixed", "inward") for mode in ("signs", "estimate")) > 0.995
+    assert (how["inward", "auto"], how["inward", "given"]) == ("given, flipped", "given")
+    assert (how["mixed", "signs"], how["mixed", "estimate"]) == ("given, sides estimated", "estimated")
+    samples, counts = told["mixed", "signs"]
+    assert counts.flipped == pytest.approx(share, abs=0.01)
+    assert np.abs(np.einsum("ij,ij->i", samples.normals, truth)).min() > 1 - 1e-12
+    assert "% turned around; " in counts.remarks()[-1]
+    assert "% of the points confirm their side." in counts.remarks()[-1]
+    assert [told["mixed", mode][0].estimated for mode in ("auto", "given", "signs", "estimate")] == [
+        False,
+        False,
+        True,
+        True,
+    ]
+    with pytest.raises(UsageError, match="auto, given, signs, estimate, not 'up'"):
+        prepare(mixed, orient="up")
+
+
+def test_the_bunnys_range_scans_are_oriented_by_their_origins(shared_data: Path) -> None:
+    cloud, _ = read_scans([shared_data / "real/bunny_scans/bun.conf"])
+    cloud = cloud.select(np.arange(0, len(cloud), 4))
+    points, first = np.unique(cloud.points, axis=0, return_index=True)
+    assert cloud.origins is not None
+    origins = cloud.origins[first]
+    assert len(np.unique(origins, axis=0)) == 6
+    found = oriented_normals(points, origins)
+    assert found.how == "estimated, oriented by origins"
+    sight = origins - points
+    facing = np.einsum("ij,ij->i", found.normals, sight) / np.linalg.norm(sight, axis=1)
+    # All but those that sight grazes look at their scanner, and these do not look away by more than that.
+    assert facing.min() > -np.sin(np.radians(10))
+    assert (facing > 0).mean() > 0.99
+    assert found.confidence is not None
+    assert found.confidence > 0.95
