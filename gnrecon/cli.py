@@ -23,7 +23,7 @@ from gnrecon.version import __version__
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
 _CommandLineError: Any = typer.BadParameter.__mro__[2]
 
-COMMANDS = ("reconstruct", "batch", "mesh", "eval", "convert", "check", "info", "doctor", "schema")
+COMMANDS = ("reconstruct", "batch", "mesh", "learn", "eval", "convert", "check", "info", "doctor", "schema")
 DEFAULT_COMMAND = "reconstruct"
 
 app = typer.Typer(
@@ -567,6 +567,59 @@ def mesh_command(
         "threads": threads,
     }
     raise SystemExit(mesh_again(model, output, options, shape, overwrite=overwrite, quiet=quiet))
+
+
+@app.command("learn")
+def learn_command(
+    context: typer.Context,
+    problem: Annotated[
+        str, typer.Argument(help="catenoid or enneper (minimal surfaces), or cone (a developable one).")
+    ],
+    output: Output,
+    optimiser: Annotated[
+        str, typer.Option(help="gn (Gauss-Newton), lbfgs or adam, which the paper compares with.", rich_help_panel=FIT)
+    ] = "gn",
+    budget: Annotated[
+        float | None,
+        typer.Option(help="Seconds for the whole of the learning; by default 600.", rich_help_panel=FIT),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            help="Most steps; without a budget, the same steps and seed give the same mesh.", rich_help_panel=FIT
+        ),
+    ] = None,
+    seed: Seed = 0,
+    threads: Threads = None,
+    resolution: Annotated[
+        int, typer.Option(help="Cells along the longest side of the box that is meshed.", rich_help_panel=MESH)
+    ] = 192,
+    curvature: Curvature = False,
+    report: Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=OUTPUT)] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Print each measurement.", rich_help_panel=OUTPUT)
+    ] = False,
+    debug: Debug = False,
+) -> None:
+    """Learn a surface from constraints alone: the paper's data-free problems, open surfaces clipped to a box."""
+    from gnrecon.commands.learn import LearnOptions, run_learn
+
+    del debug
+    options = LearnOptions(optimiser, budget, steps, seed, resolution, curvature, threads)
+    raise SystemExit(
+        run_learn(
+            problem,
+            output,
+            options,
+            report=report,
+            overwrite=overwrite,
+            quiet=quiet,
+            verbose=verbose,
+            command=context.obj,
+        )
+    )
 
 
 @app.command("eval")

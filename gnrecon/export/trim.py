@@ -100,7 +100,7 @@ def trim(mesh: Mesh, distances: Float, reach: float) -> tuple[Mesh, Trimming]:
         )
     if near.all():
         return mesh, Trimming(reach, 0.0, 0, filled)
-    result = _cut(mesh, near, smooth, reach)
+    result = cut_along(mesh, near, smooth, reach)
     return result, Trimming(reach, 1 - result.area / mesh.area, crumbs, filled)
 
 
@@ -123,7 +123,7 @@ def _without_small(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool)
     return np.where(small[labels], not of, near), int(small.sum())
 
 
-def _cut(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
+def cut_along(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
     """The part of a mesh around its near vertices, ending where the distance is the reach."""
     flags = near[mesh.faces]
     count = flags.sum(axis=1)
@@ -148,7 +148,7 @@ def _cut(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
         np.stack([ab, b, ac], axis=1)[other],
         np.stack([b, c, ac], axis=1)[other],
     ]
-    return _used(full, np.concatenate(pieces))
+    return used(full, np.concatenate(pieces))
 
 
 def _with_points_between(mesh: Mesh, low: Int, high: Int, share: Float) -> Mesh:
@@ -172,7 +172,7 @@ def _between(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt
     return np.concatenate([values, mixed.astype(values.dtype)])
 
 
-def _used(mesh: Mesh, faces: Int) -> Mesh:
+def used(mesh: Mesh, faces: Int) -> Mesh:
     """The given faces with the vertices that they use."""
     used, corners = np.unique(faces, return_inverse=True)
     normals = None if mesh.normals is None else mesh.normals[used]

@@ -1,0 +1,174 @@
+"""``gnrecon learn PROBLEM -o MESH``: a surface from constraints alone, and how well it keeps to them."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from gnrecon.atomic import atomic_write
+from gnrecon.errors import ExitCode, UsageError
+from gnrecon.export import MeshFacts, curvatures, require_bordered, require_sound, verify, verify_file
+from gnrecon.files import require_files
+from gnrecon.io import check_writable, write_mesh
+from gnrecon.mesh import Mesh
+from gnrecon.pipeline import limited
+from gnrecon.report import plain, versions
+from gnrecon.shapes import OPTIMISERS, PROBLEMS, Learned, Measurement, ShapeProblem, learn, mesh_of
+
+OPEN = "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
+CLOSED = "closed, oriented 2-manifold"
+
+
+@dataclass(frozen=True)
+class LearnOptions:
+    """What a run may be asked for; see `gnrecon learn --help`."""
+
+    optimiser: str = "gn"
+    budget: float | None = None
+    steps: int | None = None
+    seed: int = 0
+    resolution: int = 192
+    curvature: bool = False
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense, before any work."""
+        if self.optimiser not in OPTIMISERS:
+            raise UsageError(f"The optimiser is {self.optimiser!r}, but must be one of {', '.join(OPTIMISERS)}.")
+        if self.budget is not None and not self.budget > 0:
+            raise UsageError(f"The budget is {self.budget:g} s, but must be positive.")
+        if self.steps is not None and self.steps < 1:
+            raise UsageError(f"The number of steps is {self.steps}, but must be at least 1.")
+        if self.resolution < 16:
+            raise UsageError(f"The resolution is {self.resolution}, but must be at least 16 cells.")
+        if self.threads is not None and self.threads < 1:
+            raise UsageError(f"The number of threads is {self.threads}, but must be at least 1.")
+
+    @property
+    def seconds(self) -> float | None:
+        """The budget: 600 s where neither it nor steps were asked for."""
+        return 600.0 if self.budget is None and self.steps is None else self.budget
+
+
+def run_learn(
+    name: str,
+    output: Path,
+    options: LearnOptions,
+    *,
+    report: Path | None = None,
+    overwrite: bool = False,
+    quiet: bool = False,
+    verbose: bool = False,
+    command: str | None = None,
+) -> int:
+    """Learn a problem's surface, write its mesh once that is verified, and return the exit code.
+
+    Raises
+    ------
+    UsageError, FitError, MeshError, OutputError, MemoryLimitError
+        Each says in one sentence what is wrong; nothing is written then.
+    """
+    if name not in PROBLEMS:
+        raise UsageError(f"There is no problem {name!r}; the problems are {', '.join(PROBLEMS)}.")
+    check_writable(output)
+    require_files([], [path for path in (output, report) if path is not None], overwrite)
+    problem = PROBLEMS[name]()
+    console = Console(stderr=True, quiet=quiet)
+    with limited(options.threads):
+        learned = learn(
+            problem,
+            options.optimiser,
+            budget=options.seconds,
+            steps=options.steps,
+            seed=options.seed,
+            heard=(lambda found: _say(console, told(found))) if verbose else None,
+        )
+        mesh = _mesh(learned, problem, options)
+    facts = require_sound(mesh) if verify(mesh).closed else require_bordered(mesh)
+    losses = _write(output, report, mesh, _report(problem, options, learned, facts, command), overwrite)
+    for sentence in [*losses, learned.solution.status, told(learned.best), _summary(output, facts)]:
+        _say(console, sentence)
+    return ExitCode.INTERRUPTED if learned.solution.interrupted else ExitCode.OK
+
+
+def told(found: Measurement) -> str:
+    """Return a line about a measurement."""
+    shares = ", ".join(f"{name} {share:.1e}" for name, share in found.shares.items())
+    distance = "" if found.chamfer is None else f"; Chamfer {found.chamfer:.2e} from the known surface"
+    return f"Step {found.step}, {found.seconds:.0f} s: loss {found.loss:.2e} ({shares}){distance}."
+
+
+def _say(console: Console, sentence: str) -> None:
+    console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+
+def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> Mesh:
+    mesh = mesh_of(learned.field, problem.shown or problem.box, options.resolution)
+    if not options.curvature:
+        return mesh
+    mean, gauss = curvatures(learned.field.gradient(mesh.vertices), learned.field.hessian(mesh.vertices))
+    return mesh.with_attributes({"mean_curvature": mean, "gauss_curvature": gauss})
+
+
+def _write(output: Path, report: Path | None, mesh: Mesh, facts: dict[str, Any], overwrite: bool) -> list[str]:
+    """Write the mesh, and with it the report; both or neither."""
+    bordered = not facts["mesh"]["closed"]
+
+    def verified(path: Path) -> None:
+        verify_file(path, bordered)
+
+    with ExitStack() as stack:
+        if report is not None:
+            temporary = stack.enter_context(atomic_write(report, overwrite))
+            temporary.write_text(json.dumps(facts, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        return write_mesh(mesh, output, overwrite, verify=verified)
+
+
+def _report(
+    problem: ShapeProblem, options: LearnOptions, learned: Learned, facts: MeshFacts, command: str | None
+) -> dict[str, Any]:
+    """All that is known of a run, ready for JSON; losses and Chamfer divergences first."""
+    history = learned.history
+    guarantee = CLOSED if facts.closed else OPEN
+    values: dict[str, Any] = plain(
+        {
+            "problem": problem.name,
+            "command": command,
+            "loss": learned.best.loss,
+            "chamfer": learned.best.chamfer,
+            "loss_history": [found.loss for found in history],
+            "chamfer_history": [found.chamfer for found in history],
+            "seconds_history": [found.seconds for found in history],
+            "step_history": [found.step for found in history],
+            "best": learned.best.as_dict(),
+            "history": [found.as_dict() for found in history],
+            "optimiser": options.optimiser,
+            "method": learned.solution.method,
+            "status": learned.solution.status,
+            "interrupted": learned.solution.interrupted,
+            "budget": options.seconds,
+            "steps": len(learned.solution.history),
+            "seconds": learned.seconds,
+            "seed": options.seed,
+            "network": {
+                "widths": problem.network.widths,
+                "activation": problem.network.activation.name,
+                "parameters": problem.network.layout.count,
+            },
+            "mesh": {**facts.as_dict(), "guarantee": guarantee},
+            "versions": versions(),
+        }
+    )
+    if not facts.closed:
+        values["mesh"]["volume"] = None
+    return values
+
+
+def _summary(output: Path, facts: MeshFacts) -> str:
+    kind = "closed and manifold" if facts.closed else "open, edge-manifold and oriented"
+    return f"{output}: {facts.vertices} vertices, {facts.faces} faces, {kind}, area {facts.area:.6g}."

@@ -1,0 +1,42 @@
+"""Shape learning: surfaces from constraints alone, such as minimal and developable ones."""
+
+from collections.abc import Callable
+
+from gnrecon.shapes.developable import cone, developable_surface
+from gnrecon.shapes.learn import OPTIMISERS, Learned, learn
+from gnrecon.shapes.learned import LearnedField, mesh_of
+from gnrecon.shapes.measure import Measurement
+from gnrecon.shapes.minimal import catenoid, enneper, minimal_surface
+from gnrecon.shapes.problem import ShapeProblem, circle, cube, plane_through, z_cylinder, z_plane
+from gnrecon.shapes.term import Drawn, Moment, Term, at_points, fading, in_box, on_surface
+
+PROBLEMS: dict[str, Callable[[], ShapeProblem]] = {"catenoid": catenoid, "enneper": enneper, "cone": cone}
+"""Makes each of the paper's data-free problems by its name."""
+
+__all__ = [
+    "OPTIMISERS",
+    "PROBLEMS",
+    "Drawn",
+    "Learned",
+    "LearnedField",
+    "Measurement",
+    "Moment",
+    "ShapeProblem",
+    "Term",
+    "at_points",
+    "catenoid",
+    "circle",
+    "cone",
+    "cube",
+    "developable_surface",
+    "enneper",
+    "fading",
+    "in_box",
+    "learn",
+    "mesh_of",
+    "minimal_surface",
+    "on_surface",
+    "plane_through",
+    "z_cylinder",
+    "z_plane",
+]

@@ -1,0 +1,160 @@
+"""A problem's terms on the points of one step, as the least-squares problem that the optimisers solve.
+
+Row i of a term with weight w and N points is sqrt(w / N) r_i. The points of a surface move with it: where the field
+changes, each goes along the gradient to where the field is as it was at the point (zero), and a trial's loss is that of
+the surface which the trial makes, not of the places where the old one was. A point's own velocity is -df / |grad f|
+along the normal n, so that its residual changes by
+
+    dr - (d_n r) df / |grad f|,
+
+whose second part enters the rows as a coefficient of df (`levelset.transport`). The linear model then describes what a
+trial measures, and the ratio of both controls the steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gnrecon.field import CurvedJet, Network
+from gnrecon.field.siren import batches
+from gnrecon.levelset import derivative_along, transported
+from gnrecon.linalg import Block, LayeredJacobian
+from gnrecon.residuals import Linearised, Residual, SecondOrder
+
+CHUNK = 8192
+FOLLOWED, LONGEST = 2, 0.1
+"""Newton steps by which surface points follow a trial, and the longest one, in the coordinates' unit."""
+ASIDE = 1e-3
+"""Step of the differences that give the derivative of a residual along the normal."""
+
+
+@dataclass(frozen=True)
+class FrozenTerm:
+    """One constraint at the points of one step; `moves` where they belong to the surface and move with it."""
+
+    name: str
+    residual: Residual | SecondOrder
+    points: Tensor
+    target: Tensor | None
+    weight: float
+    moves: bool = False
+
+    @property
+    def scale(self) -> float:
+        """Factor of its residuals, sqrt(weight / N)."""
+        return math.sqrt(self.weight / max(len(self.points), 1))
+
+
+@dataclass(frozen=True)
+class FrozenProblem:
+    """Terms on a network, all of whose parameters are free.
+
+    Parameters
+    ----------
+    network : Network
+    terms : the constraints on their points
+    theta : parameters, of shape (p,), at which the points were drawn
+    """
+
+    network: Network
+    terms: Sequence[FrozenTerm]
+    theta: Tensor
+
+    def free(self) -> Tensor:
+        """Return the parameters, of shape (p,)."""
+        return self.theta
+
+    def whole(self, free: Tensor) -> Tensor:
+        """Return the parameters, of shape (p,)."""
+        return free
+
+    def residual(self, free: Tensor) -> Tensor:
+        """Return the weighted residuals, of shape (M,), with surface points that have followed the surface."""
+        return torch.cat([free.new_zeros(0), *(rows for term in self.terms for rows in self._residuals(free, term))])
+
+    def shares(self, free: Tensor) -> dict[str, float]:
+        """Return each term's share of the loss, by its name."""
+        losses: dict[str, float] = {}
+        for term in self.terms:
+            share = sum(0.5 * float(rows @ rows) for rows in self._residuals(free, term))
+            losses[term.name] = losses.get(term.name, 0.0) + share
+        return losses
+
+    def linearise(self, free: Tensor) -> tuple[LayeredJacobian, Tensor]:
+        """Return J, of shape (M, p), as outer products, and r, of shape (M,)."""
+        blocks: list[Block] = []
+        residuals = [free.new_zeros(0)]
+        for term in self.terms:
+            for points, target in self._pieces(free, term):
+                jet = self.network.curved_jet(free, points)
+                linear = self._linearised(free, term, jet, target, points)
+                residuals.append((linear.residual * term.scale).T.flatten())
+                blocks += _rows(jet, linear, term.scale)
+        residual = torch.cat(residuals)
+        sizes = tuple(out * (into + 1) for out, into in self.network.layout.shapes)
+        return LayeredJacobian(lambda: blocks, len(residual), sizes, free.device), residual
+
+    def _residuals(self, free: Tensor, term: FrozenTerm) -> Iterator[Tensor]:
+        for points, target in self._pieces(free, term):
+            yield (self._evaluated(free, term.residual, points, target).residual * term.scale).T.flatten()
+
+    def _linearised(
+        self, free: Tensor, term: FrozenTerm, jet: CurvedJet, target: Tensor | None, points: Tensor
+    ) -> Linearised:
+        linear = evaluate(term.residual, jet, target)
+        if not term.moves:
+            return linear
+        normals = torch.nn.functional.normalize(jet.gradient, dim=1)
+        beside = derivative_along(
+            lambda x: self._evaluated(free, term.residual, x, target).residual, points, normals, ASIDE
+        )
+        return transported(linear, jet.gradient, torch.zeros_like(jet.value), beside)
+
+    def _evaluated(
+        self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, target: Tensor | None
+    ) -> Linearised:
+        order = 2 if isinstance(residual, SecondOrder) else 1
+        layers = self.network.layout.layers(free)
+        return evaluate(residual, CurvedJet.of(layers, self.network.activation, points, order), target)
+
+    def _pieces(self, free: Tensor, term: FrozenTerm) -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Yield points, and targets, chunk by chunk; surface points where they have gone at `free`."""
+        for rows in batches(len(term.points), CHUNK):
+            points = term.points[rows]
+            if term.moves and free is not self.theta:
+                points = self._followed(free, points)
+            yield points, None if term.target is None else term.target[rows]
+
+    def _followed(self, free: Tensor, points: Tensor) -> Tensor:
+        """Move points, of shape (N, 3), to where the field at `free` has the values that it had at them."""
+        level = self.network.value(self.theta, points)
+        for _ in range(FOLLOWED):
+            value, gradient = self.network.value_and_gradient(free, points)
+            square = gradient.square().sum(1).clamp_min(1e-12)
+            step = ((level - value) / square)[:, None] * gradient
+            longest = torch.linalg.vector_norm(step, dim=1, keepdim=True).clamp_min(LONGEST)
+            points = points + step * (LONGEST / longest)
+        return points
+
+
+def evaluate(residual: Residual | SecondOrder, jet: CurvedJet, target: Tensor | None) -> Linearised:
+    """Return residuals at a jet's points."""
+    if isinstance(residual, SecondOrder):
+        return residual(jet.value, jet.gradient, jet.hessian, target)
+    return residual(jet.value, jet.gradient, target)
+
+
+def _rows(jet: CurvedJet, linear: Linearised, scale: float) -> Iterator[Block]:
+    """Yield one block for each of the m residuals of the points."""
+    for column in range(linear.residual.shape[1]):
+        yield jet.rows(
+            *(
+                None if part is None else part[:, column] * scale
+                for part in (linear.by_value, linear.by_gradient, linear.by_hessian)
+            )
+        )

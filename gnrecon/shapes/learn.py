@@ -1,0 +1,175 @@
+"""Learning a shape: the network becomes the start, and then whatever its problem's constraints ask of it.
+
+Each step draws its points afresh, as the paper does, and takes a step of the optimiser on them. Gauss-Newton is damped
+by the gain ratio in the identity metric (`optim.damping`), from a damping of one, so that the first steps do not tear
+the surface; the damping then falls with the loss, and the steps end as undamped ones. The paper's steps are a tenth of
+the undamped direction throughout.
+
+The surface is measured now and then, at fresh points. What is returned is the parameters of the least loss measured,
+among those whose weights had ended; with a few measurements a run this is nearly always the last one of Gauss-Newton,
+while runs of L-BFGS that lose their surface keep the best that they had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+from torch import Tensor
+
+from gnrecon.errors import FitError, UsageError
+from gnrecon.linalg import identity
+from gnrecon.optim import LBFGS, Adam, GainRatioDamping, GaussNewton, Optimiser, Problem, Solution, StopRule
+from gnrecon.shapes.learned import LearnedField
+from gnrecon.shapes.measure import Measurement, measure
+from gnrecon.shapes.pretrain import pretrained
+from gnrecon.shapes.problem import ShapeProblem
+from gnrecon.shapes.term import LAST
+
+OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
+    "gn": lambda rate: GaussNewton(GainRatioDamping(initial_damping=1.0, metric=identity)),  # noqa: ARG005
+    "lbfgs": lambda rate: LBFGS(),  # noqa: ARG005 (one signature for all)
+    "adam": Adam,
+}
+"""Makes each optimiser by its name, with the problem's learning rate for Adam."""
+
+MOST_STEPS = 10**6
+FIRST, GROWTH = 5.0, 1.5
+"""Seconds or steps to the first measurement, and the factor from one to the next."""
+
+Heard = Callable[[Measurement], None]
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A learned shape.
+
+    Parameters
+    ----------
+    field : the field, whose zero level is the surface
+    best : its measurement
+    history : all measurements, in order
+    solution : what the optimiser returned
+    seconds : of the whole run
+    """
+
+    field: LearnedField
+    best: Measurement
+    history: tuple[Measurement, ...]
+    solution: Solution
+    seconds: float
+
+
+@dataclass
+class _Run:
+    """A run as it goes on: when the next measurement is due, and the best parameters so far."""
+
+    problem: ShapeProblem
+    rng: np.random.Generator
+    seed: int
+    by_steps: bool
+    heard: Heard | None
+    started: float = field(default_factory=perf_counter)
+    due: float = FIRST
+    settled: int = 0
+    history: list[Measurement] = field(default_factory=list)
+    best: tuple[Measurement, Tensor] | None = None
+
+    def problem_at(self, number: int, theta: Tensor) -> Problem:
+        """Measure what the last step led to, if that is due, and freeze the next problem."""
+        passed = number - 1 if self.by_steps else perf_counter() - self.started
+        if passed >= self.due:
+            self.due = max(self.due * GROWTH, passed + (1 if self.by_steps else 0.0))
+            self.note(number - 1, theta)
+        return self.problem.freeze(number, theta, self.rng)
+
+    def note(self, step: int, theta: Tensor) -> None:
+        """Measure, and keep the parameters where their loss is the least since the weights have ended."""
+        found = measure(self.problem, theta, step, perf_counter() - self.started, self.seed)
+        self.history.append(found)
+        ended = all(term.weight_at(step + 1) == term.weight_at(LAST) for term in self.problem.terms)
+        # Before the weights have ended, each later surface counts as better than those before it.
+        fresh = self.settled == 0
+        self.settled += ended
+        if self.best is None or (fresh and np.isfinite(found.loss)) or found.loss < self.best[0].loss:
+            self.best = (found, theta.clone())
+        if self.heard is not None:
+            self.heard(found)
+
+
+def learn(
+    problem: ShapeProblem,
+    optimiser: str = "gn",
+    *,
+    budget: float | None = 600.0,
+    steps: int | None = None,
+    seed: int = 0,
+    learning_rate: float = 1e-3,
+    heard: Heard | None = None,
+) -> Learned:
+    """Learn a shape.
+
+    An interrupt (Ctrl-C) keeps the best until then; `Learned.solution.interrupted` then says so.
+
+    Parameters
+    ----------
+    problem : ShapeProblem
+    optimiser : gn, lbfgs or adam
+    budget : seconds after which no further step begins, the start and all measuring included; None for no limit
+    steps : most steps; the same problem, steps and seed give the same parameters on a machine, which a budget cannot
+    seed : of the network's start and of all points
+    learning_rate : of Adam
+    heard : told of each measurement
+
+    Raises
+    ------
+    UsageError
+        When the optimiser is unknown, or neither a budget nor steps end the run.
+    FitError
+        When the start cannot be fitted, or the surface has vanished before it was ever measured.
+    """
+    if optimiser not in OPTIMISERS:
+        raise UsageError(f"The optimiser is {optimiser!r}, but must be one of {', '.join(OPTIMISERS)}.")
+    if (
+        (budget is None and steps is None)
+        or (budget is not None and not budget > 0)
+        or (steps is not None and steps < 1)
+    ):
+        raise UsageError("A positive budget of seconds or number of steps must say when the run ends.")
+    rng = np.random.default_rng(seed)
+    run = _Run(problem, rng, seed, budget is None, heard)
+    theta = pretrained(problem, seed, rng)
+    run.note(0, theta)
+    return _finished(run, theta, _solved(run, theta, OPTIMISERS[optimiser](learning_rate), budget, steps))
+
+
+def _solved(run: _Run, theta: Tensor, method: Optimiser, budget: float | None, steps: int | None) -> Solution:
+    """Run the optimiser, and take the loss of the surface for the end of the run."""
+    most = MOST_STEPS if steps is None else steps
+    left = None if budget is None else budget - (perf_counter() - run.started)
+    # The losses of different samples do not compare, so that only steps, time or the user end the run.
+    stop = StopRule(most, tolerance=0.0, patience=most + 1, seconds=left)
+    try:
+        return method.run(run.problem_at, theta, stop)
+    except FitError as error:
+        if run.best is None:
+            raise
+        return Solution(run.best[1], str(error), ())
+
+
+def _finished(run: _Run, start: Tensor, solution: Solution) -> Learned:
+    last = solution.theta
+    if solution.history and last is not start and bool(last.isfinite().all()):
+        run.note(len(solution.history), last)
+    assert run.best is not None, "the start has been measured"
+    best, theta = run.best
+    problem = run.problem
+    return Learned(
+        LearnedField(problem.network, theta, problem.box),
+        best,
+        tuple(run.history),
+        solution,
+        perf_counter() - run.started,
+    )

@@ -1,0 +1,101 @@
+"""A shape-learning problem: constraints on a network's zero level, where they hold, and what it begins as."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.cloud import Float
+from gnrecon.field import TANH, Network
+from gnrecon.levelset import LevelSet, ParametricSurface
+from gnrecon.sampling import Box
+from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
+from gnrecon.shapes.term import Drawn, Moment, Term
+
+PAPERS = Network((32, 32), TANH)
+"""The network of the paper's minimal and developable surfaces."""
+
+Start = Callable[[Tensor], Tensor]
+"""From points, of shape (N, 3), to values, of shape (N,): about a distance to a surface much like the wanted one."""
+
+
+@dataclass(frozen=True)
+class ShapeProblem:
+    """What is asked of a surface.
+
+    Parameters
+    ----------
+    name : str
+    terms : the constraints
+    box : where the surface lives; samplers of the volume and of the surface keep to it
+    start : what the network is fitted to before the constraints are
+    network : Network
+    known : the solution, where it is known, to measure against
+    shown : the part of the box that is meshed, by default all of it
+    """
+
+    name: str
+    terms: tuple[Term, ...]
+    box: Box
+    start: Start
+    network: Network = PAPERS
+    known: ParametricSurface | None = None
+    shown: Box | None = None
+
+    def level_set(self, theta: Tensor) -> LevelSet:
+        """Return the zero level of the network with parameters theta, of shape (p,)."""
+        return LevelSet(
+            lambda x: self.network.value(theta, x), lambda x: self.network.value_and_gradient(theta, x), self.box
+        )
+
+    def freeze(self, step: int, theta: Tensor, rng: np.random.Generator) -> FrozenProblem:
+        """Draw the points of a step; terms that weigh nothing at it are left out.
+
+        Raises
+        ------
+        FitError
+            When a term needs points of the surface and there is none.
+        """
+        moment = Moment(step, self.level_set(theta), rng)
+        weighed = [(term, term.weight_at(step)) for term in self.terms]
+        return self._frozen(theta, [(term, term.sampler(moment), weight) for term, weight in weighed if weight > 0.0])
+
+    def _frozen(self, theta: Tensor, drawn: list[tuple[Term, Drawn, float]]) -> FrozenProblem:
+        terms = [
+            FrozenTerm(term.name, term.residual, points.points, points.target, weight, points.on_surface)
+            for term, points, weight in drawn
+        ]
+        return FrozenProblem(self.network, terms, theta)
+
+
+def cube(half: float) -> Box:
+    """Return the box from -half to half along each axis."""
+    return Box(np.full(3, -half), np.full(3, half))
+
+
+def z_plane(x: Tensor) -> Tensor:
+    """Return the distance to the plane z = 0 of points of shape (N, 3), of shape (N,): a start for single sheets."""
+    return x[:, 2]
+
+
+def z_cylinder(radius: float = 1.0) -> Start:
+    """Return (x^2 + y^2 - radius^2) / (2 radius), which is about the distance to a cylinder: a start for tubes."""
+    return lambda x: (x[:, :2].square().sum(1) - radius**2) / (2 * radius)
+
+
+def circle(radius: float, height: float, count: int = 1000) -> Float:
+    """Return points of the circle around the z axis at a height, of shape (count, 3)."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)], axis=1)
+
+
+def plane_through(points: Float) -> Start:
+    """Return the signed distance to the plane that fits points of shape (N, 3) best: a start for a sheet in a curve."""
+    center = points.mean(axis=0)
+    normal = torch.as_tensor(np.linalg.svd(points - center)[2][2])
+    middle = torch.as_tensor(center)
+    return lambda x: (x - middle) @ normal

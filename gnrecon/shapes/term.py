@@ -1,0 +1,126 @@
+"""The terms of a shape-learning problem: a residual, where its points come from at each step, and its weight.
+
+A sampler is called afresh at each step with what the field is then, because the points of a moving surface, or those
+that join components, change with it. A weight may change from step to step; the one that it ends with is that of the
+loss that a run reports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gnrecon.errors import FitError
+from gnrecon.levelset import LevelSet, sample_surface
+from gnrecon.residuals import Residual, SecondOrder
+from gnrecon.sampling import Box
+
+LAST = 10**9
+"""The number of a step that is never reached: weights have ended there."""
+
+NODES = 30_000
+"""Evaluations that the search for a surface costs at each step; see `gnrecon.levelset.sample_surface`."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a sampler is asked: the step's number, from 1, the field's zero level then, and what draws."""
+
+    step: int
+    level_set: LevelSet
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Points of shape (N, 3) with targets of shape (N,) or (N, 3), or None; whether they belong to the surface."""
+
+    points: Tensor
+    target: Tensor | None = None
+    on_surface: bool = False
+
+
+Sampler = Callable[[Moment], Drawn]
+Weight = Callable[[int], float]
+"""Gives a term's weight at a step of a number, from 1."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """One constraint.
+
+    Its share of the loss is  weight / (2 N) sum_i |r_i|^2  over the N points that are drawn.
+
+    Parameters
+    ----------
+    name : str
+    residual : of `gnrecon.residuals`, of first or second order
+    sampler : gives its points at each step
+    weight : a number, or one for each step
+    """
+
+    name: str
+    residual: Residual | SecondOrder
+    sampler: Sampler
+    weight: float | Weight = 1.0
+
+    def weight_at(self, step: int) -> float:
+        """Return the weight at a step."""
+        return self.weight(step) if callable(self.weight) else self.weight
+
+
+def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count: int | None = None) -> Sampler:
+    """Return a sampler of known points, of shape (N, 3), with targets or without; `count` of them at each step.
+
+    Without a count, all are used each time.
+    """
+    known = torch.as_tensor(np.asarray(points, dtype=np.float64))
+    values = None if targets is None else torch.as_tensor(np.asarray(targets, dtype=np.float64))
+
+    def draw(moment: Moment) -> Drawn:
+        if count is None or count >= len(known):
+            return Drawn(known, values)
+        rows = torch.as_tensor(np.sort(moment.rng.permutation(len(known))[:count]))
+        return Drawn(known[rows], None if values is None else values[rows])
+
+    return draw
+
+
+def in_box(count: int, box: Box | None = None) -> Sampler:
+    """Return a sampler of uniform points in a box, by default the problem's."""
+
+    def draw(moment: Moment) -> Drawn:
+        return Drawn(torch.as_tensor((box or moment.level_set.box).sample(count, moment.rng)))
+
+    return draw
+
+
+def on_surface(count: int, nodes: int = NODES) -> Sampler:
+    """Return a sampler of about `count` points of the zero level in the problem's box, uniform by area.
+
+    It raises `FitError` where there is none.
+    """
+
+    def draw(moment: Moment) -> Drawn:
+        sample = sample_surface(moment.level_set, count, moment.rng, nodes, sweeps=0)
+        if not len(sample):
+            raise FitError(f"At step {moment.step} the field has no zero level in the problem's box any more.")
+        return Drawn(sample.points, on_surface=True)
+
+    return draw
+
+
+def fading(weight: float, hold: int, factor: float, least: float = 1e-5) -> Weight:
+    """Return a weight that holds for some steps, then shrinks by a factor a step, and is zero below `least`."""
+
+    def at(step: int) -> float:
+        # Capped, because a large power of the factor underflows anyhow.
+        faded = weight * factor ** min(max(0, step - hold), 10_000)
+        return faded if faded >= least else 0.0
+
+    return at
