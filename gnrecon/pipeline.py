@@ -35,7 +35,7 @@ from gnrecon.export import (
     vertex_error,
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
-from gnrecon.ingest import IngestCounts, prepare
+from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units, layers_of, prepare, survey
 from gnrecon.io import Reading, as_cloud, cropped, read_reference, read_scans, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
@@ -202,8 +202,10 @@ def _run(
     wanted(cloud, options.attributes)  # a misspelt name is refused before the work
     with stages("ingest"):
         samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
+        scan, layers = survey(cloud), layers_of(samples, counts.normals)
     options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
-    for sentence in [*reading.remarks(), *counts.remarks()]:
+    warnings = [] if layers is None else [layers.describe()]
+    for sentence in [*reading.remarks(), *counts.remarks(), *warnings]:
         progress.remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
@@ -243,6 +245,7 @@ def _run(
                 mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
     surface = _surface(mesh, facts, unsupported, trimming) | {
         "reading": reading.as_dict(),
+        "scan": described(scan, layers, reading),
         "fineness": meshed.fineness.as_dict(),
     }
     report = _report(
@@ -279,6 +282,15 @@ def read_source(source: Any, normals: Any, format: str | None, most: int, region
     if files := _files(source):
         return read_scans(files, format, most, region)
     return cropped(as_cloud(source, normals), region)
+
+
+def described(scan: Survey | None, layers: Layers | None, reading: Reading) -> dict[str, Any] | None:
+    """Return what is known of a scan as plain values; None where it has too few points."""
+    if scan is None:
+        return None
+    units = guess_units(scan.lower, scan.upper, reading.files)
+    found = scan.as_dict() | {"layers": None if layers is None else layers.as_dict()}
+    return found | {"units_guess": units.unit, "units_reason": units.reason}
 
 
 def _files(source: Any) -> list[str | Path]:

@@ -27,7 +27,7 @@ ROWS = [
     {"levelset"},
     {"fit", "ingest", "io", "export"},
     {"options", "report", "schema", "shapes", "design"},
-    {"meshing", "adorn", "page"},
+    {"meshing", "adorn", "page", "estimate"},
     {"shaping"},
     {"pipeline"},
     {"run"},

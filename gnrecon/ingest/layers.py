@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.cloud import Samples
 from gnrecon.ingest.spacing import neighbour_spacing
 
 Float = npt.NDArray[np.float64]
@@ -32,8 +33,8 @@ _SEPARATION = 5.0
 _BALANCE = 0.2  # least share of a layer
 _APART = 0.5  # of the layers' middles in the plane, in units of their spread
 _BETWEEN = 0.1  # share of points that face the other way
-_SHARE = 0.05
-"""Of the tested points, from which on layers are more than chance."""
+_SHARE, _SHARE_UNSURE = 0.05, 0.15
+"""Of the tested points, from which on layers are more than chance; the second where normals had to be estimated."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,28 @@ class Layers:
         )
 
 
-def find_layers(points: Float, normals: Float) -> Layers | None:
+def layers_of(samples: Samples, normals: str) -> Layers | None:
+    """Return how far apart layers of samples lie, in file units, or None where there are none.
+
+    Parameters
+    ----------
+    samples : Samples
+    normals : how theirs came about, as of `IngestCounts`; estimated ones may be wrong on the sides of thin walls
+    """
+    sure = normals in ("given", "given, flipped") or normals.endswith("origins")
+    least = _SHARE if sure else _SHARE_UNSURE
+    found = find_layers(samples.points, samples.normals, least)
+    return None if found is None else Layers(found.share, found.offset * samples.frame.scale)
+
+
+def find_layers(points: Float, normals: Float, least: float = _SHARE) -> Layers | None:
     """Return how far apart layers lie, or None where there are none.
 
     Parameters
     ----------
     points : array of shape (N, 3), centred, distinct
     normals : array of shape (N, 3), of unit length, oriented
+    least : share of the points, from which on there are layers
     """
     from scipy.spatial import cKDTree
 
@@ -82,7 +98,7 @@ def find_layers(points: Float, normals: Float) -> Layers | None:
         facing = normals[near] @ normals[row]
         offsets.append(_offset(local, facing))
     found = np.array([offset for offset in offsets if offset is not None])
-    if len(found) < _SHARE * len(chosen):
+    if len(found) < least * len(chosen):
         return None
     return Layers(len(found) / len(chosen), float(np.median(found)) * spacing)
 

@@ -22,7 +22,9 @@ _SIZES = (10, 15)
 """Points of the smallest neighbourhoods."""
 
 LEAST_POINTS = 16
-_QUERIES = 4000
+_QUERIES, _LEAST_QUERIES = 4000, 500
+"""Neighbourhoods that are looked at: the wider, the fewer, because each tells more."""
+
 _WIDE = 6.0  # least reach, in units of the noise
 _DOUBLINGS = 6
 _SHARE = 32
@@ -58,7 +60,8 @@ def estimate_noise(points: Float, spacing: float) -> Noise:
     tree = cKDTree(points)
     chosen = points[np.random.default_rng(0).permutation(len(points))[:_QUERIES]]
     for doubling in range(_DOUBLINGS + 1):
-        small, large = _spread(tree, chosen, _SIZES[0] << doubling), _spread(tree, chosen, _SIZES[1] << doubling)
+        some = chosen[: max(_LEAST_QUERIES, _QUERIES >> doubling)]
+        small, large = _spread(tree, some, _SIZES[0] << doubling), _spread(tree, some, _SIZES[1] << doubling)
         reached = small[1] >= _WIDE * small[0]
         if reached or (_SIZES[1] << doubling + 1) * _SHARE > len(points):
             break

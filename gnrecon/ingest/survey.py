@@ -1,7 +1,7 @@
 """What is in a cloud, and what would trouble a fit: extent, spacing, noise, normals, outliers and open borders.
 
-Noise is the spread of neighbours about a quadric that is fitted to them, so that curvature is not taken for it. A point
-lies at an open border where its neighbours, seen along the normal of their plane, leave a wide gap.
+A point lies at an open border where its neighbours, seen along the normal of their plane, leave a wide gap, and more
+of its neighbours leave it too: by chance, or where a sheet is thin or bends sharply, one of both numbers may.
 """
 
 from __future__ import annotations
@@ -12,16 +12,19 @@ from typing import Any
 import numpy as np
 
 from gnrecon.cloud import Float, PointCloud
+from gnrecon.ingest.clusters import isolated_clusters
+from gnrecon.ingest.noise import estimate_noise, local_frames
 from gnrecon.ingest.normals import flip_if_inward
 from gnrecon.ingest.outliers import find_outliers
+from gnrecon.ingest.repeats import repeated_points
 
 _MOST = 10_000
 """Points that neighbourhoods are measured at; more would change no figure."""
 
-_NEIGHBOURS = 24
+_NEIGHBOURS, _MORE_NEIGHBOURS = 24, 40
+_DENSITY = 8  # neighbours that tell how densely points lie
 _GAP = np.radians(120)
-_QUADRIC = 6
-_OPEN_SHARE = 0.01
+_OPEN_SHARE = 0.005
 _UNIT = 0.05
 _DISAGREEING = 0.02
 
@@ -32,26 +35,35 @@ class Survey:
 
     Parameters
     ----------
-    points, non_finite, duplicates, outliers : numbers of points; outliers among the others, of `_MOST` at most
+    points, non_finite, duplicates, repeated, clusters : numbers of points: all, those that are not finite, those at
+        another's position, copies of others in a scan that is there twice, and those in isolated clusters
+    outliers : among `_MOST` of the others
     lower, upper : corners of the box
     spacing, spacing_p5, spacing_p95 : median distance to the nearest point, and what 5 % and 95 % stay below
-    noise : standard deviation along the normal
+    density_variation : how many times as many points an area has where they lie densely (the 95th percentile) as where
+        they lie thinly (the 5th)
+    noise : standard deviation along the normal; 0 where there is none, None where it cannot be told
+    noise_limit : what it is at most, because some of the spread may be the surface's own
     normals : ``"missing"``, ``"zero"``, ``"unnormalised"``, ``"inconsistent"``, ``"inward"`` or ``"good"``
     border_share : share of the points at an open border
-    open : whether these are more than chance makes
+    open : whether these are more than chance makes; not told where points are so few that noise is not either
     origins : different positions of the scanner; 0 where they are not known
     """
 
     points: int
     non_finite: int
     duplicates: int
+    repeated: int
     outliers: int
+    clusters: int
     lower: list[float]
     upper: list[float]
     spacing: float
     spacing_p5: float
     spacing_p95: float
-    noise: float
+    density_variation: float
+    noise: float | None
+    noise_limit: float
     normals: str
     border_share: float
     open: bool
@@ -69,61 +81,54 @@ def survey(cloud: PointCloud) -> Survey | None:
     if len(points) <= _NEIGHBOURS:
         return None
     rows = np.flatnonzero(finite)[first]
+    distinct, repeated = len(points), repeated_points(points - points.mean(axis=0))
+    points, rows = points[~repeated], rows[~repeated]
     chosen = np.random.default_rng(0).permutation(len(rows))[:_MOST]
     centred = points - points.mean(axis=0)
-    nearest, noise = _fine(centred, chosen)
-    thinned = centred[chosen]
+    nearest, area = _spacings(centred, chosen)
+    thinned, spacing = centred[chosen], float(np.median(nearest))
+    noise = estimate_noise(centred, spacing)
     border = _border_share(thinned)
-    origins = 0 if cloud.origins is None else len(np.unique(cloud.origins, axis=0))
     return Survey(
-        len(cloud),
-        int((~finite).sum()),
-        int(finite.sum()) - len(points),
-        int(find_outliers(thinned).sum()),
-        points.min(axis=0).tolist(),
-        points.max(axis=0).tolist(),
-        float(np.median(nearest)),
-        float(np.percentile(nearest, 5)),
-        float(np.percentile(nearest, 95)),
-        noise,
-        "missing" if cloud.normals is None else _state(thinned, cloud.normals[rows[chosen]]),
-        border,
-        border > _OPEN_SHARE,
-        origins,
+        points=len(cloud),
+        non_finite=int((~finite).sum()),
+        duplicates=int(finite.sum()) - distinct,
+        repeated=int(repeated.sum()),
+        outliers=int(find_outliers(thinned).sum()),
+        clusters=int(isolated_clusters(centred).sum()),
+        lower=points.min(axis=0).tolist(),
+        upper=points.max(axis=0).tolist(),
+        spacing=spacing,
+        spacing_p5=float(np.percentile(nearest, 5)),
+        spacing_p95=float(np.percentile(nearest, 95)),
+        density_variation=float(np.percentile(area, 95) / np.percentile(area, 5)),
+        noise=noise.deviation,
+        noise_limit=noise.limit,
+        normals="missing" if cloud.normals is None else _state(thinned, cloud.normals[rows[chosen]]),
+        border_share=border,
+        open=border > _OPEN_SHARE and noise.deviation is not None,
+        origins=0 if cloud.origins is None else len(np.unique(cloud.origins, axis=0)),
     )
 
 
-def _fine(points: Float, chosen: np.ndarray[Any, np.dtype[np.intp]]) -> tuple[Float, float]:
-    """Distances to the nearest point, at the chosen ones, and the noise."""
+def _spacings(points: Float, chosen: np.ndarray[Any, np.dtype[np.intp]]) -> tuple[Float, Float]:
+    """Distances to the nearest point, and the areas that hold as many points each, at the chosen ones."""
     from scipy.spatial import cKDTree
 
-    distances, rows = cKDTree(points).query(points[chosen], _NEIGHBOURS + 1)
-    u, v, w = np.moveaxis(_local(points[rows]), 2, 0)
-    columns = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
-    rest = w - np.einsum("gkc,gc->gk", columns, np.einsum("gck,gk->gc", np.linalg.pinv(columns), w))
-    variance = (rest**2).sum(axis=1) / (rest.shape[1] - _QUADRIC)
-    scale = distances[:, -1]
-    return distances[:, 1], float(np.sqrt(np.median(variance * scale**2)))
-
-
-def _local(groups: Float) -> Float:
-    """Neighbourhoods, of shape (G, k, 3), in units of their reach: two axes in their plane, one along its normal."""
-    centred = groups - groups[:, :1]
-    centred = centred / np.linalg.norm(centred, axis=2).max(axis=1)[:, None, None]
-    spread = centred - centred.mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("gki,gkj->gij", spread, spread))[1][:, :, ::-1]
-    local: Float = np.einsum("gki,gij->gkj", centred, axes)
-    return local
+    distances = cKDTree(points).query(points[chosen], _DENSITY + 1)[0]
+    return distances[:, 1], distances[:, -1] ** 2
 
 
 def _border_share(points: Float) -> float:
     from scipy.spatial import cKDTree
 
-    rows = cKDTree(points).query(points, min(_NEIGHBOURS + 1, len(points)))[1]
-    local = _local(points[rows])[:, 1:]
-    angles = np.sort(np.arctan2(local[:, :, 1], local[:, :, 0]), axis=1)
-    gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi)
-    return float((gaps.max(axis=1) > _GAP).mean())
+    rows = cKDTree(points).query(points, min(_MORE_NEIGHBOURS + 1, len(points)))[1]
+    at_border = np.ones(len(points), bool)
+    for count in (_NEIGHBOURS, _MORE_NEIGHBOURS):
+        local = local_frames(points[rows[:, : count + 1]])[:, 1:]
+        angles = np.sort(np.arctan2(local[:, :, 1], local[:, :, 0]), axis=1)
+        at_border &= np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi).max(axis=1) > _GAP
+    return float(at_border.mean())
 
 
 def _state(points: Float, normals: Float) -> str:

@@ -13,6 +13,7 @@ from gnrecon.io.chunks import SETTLED, chunks
 from gnrecon.io.contents import Contents
 from gnrecon.io.gather import Gatherer
 from gnrecon.io.read import check_file, extension_for, reading
+from gnrecon.io.same_scan import Moments, same_scans
 from gnrecon.io.unpack import plain_file
 from gnrecon.mesh import Mesh
 from gnrecon.region import Region
@@ -34,6 +35,7 @@ class Reading:
     non_finite : dropped while reading a scan that is too large to be kept, because a coordinate was not finite
     side : of the cubes of which the first point each was kept, in file units; None where every point was
     unread : what else the files hold, in words
+    same : pairs of files that hold the same scan, in the same place or not
     """
 
     files: tuple[str, ...]
@@ -43,6 +45,7 @@ class Reading:
     non_finite: int = 0
     side: float | None = None
     unread: tuple[str, ...] = ()
+    same: tuple[tuple[str, str], ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields by name, for reports."""
@@ -51,6 +54,8 @@ class Reading:
     def remarks(self) -> list[str]:
         """Return a sentence for what was not taken as it came."""
         sentences = [f"Not read: {', '.join(self.unread)}."] if self.unread else []
+        for first, second in self.same:
+            sentences.append(f"{second} seems to be the same scan as {first}, which adds nothing or, if moved, layers.")
         if self.cropped:
             sentences.append(f"Dropped {self.cropped:,} of {self.points:,} points outside of the wanted region.")
         if self.side is not None:
@@ -86,7 +91,8 @@ def read_scans(
         As `read_cloud` does, and when no point lies in the region.
     """
     gatherer = Gatherer(most, region)
-    extensions = [_gather(Path(path), format, gatherer) for path in paths]
+    moments = [Moments() for _ in paths]
+    extensions = [_gather(Path(path), format, gatherer, sums) for path, sums in zip(paths, moments, strict=True)]
     found = gatherer.gathered()
     for settle in {SETTLED[extension] for extension in extensions if extension in SETTLED}:
         found = settle(found)
@@ -94,7 +100,7 @@ def read_scans(
     require_points(cloud, gatherer.seen)
     files = tuple(str(path) for path in paths)
     counts = (gatherer.seen, len(cloud), gatherer.cropped, gatherer.non_finite)
-    return cloud, Reading(files, *counts, gatherer.side, found.unread)
+    return cloud, Reading(files, *counts, gatherer.side, found.unread, same_scans(files, moments))
 
 
 def cropped(cloud: PointCloud, region: Region) -> tuple[PointCloud, Reading]:
@@ -124,12 +130,13 @@ def require_points(cloud: PointCloud, before: int) -> None:
         )
 
 
-def _gather(path: Path, format: str | None, gatherer: Gatherer) -> str:
+def _gather(path: Path, format: str | None, gatherer: Gatherer, moments: Moments) -> str:
     """Add what a file holds, and return the extension by which it was read."""
     extension, before = extension_for(path, format), gatherer.seen
     with reading(path), plain_file(path, extension) as file:
         check_file(file, extension)
         for chunk in chunks(file, extension):
+            moments.add(chunk.points)
             gatherer.add(_with_normals(chunk))
         if gatherer.seen == before:
             raise InputError("the file holds no points.")

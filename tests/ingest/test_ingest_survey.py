@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from analytic_clouds import torus
 
 from gnrecon.cloud import PointCloud
 from gnrecon.ingest.survey import Survey, survey
@@ -15,15 +16,35 @@ def sphere(rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np
     return normals * (1 + noise * rng.normal(size=(6000, 1))), normals
 
 
+def box(count: int, rng: np.random.Generator) -> np.ndarray:
+    points, rows = rng.uniform(-1, 1, (count, 3)), np.arange(count)
+    points[rows, rng.integers(0, 3, count)] = rng.choice([-1.0, 1.0], count)
+    return points
+
+
 def facts(points: np.ndarray, normals: np.ndarray | None = None) -> Survey:
     found = survey(PointCloud(points, normals))
     assert found is not None
     return found
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.002, 0.01])
-def test_noise_is_told_apart_from_curvature(noise: float, rng: np.random.Generator) -> None:
-    assert facts(sphere(rng, noise)[0]).noise == pytest.approx(noise, rel=0.2, abs=2e-4)
+def test_noise_and_density_are_among_the_facts(rng: np.random.Generator) -> None:
+    found = facts(sphere(rng, 0.01)[0])
+    assert found.noise == pytest.approx(0.01, rel=0.1)
+    assert found.noise_limit >= found.noise
+    assert 1.5 < found.density_variation < 8
+    points = sphere(rng)[0]
+    uneven = np.vstack([points, 1.0001 * points[points[:, 2] > 0], 1.0002 * points[points[:, 2] > 0]])
+    assert facts(uneven + rng.normal(size=uneven.shape) * 0.01).density_variation > 1.5 * found.density_variation
+
+
+def test_a_scan_that_is_there_twice_is_measured_once(rng: np.random.Generator) -> None:
+    points, _ = sphere(rng, 0.005)
+    once, twice = facts(points), facts(np.vstack([points, points + 1e-9]))
+    assert twice.repeated == pytest.approx(6000, abs=20)
+    assert twice.spacing == pytest.approx(once.spacing, rel=0.01)
+    assert twice.noise == pytest.approx(once.noise, rel=0.05)
+    assert facts(np.vstack([points, 0.01 * points[:20] + [3, 0, 0]])).clusters == 20
 
 
 def test_the_state_of_normals(rng: np.random.Generator) -> None:
@@ -42,6 +63,9 @@ def test_borders_counts_and_extent(rng: np.random.Generator) -> None:
     half = facts(points[points[:, 2] > 0])
     assert half.open
     assert half.border_share < 0.1
+    for closed in (torus(1500, rng)[0], torus(8000, rng)[0], box(3000, rng)):
+        assert not facts(closed).open
+        assert facts(closed).border_share < 0.004
     mixed = np.vstack([points, points[:7], np.full((3, 3), np.nan), [[9.0, 9, 9]]])
     found = facts(mixed)
     assert (found.points, found.duplicates, found.non_finite, found.outliers) == (6011, 7, 3, 1)

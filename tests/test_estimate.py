@@ -1,0 +1,44 @@
+"""The estimate follows the runs that it was made from, and is silent about runs that were not measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gnrecon.estimate import Estimate, estimate
+from gnrecon.options import Options
+
+BOX = np.array([[0.0, 0, 0], [1.0, 1, 1]])
+
+
+def expected(points: int, **options: Any) -> Estimate:
+    found = estimate(points, points, BOX, Options(**options))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("points", "seconds"), [(2009, 24), (7189, 54), (10_044, 42), (85_127, 76)])
+def test_measured_runs_are_met_to_within_a_factor(points: int, seconds: float) -> None:
+    assert 1 / 1.5 < expected(points).seconds / seconds < 1.5
+
+
+def test_resolution_and_quality_count() -> None:
+    assert expected(8000, resolution=512).seconds > 2.5 * expected(8000).seconds
+    assert expected(8000, resolution=512).memory_mb == pytest.approx(1391, rel=0.02)
+    assert expected(8000, edge_length=1 / 300).seconds > expected(8000).seconds
+    draft, normal, high = (expected(8000, quality=name).seconds for name in ("draft", "normal", "high"))
+    assert draft < normal < high
+    assert expected(2_000_000).memory_mb > 2000
+
+
+@pytest.mark.parametrize("options", [{"widths": (2000,)}, {"steps": 0}, {"device": "cuda"}, {"max_error": 0.01}])
+def test_runs_that_were_not_measured_have_none(options: dict[str, Any]) -> None:
+    assert estimate(5000, 5000, BOX, Options(**options)) is None
+
+
+def test_the_sentence() -> None:
+    assert Estimate(43.2, 950).describe() == "It would take about 40 seconds on two idle cores, and 0.9 GB of memory."
+    assert "about 12 seconds" in Estimate(12.2, 950).describe()
+    assert "about 4 minutes" in Estimate(251, 950).describe()
