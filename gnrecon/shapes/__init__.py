@@ -8,7 +8,7 @@ from gnrecon.shapes.learned import LearnedField, mesh_of
 from gnrecon.shapes.measure import Measurement
 from gnrecon.shapes.minimal import catenoid, enneper, minimal_surface
 from gnrecon.shapes.problem import ShapeProblem, circle, cube, plane_through, z_cylinder, z_plane
-from gnrecon.shapes.term import Drawn, Moment, Term, at_points, fading, in_box, on_surface
+from gnrecon.shapes.term import Drawn, Moment, Term, at_points, fading, in_box, on_surface, rising
 
 PROBLEMS: dict[str, Callable[[], ShapeProblem]] = {"catenoid": catenoid, "enneper": enneper, "cone": cone}
 """Makes each of the paper's data-free problems by its name."""
@@ -37,6 +37,7 @@ __all__ = [
     "minimal_surface",
     "on_surface",
     "plane_through",
+    "rising",
     "z_cylinder",
     "z_plane",
 ]

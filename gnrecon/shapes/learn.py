@@ -5,9 +5,8 @@ by the gain ratio in the identity metric (`optim.damping`), from a damping of on
 the surface; the damping then falls with the loss, and the steps end as undamped ones. The paper's steps are a tenth of
 the undamped direction throughout.
 
-The surface is measured now and then, at fresh points. What is returned is the parameters of the least loss measured,
-among those whose weights had ended; with a few measurements a run this is nearly always the last one of Gauss-Newton,
-while runs of L-BFGS that lose their surface keep the best that they had.
+The surface is measured now and then, at fresh points, and the parameters of the least loss measured are returned. Of
+Gauss-Newton these are nearly always the last ones; runs of L-BFGS that lose their surface keep the best that they had.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from gnrecon.shapes.learned import LearnedField
 from gnrecon.shapes.measure import Measurement, measure
 from gnrecon.shapes.pretrain import pretrained
 from gnrecon.shapes.problem import ShapeProblem
-from gnrecon.shapes.term import LAST
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
     "gn": lambda rate: GaussNewton(GainRatioDamping(initial_damping=1.0, metric=identity)),  # noqa: ARG005
@@ -73,7 +71,6 @@ class _Run:
     heard: Heard | None
     started: float = field(default_factory=perf_counter)
     due: float = FIRST
-    settled: int = 0
     history: list[Measurement] = field(default_factory=list)
     best: tuple[Measurement, Tensor] | None = None
 
@@ -86,14 +83,10 @@ class _Run:
         return self.problem.freeze(number, theta, self.rng)
 
     def note(self, step: int, theta: Tensor) -> None:
-        """Measure, and keep the parameters where their loss is the least since the weights have ended."""
+        """Measure, and keep the parameters where their loss is the least so far."""
         found = measure(self.problem, theta, step, perf_counter() - self.started, self.seed)
         self.history.append(found)
-        ended = all(term.weight_at(step + 1) == term.weight_at(LAST) for term in self.problem.terms)
-        # Before the weights have ended, each later surface counts as better than those before it.
-        fresh = self.settled == 0
-        self.settled += ended
-        if self.best is None or (fresh and np.isfinite(found.loss)) or found.loss < self.best[0].loss:
+        if self.best is None or found.loss < self.best[0].loss:
             self.best = (found, theta.clone())
         if self.heard is not None:
             self.heard(found)

@@ -25,7 +25,7 @@ class Measurement:
     ----------
     step : its number; 0 is the start
     seconds : since the run began, measuring included
-    loss : at fresh points, with the weights that the terms end with; infinite where there is no surface
+    loss : at fresh points, with the terms' reported weights; infinite where there is no surface
     shares : of the loss, by the terms' names
     chamfer : root mean square distance from the known solution to the surface, by projection: the paper's figure
     chamfer_back : that from the surface to the solution

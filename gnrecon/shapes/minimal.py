@@ -7,6 +7,9 @@ mean curvature on the surface within the box, both of weight one.
 Neither says what the field's slope is, and a field that shrinks on a curve satisfies the first without moving its
 surface. So the eikonal term begins with a weight of one and fades over some thirty steps to nothing; the paper's
 begins with 1e-3 and ends after 500 steps.
+
+Once the surface has its shape, its distance from the known one is about the residual on the curves. So the interface's
+weight rises after forty steps, to fifty; the loss that is reported has the paper's weights.
 """
 
 from __future__ import annotations
@@ -20,13 +23,16 @@ from gnrecon.errors import UsageError
 from gnrecon.residuals import eikonal, interface, mean_curvature
 from gnrecon.sampling import Box
 from gnrecon.shapes.problem import ShapeProblem, Start, circle, cube, plane_through, z_cylinder, z_plane
-from gnrecon.shapes.term import Term, at_points, fading, in_box, on_surface
+from gnrecon.shapes.term import Term, Weight, at_points, fading, in_box, on_surface, rising
 
 ON_SURFACE, ON_CURVE, IN_BOX = 2000, 500, 300
 """Points of each term at each step."""
 
 HOLD, FACTOR = 10, 0.7
 """Steps for which the eikonal term keeps its weight, and its factor from step to step after them."""
+
+RISE = 40, 1.1, 50.0
+"""Steps for which the interface keeps the weight one, its factor from step to step after them, and its most."""
 
 MARGIN = 0.25
 """How far the box reaches beyond a curve, as a share of the curve's longest side."""
@@ -51,7 +57,11 @@ def minimal_surface(
     points = curve_points(curve)
     return ShapeProblem(
         name,
-        (interface_term(points), Term("mean curvature", mean_curvature, on_surface(ON_SURFACE)), eikonal_term()),
+        (
+            interface_term(points, rising(1.0, *RISE)),
+            Term("mean curvature", mean_curvature, on_surface(ON_SURFACE)),
+            eikonal_term(),
+        ),
         box or box_around(points),
         start or plane_through(points),
     )
@@ -78,9 +88,9 @@ def _known(problem: ShapeProblem, known: levelset.ParametricSurface, shown: Box)
     return ShapeProblem(problem.name, problem.terms, problem.box, problem.start, problem.network, known, shown)
 
 
-def interface_term(points: Float) -> Term:
-    """Return f = 0 on a curve."""
-    return Term("interface", interface, at_points(points, count=ON_CURVE))
+def interface_term(points: Float, weight: float | Weight = 1.0) -> Term:
+    """Return f = 0 on a curve, with weight one in the reported loss."""
+    return Term("interface", interface, at_points(points, count=ON_CURVE), weight, reported=1.0)
 
 
 def eikonal_term(hold: int = HOLD) -> Term:

@@ -1,12 +1,13 @@
 """The terms of a shape-learning problem: a residual, where its points come from at each step, and its weight.
 
 A sampler is called afresh at each step with what the field is then, because the points of a moving surface, or those
-that join components, change with it. A weight may change from step to step; the one that it ends with is that of the
-loss that a run reports.
+that join components, change with it. A weight may change from step to step. The loss that a run reports has weights
+of its own, by default those that the terms end with.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -62,15 +63,19 @@ class Term:
     residual : of `gnrecon.residuals`, of first or second order
     sampler : gives its points at each step
     weight : a number, or one for each step
+    reported : weight in the loss that a run reports, by default that which the weight ends with
     """
 
     name: str
     residual: Residual | SecondOrder
     sampler: Sampler
     weight: float | Weight = 1.0
+    reported: float | None = None
 
     def weight_at(self, step: int) -> float:
-        """Return the weight at a step."""
+        """Return the weight at a step, or that in the reported loss at `LAST`."""
+        if step == LAST and self.reported is not None:
+            return self.reported
         return self.weight(step) if callable(self.weight) else self.weight
 
 
@@ -113,6 +118,16 @@ def on_surface(count: int, nodes: int = NODES) -> Sampler:
         return Drawn(sample.points, on_surface=True)
 
     return draw
+
+
+def rising(weight: float, hold: int, factor: float, most: float) -> Weight:
+    """Return a weight that holds for some steps, then grows by a factor a step, up to the most."""
+    growth = int(math.log(most / weight) / math.log(factor)) + 1
+
+    def at(step: int) -> float:
+        return min(most, weight * factor ** min(max(0, step - hold), growth))
+
+    return at
 
 
 def fading(weight: float, hold: int, factor: float, least: float = 1e-5) -> Weight:

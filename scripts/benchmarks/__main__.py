@@ -23,6 +23,7 @@ BENCHMARKS = {
     "accuracy": Benchmark("benchmarks.accuracy.main", "gnrecon beside its peers on clean, noisy and sparse scans"),
     "uncertainty": Benchmark("benchmarks.uncertainty.main", "sigma beside the true error, on known shapes"),
     "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
+    "learn": Benchmark("benchmarks.learn.main", "shape learning by three optimisers, and one step's time"),
     "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
     "refine": Benchmark("benchmarks.refine.main", "remeshing and fewer faces, beside the libraries' own"),
     "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),

@@ -22,6 +22,7 @@ from gnrecon.shapes import (
     minimal_surface,
     on_surface,
     plane_through,
+    rising,
     z_cylinder,
 )
 from gnrecon.shapes.term import LAST
@@ -78,6 +79,13 @@ def test_weights_fade_to_nothing() -> None:
     term = Term("eikonal", interface, in_box(3), weight)
     assert term.weight_at(6) == 1.0
     assert Term("fixed", interface, in_box(3), 3.0).weight_at(LAST) == 3.0
+
+
+def test_weights_rise_to_the_most_and_are_reported_as_asked() -> None:
+    weight = rising(1.0, 10, 2.0, most=5.0)
+    assert [weight(step) for step in (1, 10, 11, 12, 13, 14, LAST)] == [1.0, 1.0, 2.0, 4.0, 5.0, 5.0, 5.0]
+    term = Term("interface", interface, in_box(3), weight, reported=1.0)
+    assert [term.weight_at(step) for step in (1, 12, LAST)] == [1.0, 4.0, 1.0]
 
 
 def test_starts() -> None:

@@ -1,0 +1,62 @@
+"""The benchmark of shape learning: nested differentiation takes the same step, and the figures are written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from benchmarks.__main__ import main as bench
+from benchmarks.learn import main as learn_bench
+from benchmarks.learn import step as step_bench
+from benchmarks.learn.nested import nested_step
+from benchmarks.learn.step import closed_step
+
+from gnrecon.errors import ExitCode
+from gnrecon.field import Network
+from gnrecon.residuals import eikonal, interface, mean_curvature
+from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
+
+
+def test_nested_differentiation_takes_the_same_step() -> None:
+    network = Network((6, 5))
+    generator = torch.Generator().manual_seed(0)
+    theta = network.initial(generator)
+    points = torch.randn(3, 40, 3, generator=generator, dtype=torch.float64)
+    terms = [
+        FrozenTerm("interface", interface, points[0], None, 2.0),
+        FrozenTerm("eikonal", eikonal, points[1], None, 0.5),
+        FrozenTerm("mean curvature", mean_curvature, points[2], None, 1.0),
+    ]
+    problem = FrozenProblem(network, terms, theta)
+    closed, nested = closed_step(problem, theta), nested_step(problem, theta, step_bench.DAMPING)
+    assert float((closed - nested).norm()) < 1e-6 * float(nested.norm())
+
+
+def test_the_figures_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = {
+        "rows": 3,
+        "parameters": 2,
+        "closed_seconds": 0.1,
+        "moving_seconds": 0.2,
+        "nested_seconds": 3.0,
+        "speedup": 30.0,
+        "difference": 1e-9,
+    }
+    monkeypatch.setattr(learn_bench, "step_figures", lambda seed: figures | {"seed": seed})
+    path = tmp_path / "figures.json"
+    words = ["--problems", "cone", "--optimisers", "gn", "--budget", "0.01", "--json", str(path)]
+    assert bench(["learn", *words]) == ExitCode.OK
+    written = json.loads(path.read_text())
+    assert written["step"]["speedup"] == 30.0
+    (one,) = written["figures"]
+    assert (one["problem"], one["optimiser"], one["seed"]) == ("cone", "gn", 0)
+    assert np.isfinite(one["loss"])
+    assert one["chamfer"] > 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "30 times as long" in printed
+    assert "cone" in printed
