@@ -77,7 +77,7 @@ class _Run:
     def problem_at(self, number: int, theta: Tensor) -> Problem:
         """Measure what the last step led to, if that is due, and freeze the next problem."""
         passed = number - 1 if self.by_steps else perf_counter() - self.started
-        if passed >= self.due:
+        if passed >= self.due and number > 1:
             self.due = max(self.due * GROWTH, passed + (1 if self.by_steps else 0.0))
             self.note(number - 1, theta)
         return self.problem.freeze(number, theta, self.rng)
