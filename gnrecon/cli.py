@@ -37,7 +37,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-POINTS, FIT, MESH, OUTPUT = "Points", "Fit", "Mesh", "Output"
+POINTS, FIT, MESH, OUTPUT, DESIGN = "Points", "Fit", "Mesh", "Output", "Design"
 
 Format = Annotated[
     str | None,
@@ -573,7 +573,8 @@ def mesh_command(
 def learn_command(
     context: typer.Context,
     problem: Annotated[
-        str, typer.Argument(help="catenoid or enneper (minimal surfaces), or cone (a developable one).")
+        str,
+        typer.Argument(help="catenoid or enneper (minimal surfaces), cone (a developable one), or bracket (a part)."),
     ],
     output: Output,
     optimiser: Annotated[
@@ -595,6 +596,30 @@ def learn_command(
         int, typer.Option(help="Cells along the longest side of the box that is meshed.", rich_help_panel=MESH)
     ] = 192,
     curvature: Curvature = False,
+    region: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of a bracket: closed mesh to stay within; by default sample_data's.", rich_help_panel=DESIGN
+        ),
+    ] = None,
+    interfaces: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of a bracket: open mesh to be attached to, its faces out of the part.", rich_help_panel=DESIGN
+        ),
+    ] = None,
+    interfaces_frame: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z,SCALE",
+            help="Origin and scale of the interfaces' own coordinates in the region's.",
+            rich_help_panel=DESIGN,
+        ),
+    ] = None,
+    clip: Annotated[
+        float | None,
+        typer.Option(help="Greatest strain k1^2 + k2^2 that counts, region's half-length 1.", rich_help_panel=DESIGN),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=OUTPUT)] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -603,8 +628,9 @@ def learn_command(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """Learn a surface from constraints alone: the paper's data-free problems, open surfaces clipped to a box."""
+    """Learn a surface from constraints alone: the paper's data-free problems, or a part from its design."""
     from gnrecon.commands.learn import LearnOptions, run_learn
+    from gnrecon.commands.part import DesignFiles
 
     del debug
     options = LearnOptions(optimiser, budget, steps, seed, resolution, curvature, threads)
@@ -613,6 +639,7 @@ def learn_command(
             problem,
             output,
             options,
+            files=DesignFiles(region, interfaces, interfaces_frame, clip),
             report=report,
             overwrite=overwrite,
             quiet=quiet,

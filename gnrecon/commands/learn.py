@@ -8,9 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from gnrecon.atomic import atomic_write
+from gnrecon.commands.part import NAME, DesignFiles, part_mesh
+from gnrecon.design import DesignFacts, judge
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import MeshFacts, curvatures, require_bordered, require_sound, verify, verify_file
 from gnrecon.files import require_files
@@ -18,7 +21,7 @@ from gnrecon.io import check_writable, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.pipeline import limited
 from gnrecon.report import plain, versions
-from gnrecon.shapes import OPTIMISERS, PROBLEMS, Learned, Measurement, ShapeProblem, learn, mesh_of
+from gnrecon.shapes import OPTIMISERS, PROBLEMS, Learned, Measurement, ShapeProblem, bracket, learn, mesh_of
 
 OPEN = "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
 CLOSED = "closed, oriented 2-manifold"
@@ -60,6 +63,7 @@ def run_learn(
     output: Path,
     options: LearnOptions,
     *,
+    files: DesignFiles,
     report: Path | None = None,
     overwrite: bool = False,
     quiet: bool = False,
@@ -73,11 +77,14 @@ def run_learn(
     UsageError, FitError, MeshError, OutputError, MemoryLimitError
         Each says in one sentence what is wrong; nothing is written then.
     """
-    if name not in PROBLEMS:
-        raise UsageError(f"There is no problem {name!r}; the problems are {', '.join(PROBLEMS)}.")
+    if name not in (*PROBLEMS, NAME):
+        raise UsageError(f"There is no problem {name!r}; the problems are {', '.join((*PROBLEMS, NAME))}.")
+    if name != NAME and files != DesignFiles():
+        raise UsageError(f"A design is for the problem {NAME} alone, not for {name}.")
     check_writable(output)
-    require_files([], [path for path in (output, report) if path is not None], overwrite)
-    problem = PROBLEMS[name]()
+    require_files(files.named(), [path for path in (output, report) if path is not None], overwrite)
+    design = files.read() if name == NAME else None
+    problem = PROBLEMS[name]() if design is None else bracket(design, options.seed, files.clip)
     console = Console(stderr=True, quiet=quiet)
     with limited(options.threads):
         learned = learn(
@@ -88,10 +95,19 @@ def run_learn(
             seed=options.seed,
             heard=(lambda found: _say(console, told(found))) if verbose else None,
         )
-        mesh = _mesh(learned, problem, options)
-    facts = require_sound(mesh) if verify(mesh).closed else require_bordered(mesh)
-    losses = _write(output, report, mesh, _report(problem, options, learned, facts, command), overwrite)
-    for sentence in [*losses, learned.solution.status, told(learned.best), _summary(output, facts)]:
+        notes: list[str] = []
+        rng = np.random.default_rng(options.seed)
+        if design is None:
+            mesh = _mesh(learned, problem, options)
+        else:
+            mesh, notes = part_mesh(learned.field, design, options.resolution, options.curvature, rng)
+    facts = require_sound(mesh) if design is not None or verify(mesh).closed else require_bordered(mesh)
+    kept = None if design is None else judge(mesh, design, rng)
+    said = _report(problem, options, learned, facts, kept, command)
+    notes += _write(output, report, mesh, said, overwrite)
+    if kept is not None:
+        notes.append(kept.describe())
+    for sentence in [*notes, learned.solution.status, told(learned.best), _summary(output, facts)]:
         _say(console, sentence)
     return ExitCode.INTERRUPTED if learned.solution.interrupted else ExitCode.OK
 
@@ -130,7 +146,12 @@ def _write(output: Path, report: Path | None, mesh: Mesh, facts: dict[str, Any],
 
 
 def _report(
-    problem: ShapeProblem, options: LearnOptions, learned: Learned, facts: MeshFacts, command: str | None
+    problem: ShapeProblem,
+    options: LearnOptions,
+    learned: Learned,
+    facts: MeshFacts,
+    kept: DesignFacts | None,
+    command: str | None,
 ) -> dict[str, Any]:
     """All that is known of a run, ready for JSON; losses and Chamfer divergences first."""
     history = learned.history
@@ -160,6 +181,7 @@ def _report(
                 "activation": problem.network.activation.name,
                 "parameters": problem.network.layout.count,
             },
+            "design": None if kept is None else kept.as_dict(),
             "mesh": {**facts.as_dict(), "guarantee": guarantee},
             "versions": versions(),
         }

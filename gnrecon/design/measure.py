@@ -43,6 +43,15 @@ class DesignFacts:
         """Mean distance of all interfaces, each of the same weight."""
         return float(np.mean(self.attachment))
 
+    def describe(self) -> str:
+        """Say the facts in a sentence."""
+        away = ", ".join(f"{distance:.1e}" for distance in self.attachment)
+        pieces = "1 piece" if self.components == 1 else f"{self.components} pieces"
+        return (
+            f"{pieces}; {self.violations:.2%} of the surface is outside of the design region, by {self.depth:.3g} at "
+            f"most; the interfaces are {away} away (lengths in half the region's longest side)."
+        )
+
     def as_dict(self) -> dict[str, object]:
         """Return the facts as plain values."""
         return {**asdict(self), "attachment": list(self.attachment), "mean_attachment": self.mean_attachment}

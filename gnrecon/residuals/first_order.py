@@ -36,10 +36,14 @@ def interface(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lineari
 
 
 def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
-    """The point, which lies outside of the design region, is not inside of the shape: r = min(0, f)."""
-    del gradient, target
-    within = value < 0
-    return Linearised(torch.where(within, value, 0.0)[:, None], within.to(value)[:, None], None)
+    """The point, which lies outside of the design region, is not inside of the shape: r = min(0, f).
+
+    With least values as targets, of shape (N,), r = min(0, f - target).
+    """
+    del gradient
+    excess = value if target is None else value - target
+    within = excess < 0
+    return Linearised(torch.where(within, excess, 0.0)[:, None], within.to(value)[:, None], None)
 
 
 def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:

@@ -7,6 +7,7 @@ from gnrecon.shapes.learn import OPTIMISERS, Learned, learn
 from gnrecon.shapes.learned import LearnedField, mesh_of
 from gnrecon.shapes.measure import Measurement
 from gnrecon.shapes.minimal import catenoid, enneper, minimal_surface
+from gnrecon.shapes.part import bracket
 from gnrecon.shapes.problem import ShapeProblem, circle, cube, plane_through, z_cylinder, z_plane
 from gnrecon.shapes.term import Drawn, Moment, Term, at_points, fading, in_box, on_surface, rising
 
@@ -24,6 +25,7 @@ __all__ = [
     "ShapeProblem",
     "Term",
     "at_points",
+    "bracket",
     "catenoid",
     "circle",
     "cone",

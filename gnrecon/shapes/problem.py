@@ -66,7 +66,7 @@ class ShapeProblem:
 
     def _frozen(self, theta: Tensor, drawn: list[tuple[Term, Drawn, float]]) -> FrozenProblem:
         terms = [
-            FrozenTerm(term.name, term.residual, points.points, points.target, weight, points.on_surface)
+            FrozenTerm(term.name, term.residual, points.points, points.target, weight * points.share, points.on_surface)
             for term, points, weight in drawn
         ]
         return FrozenProblem(self.network, terms, theta)

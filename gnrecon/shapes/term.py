@@ -39,11 +39,20 @@ class Moment:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Points of shape (N, 3) with targets of shape (N,) or (N, 3), or None; whether they belong to the surface."""
+    """Points of a step.
+
+    Parameters
+    ----------
+    points : of shape (N, 3)
+    target : of shape (N,) or (N, 3), or None
+    on_surface : whether they belong to the surface and move with it
+    share : of all points that were drawn; the others have no residual, and need not be evaluated
+    """
 
     points: Tensor
     target: Tensor | None = None
     on_surface: bool = False
+    share: float = 1.0
 
 
 Sampler = Callable[[Moment], Drawn]

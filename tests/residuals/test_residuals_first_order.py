@@ -46,6 +46,15 @@ def targets(name: str, generator: torch.Generator, count: int) -> Tensor | None:
     return normals / normals.norm(dim=1, keepdim=True)
 
 
+def test_a_design_region_may_ask_for_more_than_zero() -> None:
+    value = torch.tensor([-0.2, 0.1, 0.4], dtype=torch.float64)
+    least = torch.tensor([0.0, 0.3, 0.3], dtype=torch.float64)
+    linear = residuals.design_region(value, torch.zeros(3, 3, dtype=torch.float64), least)
+    torch.testing.assert_close(linear.residual[:, 0], torch.tensor([-0.2, -0.2, 0.0], dtype=torch.float64))
+    assert linear.by_value is not None
+    assert linear.by_value[:, 0].tolist() == [1.0, 1.0, 0.0]
+
+
 def test_every_residual_is_tested() -> None:
     # Those with second derivatives are in test_residuals_second_order.
     second = {name for name in residuals.__all__ if isinstance(getattr(residuals, name), residuals.SecondOrder)}

@@ -1,0 +1,166 @@
+"""The design of a part: within a region, attached to interfaces, in one piece, and as smooth as that allows.
+
+The paper's last experiment is the bracket of a jet engine. Its terms, all of them ordinary residuals:
+
+    design region    f >= d / 2        at the distance d outside of the region
+    interface        f = 0             on the interfaces
+    normal           grad f = n        there, in which the slope of one is included
+    surface strain   k1^2 + k2^2       on the surface, except where it is an interface
+    connectedness    f = target        at passes between separate components (`levelset.connect`)
+    eikonal          |grad f| = 1      in the box
+
+The paper asks for f >= 0 outside of the region, which leaves sheets far from the part that hardly go below zero, and
+whose points are few. The signed distance of a part within the region is at least that of the region, so half of that is
+no more than what the eikonal term asks for.
+
+It begins as the signed distance of the region itself. The problem is posed in unit coordinates, in which half the
+longest side of the region's box is one.
+
+What is outside of the region is asked of points drawn near its border as well as in the whole box, and of a layer just
+within the border too (`MARGIN`), so that what is left of the term's residual lies within the region. An interface may
+lie on the border itself; the layer is thinner there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from gnrecon.cloud import Float
+from gnrecon.design import Design
+from gnrecon.field import Network
+from gnrecon.field.activation import WAVELET
+from gnrecon.levelset import Beside, Joints, LevelSet, Region, joints
+from gnrecon.residuals import (
+    clipped_strain,
+    design_region,
+    eikonal,
+    interface,
+    normal_vector,
+    signed_distance,
+    surface_strain,
+)
+from gnrecon.shapes.problem import ShapeProblem
+from gnrecon.shapes.term import LAST, Drawn, Moment, Sampler, Term, at_points, in_box, on_surface
+
+NETWORK = Network((24, 24), WAVELET, (6.0, 2.0))
+"""The paper's has 2 x 32 wavelets; a step's cost grows with the fourth power of the width."""
+
+STRAIN, EIKONAL, INTERFACE, NORMAL, REGION, CONNECTED = 1e-4, 0.1, 100.0, 1.0, 1e4, 1e3
+"""Weights. The paper's are 1e-4, 1, 10, 10, 1e3 and 1e3; a slope of one everywhere costs the part its fit."""
+
+ON_SURFACE, ON_INTERFACES, IN_BOX, AROUND = 600, 500, 600, 4000
+"""Points of each term at each step."""
+
+POOL = 100_000
+"""Points around the region and on the interfaces that each step draws from, so that distances are computed once."""
+
+MARGIN = 0.01
+"""Depth of the layer within the region's border that is kept free as well."""
+
+CLEARANCE = 0.5
+"""Least value of f outside of the region, as a share of the distance from it; a distance would have all of it."""
+
+ACTIVE = 0.05
+"""Points outside of the region with a larger value than this have no residual, nor will have after the step."""
+
+BESIDE = 0.02
+"""Distance from an interface within which the strain is none of the part's."""
+
+CELLS = 64
+"""Cells along the longest side of the grid on which components are found, as in the paper."""
+
+FAR = 0.05
+"""Distance from which on points are simply far from interfaces."""
+
+NECK = 0.02
+"""How far beyond zero f should be where components are joined, or removed."""
+
+
+def bracket(design: Design, seed: int = 0, clip: float | None = None, network: Network | None = None) -> ShapeProblem:
+    """Return the problem of a part.
+
+    Parameters
+    ----------
+    design : its region and interfaces
+    seed : of the pools that each step's points are drawn from
+    clip : greatest strain k1^2 + k2^2 that counts, per squared unit length, or None for all of it
+    network : by default `NETWORK`
+    """
+    rng = np.random.default_rng(seed)
+    walls = design.interfaces.sample(POOL, rng)
+    off_walls = _off(walls.points)
+    strain = surface_strain if clip is None else clipped_strain(clip)
+    return ShapeProblem(
+        "bracket",
+        (
+            Term("design region", design_region, _outside(design, off_walls, rng), REGION),
+            Term("interface", interface, at_points(walls.points, count=ON_INTERFACES), INTERFACE),
+            Term("normal", normal_vector, at_points(walls.points, walls.normals, count=ON_INTERFACES), NORMAL),
+            Term("surface strain", strain, _free_surface(off_walls), STRAIN),
+            Term("connectedness", signed_distance, _joints(design, walls.points), CONNECTED),
+            Term("eikonal", eikonal, in_box(IN_BOX), EIKONAL),
+        ),
+        design.region.box,
+        lambda x: torch.as_tensor(design.region.distance(x.numpy())),
+        network or NETWORK,
+    )
+
+
+def _off(walls: Float) -> Callable[[Float], Float]:
+    """Return a function that gives the distances, of shape (N,), of points, (N, 3), from the interfaces' points.
+
+    Beyond `FAR` they are infinite: points on a hole's axis are as far from all of its wall, which costs the search.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(walls)
+    return lambda points: tree.query(points, distance_upper_bound=FAR)[0]
+
+
+def _outside(design: Design, off_walls: Callable[[Float], Float], rng: np.random.Generator) -> Sampler:
+    """Return a sampler of points that are to be outside of the part; those far outside of it are counted, not drawn."""
+    around = design.region.around(POOL, rng)
+    layer = np.minimum(MARGIN, off_walls(around) / 4)
+    distance = design.region.distance(around)
+    kept = distance > -layer
+    pool, least = torch.as_tensor(around[kept]), torch.as_tensor(CLEARANCE * np.maximum(distance[kept], 0.0))
+
+    def draw(moment: Moment) -> Drawn:
+        rows = torch.as_tensor(moment.rng.integers(len(pool), size=AROUND))
+        points, targets = pool[rows], least[rows]
+        active = moment.level_set.values(points) - targets < ACTIVE
+        return Drawn(points[active], targets[active], share=int(active.sum()) / AROUND)
+
+    return draw
+
+
+def _free_surface(off_walls: Callable[[Float], Float]) -> Sampler:
+    """Return a sampler of the surface away from the interfaces, whose shape is given."""
+    everywhere = on_surface(ON_SURFACE)
+
+    def draw(moment: Moment) -> Drawn:
+        points = everywhere(moment).points
+        return Drawn(points[torch.as_tensor(off_walls(points.numpy()) > BESIDE)], on_surface=True)
+
+    return draw
+
+
+def _joints(design: Design, walls: Float) -> Sampler:
+    """Return a sampler of the points that join components, found beside the step from the field of one step ago."""
+    region = Region.within(design.region.box, design.region.inside, CELLS)
+    anchors = walls[:: len(walls) // 2000]
+
+    def work(level_set: LevelSet) -> Joints:
+        return joints(level_set, region, NECK, anchors)
+
+    beside = Beside(work)
+
+    def draw(moment: Moment) -> Drawn:
+        # What is measured once is measured as it is.
+        found = work(moment.level_set) if moment.step == LAST else beside(moment.level_set)
+        return Drawn(found.points, found.targets)
+
+    return draw

@@ -1,0 +1,120 @@
+"""The design of a part: its terms draw what they should, and a few steps bring the part nearer to its design."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gnrecon.design import Design, read_design
+from gnrecon.field import Network
+from gnrecon.field.activation import WAVELET
+from gnrecon.levelset import LevelSet
+from gnrecon.shapes import ShapeProblem, bracket, learn, part, pretrain
+from gnrecon.shapes.term import LAST, Drawn, Moment
+
+SMALL = Network((8, 8), WAVELET, (6.0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def design(repository: Path) -> Design:
+    data = repository / "sample_data"
+    return read_design(data / "design_region.stl", data / "design_interfaces.stl")
+
+
+@pytest.fixture(scope="module")
+def problem(design: Design) -> ShapeProblem:
+    return bracket(design, network=SMALL)
+
+
+def balls(x: torch.Tensor) -> torch.Tensor:
+    """Two balls apart, one in each foot of the sample's region."""
+    centers = torch.tensor([[-0.6, 0.0, -0.5], [0.6, 0.0, -0.5]], dtype=x.dtype)
+    return (x[:, None] - centers).norm(dim=2).amin(1) - 0.1
+
+
+def moment(problem: ShapeProblem, step: int, shift: float = 0.0) -> Moment:
+    def value_and_gradient(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.enable_grad():
+            leaf = x.detach().requires_grad_()
+            value = balls(leaf) + shift
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+        return value.detach(), gradient
+
+    level_set = LevelSet(lambda x: balls(x) + shift, value_and_gradient, problem.box)
+    return Moment(step, level_set, np.random.default_rng(0))
+
+
+def drawn(problem: ShapeProblem, name: str, when: Moment) -> Drawn:
+    (term,) = (term for term in problem.terms if term.name == name)
+    return term.sampler(when)
+
+
+def test_what_is_to_be_free_is_outside_or_just_within(problem: ShapeProblem, design: Design) -> None:
+    found = drawn(problem, "design region", moment(problem, 1, shift=-0.5))
+    distance = design.region.distance(found.points.numpy())
+    assert distance.min() > -0.011
+    assert 0.02 < (distance < 0).mean() < 0.3
+    # Half the distance is the least value, and the others are farther from the part than a step will take it.
+    assert found.target is not None
+    np.testing.assert_allclose(found.target, np.maximum(distance, 0) / 2, atol=1e-6)
+    assert (balls(found.points) - 0.5 - found.target < 0.05).all()
+    assert 0.1 < found.share < 1
+
+
+def test_the_layer_within_the_border_leaves_the_interfaces_alone(problem: ShapeProblem, design: Design) -> None:
+    found = drawn(problem, "design region", moment(problem, 1, shift=-3.0)).points.numpy()
+    assert drawn(problem, "design region", moment(problem, 1, shift=-3.0)).share == 1
+    walls = design.interfaces.sample(6000, np.random.default_rng(1)).points
+    nearest = np.linalg.norm(found[:, None] - walls[None, ::3], axis=2).min(axis=1)
+    inside = -design.region.distance(found)
+    assert (inside < nearest / 3 + 1e-3).all()
+
+
+def test_the_strain_is_that_of_the_free_surface(problem: ShapeProblem, design: Design) -> None:
+    found = drawn(problem, "surface strain", moment(problem, 1))
+    assert found.on_surface
+    assert balls(found.points).abs().max() < 1e-10
+    walls = design.interfaces.sample(30_000, np.random.default_rng(1)).points
+    nearest = np.linalg.norm(found.points.numpy()[:100, None] - walls[None], axis=2).min(axis=1)
+    assert nearest.min() > 0.015
+
+
+def test_interfaces_come_with_their_normals(problem: ShapeProblem) -> None:
+    found = drawn(problem, "normal", moment(problem, 1))
+    assert found.target is not None
+    torch.testing.assert_close(found.target.norm(dim=1), torch.ones(len(found.target), dtype=torch.float64))
+
+
+def test_components_are_joined_one_step_later(design: Design) -> None:
+    fresh = bracket(design, network=SMALL)
+    # The first answer is to its own field; from then on each is to the one before.
+    assert len(drawn(fresh, "connectedness", moment(fresh, 1)).points) == 1
+    apart = drawn(fresh, "connectedness", moment(fresh, 2, shift=-0.9))
+    assert apart.target is not None
+    assert apart.target.tolist() == [-0.02]
+    assert float(apart.points[0, 0]) == pytest.approx(0.0, abs=0.05)
+    assert len(drawn(fresh, "connectedness", moment(fresh, 3)).points) == 0
+    # A measurement waits for its own.
+    assert len(drawn(fresh, "connectedness", moment(fresh, LAST, shift=-0.9)).points) == 0
+
+
+def test_the_strain_can_be_clipped(design: Design) -> None:
+    names = [term.residual.name for term in bracket(design, clip=50.0).terms if term.name == "surface strain"]  # type: ignore[union-attr]
+    assert names == ["surface strain, at most 50"]
+
+
+def test_a_few_steps_bring_the_part_nearer_to_its_design(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pretrain, "STEPS", 10)
+    monkeypatch.setattr(part, "POOL", 30_000)
+    monkeypatch.setattr(part, "AROUND", 2000)
+    monkeypatch.setattr(part, "CELLS", 32)
+    learned = learn(bracket(design, network=SMALL), budget=None, steps=3)
+    first, last = learned.history[0], learned.best
+    assert last.loss < 0.7 * first.loss
+    assert set(last.shares) == {"design region", "interface", "normal", "surface strain", "connectedness", "eikonal"}
+    # What is computed beside the steps does not make a run depend on how busy the machine is.
+    again = learn(bracket(design, network=SMALL), budget=None, steps=3)
+    assert torch.equal(again.field.theta, learned.field.theta)
