@@ -29,7 +29,8 @@ class Moments:
 
     def add(self, points: Float) -> None:
         """Take a chunk of points, of shape (N, 3); those that are not finite do not count."""
-        points = points[np.isfinite(points).all(axis=1)]
+        finite = np.isfinite(points).all(axis=1)
+        points = points if finite.all() else points[finite]
         if not len(points):
             return
         if self._first is None:
