@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.ingest.outliers import thickness
+
 Float = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
@@ -46,11 +48,7 @@ def surface_variation(points: Float) -> Float:
     found = np.zeros(len(points))
     for start in range(0, len(points), _AT_A_TIME):
         rows = tree.query(points[start : start + _AT_A_TIME], min(_NEIGHBOURS, len(points)))[1]
-        groups = points[rows.reshape(len(rows), -1)]
-        groups = groups - groups.mean(axis=1, keepdims=True)
-        eigenvalues = np.linalg.eigvalsh(np.einsum("gki,gkj->gij", groups, groups))
-        sums = eigenvalues.sum(axis=1)
-        found[start : start + len(rows)] = np.maximum(eigenvalues[:, 0], 0) / np.where(sums > 0, sums, 1)
+        found[start : start + len(rows)] = thickness(points[rows.reshape(len(rows), -1)])
     return found
 
 

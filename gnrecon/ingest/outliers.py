@@ -45,7 +45,7 @@ def find_outliers(points: Float) -> npt.NDArray[np.bool_]:
             bound = max(float(np.log(_LEAST_FACTOR)), middle + _DEVIATIONS * deviation)
         far = ratio > bound
         sparse = np.flatnonzero(spacing > _SPARSE_FACTOR * np.median(spacing))
-        far[sparse] |= _thickness(points[remaining][neighbours[sparse]]) > _THICKNESS
+        far[sparse] |= thickness(points[remaining][neighbours[sparse]]) > _THICKNESS
         if not far.any():
             break
         remaining = remaining[~far]
@@ -63,9 +63,13 @@ def _spacing(points: Float) -> tuple[Float, npt.NDArray[np.intp]]:
     return np.maximum(distances[:, 1:].mean(axis=1), np.finfo(np.float64).tiny), neighbours[:, 1:]
 
 
-def _thickness(groups: Float) -> Float:
-    """Return the smallest eigenvalue's share of each group's covariance; `groups` has shape (G, k, 3)."""
+def thickness(groups: Float) -> Float:
+    """Return the smallest eigenvalue's share of each group's covariance, of shape (G,); `groups` has shape (G, k, 3).
+
+    It is 0 where all points of a group coincide.
+    """
     centred = groups - groups.mean(axis=1, keepdims=True)
     eigenvalues = np.linalg.eigvalsh(np.einsum("gki,gkj->gij", centred, centred))
-    shares: Float = eigenvalues[:, 0] / eigenvalues.sum(axis=1)
+    sums = eigenvalues.sum(axis=1)
+    shares: Float = np.maximum(eigenvalues[:, 0], 0) / np.where(sums > 0, sums, 1)
     return shares
