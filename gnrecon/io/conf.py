@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.errors import InputError
+from gnrecon.io.beside import beside
 from gnrecon.io.contents import Contents, Float, joined
 from gnrecon.io.ply import read_ply
 from gnrecon.io.text import numbers, read_text
@@ -86,9 +87,7 @@ def _rotation(quaternion: Float) -> Float:
 
 
 def _posed(pose: Pose, folder: Path) -> Contents:
-    target = folder / pose.file
-    if not target.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"the scan {pose.file[:80]!r} lies outside of the file's folder, so it is not read.")
+    target = beside(folder, pose.file, "scan")
     try:
         scan = read_ply(target)
     except InputError as error:

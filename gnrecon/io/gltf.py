@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from gnrecon.errors import InputError
+from gnrecon.io.beside import beside
 from gnrecon.io.contents import Contents
 from gnrecon.io.foreign import parsing
 from gnrecon.io.glb import packed, read_glb_bytes
@@ -51,9 +52,7 @@ def _buffer(uri: str, folder: Path) -> bytes:
     """The bytes of a data URI, or of a file in or below the scene's folder."""
     if uri.startswith("data:"):
         return binascii.a2b_base64(uri.partition(",")[2])
-    target = folder / unquote(uri)
-    if not target.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"the buffer {uri[:80]!r} lies outside of the file's folder, so it is not read.")
+    target = beside(folder, unquote(uri), "buffer")
     if not target.is_file():
         raise InputError(f"the buffer {uri[:80]!r} is missing beside the file.")
     return target.read_bytes()
