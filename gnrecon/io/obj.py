@@ -15,7 +15,7 @@ from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan, not_triangles
-from gnrecon.io.text import format_rows, numbers, read_text
+from gnrecon.io.text import format_rows, read_text, rows_of
 from gnrecon.mesh import Mesh
 
 Float = npt.NDArray[np.float64]
@@ -43,8 +43,8 @@ def read_obj(path: Path) -> Contents:
         When there is no vertex, a word is no number, or an index points nowhere.
     """
     lines = [line.strip() for line in read_text(path).replace("\\\n", " ").splitlines()]
-    vertices = _rows([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "v")
-    normals = _rows([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "vn")
+    vertices = rows_of([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "the 'v' lines")
+    normals = rows_of([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "the 'vn' lines")
     if not len(vertices):
         raise InputError("the file holds no vertex line ('v x y z').")
     colors = {"colors": vertices[:, 3:6]} if vertices.shape[1] >= 6 else {}
@@ -64,17 +64,6 @@ def _unread(lines: list[str]) -> tuple[str, ...]:
     """Name what other kinds of lines hold."""
     kinds = {word for word in (line.partition(" ")[0] for line in lines) if word in _UNREAD}
     return tuple(dict.fromkeys(name for word, name in _UNREAD.items() if word in kinds))
-
-
-def _rows(lines: list[str], kind: str) -> Float:
-    """Return the numbers of all lines of one kind, as an array of equally many columns, at least 3."""
-    if not lines:
-        return np.empty((0, 3))
-    columns = len(lines[0].split())
-    values = numbers(" ".join(lines).split())
-    if columns < 3 or len(values) != columns * len(lines):
-        raise InputError(f"the '{kind}' lines do not all hold the same number of coordinates, at least 3.")
-    return values.reshape(-1, columns)
 
 
 def _corners(lines: list[str]) -> tuple[Int, list[str]]:

@@ -12,7 +12,7 @@ from gnrecon.colors import as_bytes, with_alpha
 from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan, not_triangles
-from gnrecon.io.text import format_rows, meaningful_lines, numbers, read_text
+from gnrecon.io.text import format_rows, meaningful_lines, numbers, read_text, rows_of
 from gnrecon.mesh import Mesh
 
 Int = npt.NDArray[np.int64]
@@ -41,7 +41,9 @@ def read_off(path: Path) -> Contents:
         raise InputError(
             f"the header declares {vertex_count} vertices and {face_count} faces, but {len(lines)} rows follow."
         )
-    table = _vertices(lines[:vertex_count])
+    if not vertex_count:
+        raise InputError("the header declares no vertices.")
+    table = rows_of(lines[:vertex_count], "the vertex rows")
     has_normals, has_colors = bool(keyword[3]), bool(keyword[2])
     if has_normals and table.shape[1] < 6:
         raise InputError(f"NOFF vertices need 6 numbers each, but hold {table.shape[1]}.")
@@ -50,17 +52,6 @@ def read_off(path: Path) -> Contents:
     faces, unread = _faces(lines[vertex_count : vertex_count + face_count])
     points = np.ascontiguousarray(table[:, :3])
     return Contents(points, table[:, 3:6] if has_normals else None, faces, colors, unread)
-
-
-def _vertices(lines: list[str]) -> npt.NDArray[np.float64]:
-    """Return the vertex rows as a table, of shape (V, columns)."""
-    if not lines:
-        raise InputError("the header declares no vertices.")
-    columns = len(lines[0].split())
-    values = numbers(" ".join(lines).split())
-    if columns < 3 or len(values) != columns * len(lines):
-        raise InputError("the vertex rows do not all hold the same number of coordinates, at least 3.")
-    return values.reshape(-1, columns)
 
 
 def _faces(lines: list[str]) -> tuple[Int, tuple[str, ...]]:

@@ -44,6 +44,23 @@ def numbers(words: Sequence[str]) -> Float:
         raise InputError(f"{_first_bad(words)!r} is not a number.") from None
 
 
+def rows_of(lines: Sequence[str], what: str) -> Float:
+    """Return the numbers of all lines, as an array of equally many columns, at least 3; `what` names the lines.
+
+    Raises
+    ------
+    InputError
+        When a word is no number, or lines differ in length or hold fewer than 3.
+    """
+    if not lines:
+        return np.empty((0, 3))
+    columns = len(lines[0].split())
+    values = numbers(" ".join(lines).split())
+    if columns < 3 or len(values) != columns * len(lines):
+        raise InputError(f"{what} do not all hold the same number of coordinates, at least 3.")
+    return values.reshape(-1, columns)
+
+
 def _first_bad(words: Sequence[str]) -> str:
     for word in words:
         try:
