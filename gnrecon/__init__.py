@@ -31,7 +31,7 @@ if TYPE_CHECKING:
         verify,
     )
     from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
-    from gnrecon.ingest import prepare
+    from gnrecon.ingest import prepare, survey
     from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
     from gnrecon.options import Options
     from gnrecon.page import write_page
@@ -53,7 +53,7 @@ _ROOMS = {
         "verify",
     ),
     "gnrecon.fit": ("FitOptions", "NeuralSDF", "Uncertainty", "fit"),
-    "gnrecon.ingest": ("prepare",),
+    "gnrecon.ingest": ("prepare", "survey"),
     "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
     "gnrecon.options": ("Options",),
     "gnrecon.page": ("write_page",),
@@ -99,6 +99,7 @@ __all__ = [
     "report_schema",
     "require_sound",
     "shaped",
+    "survey",
     "to_open3d",
     "to_trimesh",
     "trim",
