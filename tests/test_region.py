@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scan_files import gnrecon, sphere, write_scan
 
+from gnrecon.cli import main
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import UsageError
 from gnrecon.io import cropped, read_scans
@@ -93,6 +94,19 @@ def test_the_command_line_crops(tmp_path: Path) -> None:
     assert f"Dropped {1500 - kept.sum():,} of 1,500 points outside of the wanted region." in done.stderr
     cloud, _ = read_scans([scan], region=Options(crop="99.5,99,99,102,102,102").region())
     np.testing.assert_array_equal(cloud.points, (points + 100)[points[:, 0] >= -0.5])
+
+
+def test_a_batch_passes_boxes_and_planes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    passed: list[str] = []
+    monkeypatch.setattr("gnrecon.batch.run_batch", lambda *given, **_: passed.extend(given[3]) or 0)
+    boxes = ("--crop", "-1,-1,-1,1,1,1", "--crop", "2,2,2,3,3,3", "--clip-plane", "-1,0,0,2")
+    with pytest.raises(SystemExit) as ended:
+        main(["batch", str(tmp_path), "-o", str(tmp_path), *boxes, "--smooth-scan", "8s", "--clusters", "off"])
+    assert ended.value.code == 0
+    text = " ".join(passed)
+    assert " ".join(boxes) in text
+    assert "--smooth-scan 8s" in text
+    assert "--clusters off" in text
 
 
 @pytest.mark.parametrize(
