@@ -8,6 +8,7 @@ from pathlib import PurePath
 from typing import Any
 
 from gnrecon.export import DISTANCES
+from gnrecon.ingest import Layers
 from gnrecon.page.numbers import count, figure, memory, seconds, share
 
 Report = Mapping[str, Any]
@@ -36,7 +37,10 @@ INGEST = {
     "non_finite": "without finite coordinates",
     "zero_normals": "without a direction",
     "duplicates": "at the position of another",
+    "repeated": "copies, of a scan that is there twice",
     "outliers": "scattered off the surface",
+    "clusters": "in isolated clusters",
+    "held_out": "held out to check the fit",
     "thinned": "thinned out",
     "kept": "fitted",
 }
@@ -101,6 +105,10 @@ def remarks(report: Report) -> list[str]:
     sentences = [f"Normals: {counts['normals']}."] if counts.get("normals") else []
     if counts.get("outliers_found"):
         sentences.append(f"Left {counts['outliers_found']} points alone that look like outliers.")
+    if counts.get("clusters_found"):
+        sentences.append(f"Left {counts['clusters_found']} points alone that lie in isolated clusters.")
+    if layers := (report.get("scan") or {}).get("layers"):
+        sentences.append(Layers(**layers).describe())
     return [*sentences, *(fit[name] for name in ("method", "status") if fit.get(name)), *report.get("actions", [])]
 
 
