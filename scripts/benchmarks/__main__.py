@@ -24,6 +24,7 @@ BENCHMARKS = {
     "uncertainty": Benchmark("benchmarks.uncertainty.main", "sigma beside the true error, on known shapes"),
     "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
     "learn": Benchmark("benchmarks.learn.main", "shape learning by three optimisers, and one step's time"),
+    "transport": Benchmark("benchmarks.transport", "what the paper's neglected terms of moving surfaces change"),
     "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
     "refine": Benchmark("benchmarks.refine.main", "remeshing and fewer faces, beside the libraries' own"),
     "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),
