@@ -17,7 +17,7 @@ Float = npt.NDArray[np.float64]
 
 _METRES = {".e57": "E57", ".ptx": "PTX", ".gltf": "glTF", ".glb": "glTF", ".las": "LAS", ".laz": "LAZ"}
 _FAR, _FAR_SHARE = 1e4, 30.0
-_UNIT = 2e-3
+_UNIT = 5e-3
 _SMALLEST, _MIDDLE, _LARGEST = 0.005, 5.0, 5000.0
 
 
@@ -52,7 +52,7 @@ def guess_units(lower: Sequence[float], upper: Sequence[float], files: Sequence[
     if _normalised(low, high):
         return UnitsGuess(None, "the shape seems to have been scaled to a unit box or ball")
     if _SMALLEST < longest <= _MIDDLE:
-        return UnitsGuess("m", f"its longest side, {longest:.3g}, would be {1000 * longest:.3g} mm then")
+        return UnitsGuess("m", f"its longest side, {longest:.3g}, would be {1000 * longest:,.4g} mm then")
     if _MIDDLE < longest <= _LARGEST:
         return UnitsGuess("mm", f"its longest side would be {longest:.4g} mm then, as of most things that are scanned")
     return UnitsGuess(None, f"its longest side, {longest:.3g}, is not like that of most things in mm or m")
