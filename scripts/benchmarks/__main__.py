@@ -26,6 +26,7 @@ BENCHMARKS = {
     "learn": Benchmark("benchmarks.learn.main", "shape learning by three optimisers, and one step's time"),
     "transport": Benchmark("benchmarks.transport", "what the paper's neglected terms of moving surfaces change"),
     "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
+    "orient": Benchmark("benchmarks.orient.main", "estimated normals, and their meshes, beside open3d's"),
     "refine": Benchmark("benchmarks.refine.main", "remeshing and fewer faces, beside the libraries' own"),
     "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),
 }
