@@ -21,12 +21,15 @@ from gnrecon.fit.detail import fit_detail
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.smoothness import global_length
 from gnrecon.fit.start import Spectrum
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Solution
 
 COARSE_POINTS, COARSE_UNITS = 5000, 1000
-SMOOTH = Spectrum(length=0.25, degrees_of_freedom=12.0)
+DEGREES_OF_FREEDOM = 12.0
+"""Of the global features' spectrum: smooth."""
+
 SPACINGS = 4.0
 """Least length of the global field's features, in spacings of the points that it sees: shorter ones oscillate."""
 
@@ -57,7 +60,8 @@ def fit_adaptive(
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
     field = Siren((COARSE_UNITS,))
-    spectrum = replace(SMOOTH, length=max(SMOOTH.length, SPACINGS * scene.coarse.spacing))
+    length = max(global_length(samples, held, scene, rng.spawn(1)[0]), SPACINGS * scene.coarse.spacing)
+    spectrum = Spectrum(length, DEGREES_OF_FREEDOM)
     linear = replace(options, widths=field.widths, steps=0)
     fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())

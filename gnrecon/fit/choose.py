@@ -191,7 +191,8 @@ class _Trials:
         if len(rows) > MOST_POINTS:
             far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
             rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
-        system = PatchSystem(self.leftover.patch(rows, center, Volume.none(), self.device), self.features, length)
+        patch = self.leftover.patch(rows, center, Volume.none(), self.device)
+        system = PatchSystem(patch, self.features, length, patch.size)
         target = self.leftover.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
         return [self._score(system.solve(p, a), target, normals, length) for p, a in self.noises]

@@ -106,7 +106,7 @@ class _Cubes:
             if len(rows) >= LEAST_POINTS:
                 length = self._length(rows)
                 patch = self.leftover.patch(rows, center, volumes[number], self.device)
-                system = PatchSystem(patch, self.features, length)
+                system = PatchSystem(patch, self.features, length, patch.size)
                 kept.append(key)
                 lengths.append(length)
                 amplitudes.append(system.solve(self.belief.position, self.belief.angle))

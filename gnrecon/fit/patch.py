@@ -68,15 +68,23 @@ class Patch:
 
     @property
     def size(self) -> float:
-        """Root mean square of the wanted values, or a trace where there is nothing to correct."""
-        return max(float(self.value.square().mean().sqrt()), 1e-6)
+        """What the standard deviation of a correction is taken to be; a trace where there is nothing to correct."""
+        return SIZE * max(float(self.value.square().mean().sqrt()), 1e-6)
 
 
 class PatchSystem:
-    """The normal equations of a patch, assembled once and solved for any noise."""
+    """The normal equations of a patch, assembled once and solved for any noise.
 
-    def __init__(self, patch: Patch, features: Features, length: float) -> None:
-        self._scale = float(SIZE * patch.size * (2.0 / len(features)) ** 0.5)
+    Parameters
+    ----------
+    patch : Patch
+    features : Features
+    length : of the features, unit coordinates
+    size : standard deviation of the function, unit coordinates
+    """
+
+    def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
+        self._scale = size * (2.0 / len(features)) ** 0.5
         z = features.phase(patch.points, patch.center, length)
         sines, cosines = z.sin(), z.cos()
         like, count = patch.value, len(features)

@@ -49,12 +49,12 @@ def test_amplitudes_are_the_mode_of_bayesian_regression(patch: Patch, features: 
     prior = SIZE * float(patch.value.square().mean().sqrt()) * (2 / len(features)) ** 0.5
     J, r = plainly(patch, features)
     expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
-    found = PatchSystem(patch, features, LENGTH).solve(POSITION, ANGLE)
+    found = PatchSystem(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
     torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
 
 
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:
-    system = PatchSystem(patch, features, LENGTH)
+    system = PatchSystem(patch, features, LENGTH, patch.size)
     misfits = []
     for noise in (1e-3, 1e-1, 1e1):
         value = rows(features, patch.points, patch.center)[0] @ system.solve(noise, 100.0)

@@ -1,0 +1,58 @@
+"""The length of the global field: long for shapes with few degrees of freedom, short for those with many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.fit.scene import Scene
+from gnrecon.fit.smoothness import LENGTHS, global_length
+
+FRAME = Frame(np.zeros(3), 1.0)
+
+
+def rippled(ripples: float, height: float, noise: float) -> Samples:
+    """Points of a sphere of radius 0.8 with ripples, moved along their normals by noise."""
+    rng = np.random.default_rng(0)
+
+    def level(x: Float) -> tuple[Float, Float]:
+        radius, (sx, sy), (cx, cy) = (
+            np.linalg.norm(x, axis=1),
+            np.sin(ripples * x[:, :2]).T,
+            np.cos(ripples * x[:, :2]).T,
+        )
+        turn = height * ripples * np.stack([cx * sy, sx * cy, 0 * sx], axis=1)
+        return radius - 0.8 - height * sx * sy, x / radius[:, None] - turn
+
+    x = rng.standard_normal((1500, 3))
+    x *= 0.8 / np.linalg.norm(x, axis=1, keepdims=True)
+    for _ in range(30):
+        value, gradient = level(x)
+        x -= (value / np.einsum("ij,ij->i", gradient, gradient))[:, None] * gradient
+    normals = level(x)[1]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Samples(x + noise * rng.standard_normal((1500, 1)) * normals, normals, FRAME)
+
+
+def chosen(samples: Samples) -> float:
+    held = np.zeros(len(samples), dtype=bool)
+    held[::6] = True
+    seen = Samples(samples.points[~held], samples.normals[~held], FRAME)
+    scene = Scene.of(seen, "cpu", np.random.default_rng(1))
+    return global_length(samples, held, scene, np.random.default_rng(2))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_ball_needs_long_features(noise: float) -> None:
+    assert chosen(rippled(1.0, 0.0, noise)) > LENGTHS[0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_ripples_need_short_features(noise: float) -> None:
+    assert chosen(rippled(9.0, 0.05, noise)) == LENGTHS[0]
+
+
+def test_equal_seeds_choose_alike() -> None:
+    samples = rippled(4.0, 0.05, 0.003)
+    assert chosen(samples) == chosen(samples)
