@@ -17,6 +17,7 @@ from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.field.siren import Siren
 from gnrecon.fit.choose import Mask
+from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.detail import fit_detail
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
@@ -45,6 +46,8 @@ def fit_adaptive(
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a global field and its detail; `advance` is told of the share that is done.
 
+    Normals that were estimated are turned around where a first field contradicts them.
+
     An interrupt (Ctrl-C) while the detail is solved leaves the global field.
 
     Raises
@@ -57,6 +60,9 @@ def fit_adaptive(
     held: Mask = np.zeros(len(samples), dtype=bool)
     held[order[:out]] = True
     rows = np.sort(order[out:][:COARSE_POINTS])
+    turned = 0.0
+    if samples.estimated:
+        samples, turned = reconciled(samples, rows, options)
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
     field = Siren((COARSE_UNITS,))
@@ -71,9 +77,10 @@ def fit_adaptive(
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(fitted, status=status, interrupted=True)
     chosen = detail.as_dict(samples.frame.scale)
+    told = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
     status = (
         f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
         f"length {chosen['length']:.3g}, noise {chosen['position_noise']:.2g} in position and "
-        f"{chosen['angle_noise']:.2g} degrees in normals."
+        f"{chosen['angle_noise']:.2g} degrees in normals.{told}"
     )
     return replace(sdf, detail=detail), replace(fitted, status=status, method="Exact linear least squares.")

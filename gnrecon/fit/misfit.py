@@ -58,6 +58,7 @@ class Misfit:
         reach = _reach(np.abs(self.distances))
         return {
             "points": len(self.distances),
+            "contradicted": float((self.angles > 90).mean()),
             "distance": _figures(np.abs(self.distances)) | {"histogram": _counts(self.distances, -reach, reach)},
             "angle": _figures(self.angles) | {"histogram": _counts(self.angles, 0.0, _reach(self.angles))},
         }

@@ -1,0 +1,57 @@
+"""Patches of normals on the wrong side are turned around; right ones, thin walls' too, stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.fit.adaptive import fit_adaptive
+from gnrecon.fit.contradict import reconciled
+from gnrecon.fit.options import FitOptions
+
+OPTIONS = FitOptions(quality="draft")
+
+
+def sphere(count: int, rng: np.random.Generator) -> Samples:
+    points = rng.standard_normal((count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return Samples(0.9 * points, points, Frame(np.array([5.0, 0, -3]), 2.0))
+
+
+def plate(count: int, rng: np.random.Generator) -> Samples:
+    """Both sides of a disk, as far from each other as its points are."""
+    angles, radii = 2 * np.pi * rng.uniform(size=count), 0.9 * np.sqrt(rng.uniform(size=count))
+    sides = rng.choice([-1.0, 1.0], count)
+    points = np.stack([radii * np.cos(angles), radii * np.sin(angles), 0.04 * sides], axis=1)
+    return Samples(points, np.stack([0 * sides, 0 * sides, sides], axis=1), Frame(np.zeros(3), 1.0))
+
+
+def turned(samples: Samples, patch: Float) -> Samples:
+    return replace(samples, normals=np.where(patch[:, None], -samples.normals, samples.normals), estimated=True)
+
+
+def test_a_patch_on_the_wrong_side_is_turned_around(rng: np.random.Generator) -> None:
+    right = sphere(900, rng)
+    patch = np.linalg.norm(right.points - right.points[0], axis=1) < 0.15
+    assert 2 < patch.sum() < 20
+    found, share = reconciled(turned(right, patch), np.arange(900), OPTIONS)
+    assert np.array_equal(found.normals, right.normals)
+    assert share == pytest.approx(patch.mean())
+
+
+@pytest.mark.parametrize("shape", [sphere, plate])
+def test_right_normals_stay(shape: type, rng: np.random.Generator) -> None:
+    right = shape(900, rng)
+    found, share = reconciled(right, np.arange(900), OPTIONS)
+    assert np.array_equal(found.normals, right.normals)
+    assert share == 0
+
+
+def test_the_default_fit_turns_estimates(rng: np.random.Generator) -> None:
+    right = sphere(250, rng)
+    wrong = turned(right, np.linalg.norm(right.points - right.points[0], axis=1) < 0.3)
+    status = fit_adaptive(wrong, OPTIONS, np.random.default_rng(0))[1].status
+    assert "of the normals around, which a first field contradicted." in status
