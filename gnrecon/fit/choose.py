@@ -55,12 +55,16 @@ BEYOND = 1.5
 
 @dataclass(frozen=True)
 class Leftover:
-    """What a global field leaves over at the points: everything of shape (N,) or (N, 3), unit coordinates."""
+    """What a global field leaves over at the points: everything of shape (N,) or (N, 3), unit coordinates.
+
+    `estimated` says that the normals were found from the points.
+    """
 
     points: Float
     normals: Float
     value: Float
     gradient: Float
+    estimated: bool = False
 
     def __len__(self) -> int:
         return len(self.points)
@@ -203,4 +207,6 @@ class _Trials:
         missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
         distance = missing.abs() / slope.clamp_min(LEAST_SLOPE)
-        return float(distance.mean() + self.radius * turn.norm(dim=1).mean())
+        # Estimated normals are means of their neighbours', which a field that is too smooth predicts best.
+        heeded = 0.0 if self.leftover.estimated else self.radius
+        return float(distance.mean() + heeded * turn.norm(dim=1).mean())

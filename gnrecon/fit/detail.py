@@ -72,7 +72,7 @@ def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
     """Return the values and gradients of a field at samples, in unit coordinates."""
     points = samples.frame.to_world(samples.points)
     value, gradient = sdf.sdf_and_gradient(points)
-    return Leftover(samples.points, samples.normals, value / samples.frame.scale, gradient)
+    return Leftover(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
 
 
 @dataclass(frozen=True)

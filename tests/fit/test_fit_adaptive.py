@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import InputError
@@ -163,6 +164,23 @@ def test_the_score_does_not_reward_a_flat_field() -> None:
     leftover = Leftover(noisy.points, noisy.normals, zero + distance(noisy), noisy.normals)
     belief = choose(leftover, held, 0.02, rng)
     assert belief.position >= 0.005
+
+
+def test_estimated_normals_do_not_smooth_ripples_away() -> None:
+    """Estimated normals are means of their neighbours'; a choice that heeds them takes ripples for noise."""
+    rng = np.random.default_rng(5)
+    samples = rippled(2500, rng)
+    near = cKDTree(samples.points).query(samples.points, 80)[1]
+    normals = samples.normals[near].mean(axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radius = np.linalg.norm(samples.points, axis=1)
+    smooth = radius - 0.8, samples.points / radius[:, None]
+    held = rng.random(len(samples)) < 0.15
+    heeding, free = (
+        choose(Leftover(samples.points, normals, *smooth, estimated), held, 0.03, np.random.default_rng(1))
+        for estimated in (False, True)
+    )
+    assert free.angle > heeding.angle or free.position < heeding.position
 
 
 def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
