@@ -206,7 +206,9 @@ class _Trials:
         # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
         missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
+        if self.leftover.estimated:
+            # Such normals are means of their neighbours', which a field that is too smooth predicts best. So distances
+            # alone count, and a field that is steep because it winds through every point is not nearer for that.
+            return float((missing.abs() / slope.clamp(LEAST_SLOPE, 1.0)).mean())
         distance = missing.abs() / slope.clamp_min(LEAST_SLOPE)
-        # Estimated normals are means of their neighbours', which a field that is too smooth predicts best.
-        heeded = 0.0 if self.leftover.estimated else self.radius
-        return float(distance.mean() + heeded * turn.norm(dim=1).mean())
+        return float(distance.mean() + self.radius * turn.norm(dim=1).mean())

@@ -183,6 +183,19 @@ def test_estimated_normals_do_not_smooth_ripples_away() -> None:
     assert free.angle > heeding.angle or free.position < heeding.position
 
 
+def test_scans_that_do_not_match_are_not_wound_through() -> None:
+    """Two layers of a ball, with normals that were estimated: a field through all points is steep everywhere."""
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal((2500, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    apart = np.where(rng.random(2500) < 0.5, 0.006, -0.006)
+    normals = x + 0.1 * rng.standard_normal(x.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    held = rng.random(2500) < 0.15
+    leftover = Leftover((0.8 + apart)[:, None] * x, normals, apart, x, estimated=True)
+    assert choose(leftover, held, 0.03, rng).position > 0.002
+
+
 def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
     rng = np.random.default_rng(9)
     alike = 1.0 + 0.001 * rng.standard_normal((10, 12))
