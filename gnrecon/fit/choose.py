@@ -46,6 +46,10 @@ FIRST = 2
 PATCHES, HELD_NEAR = 10, 20
 """Patches, and how many left-out points each of them predicts."""
 
+SPARSE = 20_000
+"""Points up to which estimated normals are not heeded; those of denser scans are means over little of the surface, and
+where many scans do not quite match, distances alone are least for a field that winds through all of them."""
+
 MOST_POINTS = 2500
 FEATURES = 700
 LEAST_SLOPE = 0.05
@@ -206,7 +210,7 @@ class _Trials:
         # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
         missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
-        if self.leftover.estimated:
+        if self.leftover.estimated and len(self.leftover) <= SPARSE:
             # Such normals are means of their neighbours', which a field that is too smooth predicts best. So distances
             # alone count, and a field that is steep because it winds through every point is not nearer for that.
             return float((missing.abs() / slope.clamp(LEAST_SLOPE, 1.0)).mean())
