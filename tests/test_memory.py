@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
+from mmap import MAP_ANONYMOUS, MAP_PRIVATE, PAGESIZE, mmap
 from pathlib import Path
 from threading import Barrier, Thread
 
@@ -18,10 +19,13 @@ SLACK = 12.0  # MB that the interpreter, the allocator and other threads may tak
 
 
 def use(mb: float) -> None:
-    """Hold so much memory, as long as it takes to be seen where the mark cannot be set back, and give it back."""
-    held = np.ones(int(mb * 1e6 / 8))
-    time.sleep(5 * memory.INTERVAL)
-    del held
+    """Hold so much memory, as long as it takes to be seen where the mark cannot be set back, and give it back.
+
+    It comes from the system itself: an allocator may serve it from what earlier tests freed and it kept resident.
+    """
+    with mmap(-1, max(int(mb * 1e6), 1), flags=MAP_PRIVATE | MAP_ANONYMOUS) as held:
+        np.frombuffer(held, dtype=np.uint8)[::PAGESIZE] = 1
+        time.sleep(5 * memory.INTERVAL)
 
 
 def resident() -> float:
