@@ -8,15 +8,16 @@ the problem has other solutions, such as two planes.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
 from gnrecon import levelset
 from gnrecon.residuals import gauss_curvature
 from gnrecon.sampling import Box
-from gnrecon.shapes.minimal import ON_SURFACE, box_around, curve_points, eikonal_term, interface_term
-from gnrecon.shapes.problem import ShapeProblem, Start, circle, cube, plane_through, z_cylinder
-from gnrecon.shapes.term import Term, on_surface
+from gnrecon.shapes.curves import through_curves
+from gnrecon.shapes.problem import ShapeProblem, Start, circle, cube, z_cylinder
 
 
 def developable_surface(
@@ -35,20 +36,12 @@ def developable_surface(
     UsageError
         When there are fewer than three points, or they are not finite.
     """
-    points = curve_points(curve)
-    return ShapeProblem(
-        name,
-        (interface_term(points), Term("Gauss curvature", gauss_curvature, on_surface(ON_SURFACE)), eikonal_term()),
-        box or box_around(points),
-        start or plane_through(points),
-    )
+    return through_curves(name, curve, gauss_curvature, start, box)
 
 
 def cone() -> ShapeProblem:
     """Return the paper's problem of the cone; the mantle between the circles is meshed."""
     curves = np.concatenate([circle(1.0, 0.0), circle(0.4, 1.0)])
     problem = developable_surface(curves, start=z_cylinder(), box=cube(1.0), name="cone")
-    shown = Box(np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0]))
-    return ShapeProblem(
-        problem.name, problem.terms, problem.box, problem.start, problem.network, levelset.cone(), shown
-    )
+    mantle = Box(np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0]))
+    return replace(problem, known=levelset.cone(), shown=mantle)
