@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -61,6 +62,15 @@ class Layout:
             split = start + out * into
             views.append((theta[start:split].view(out, into), theta[split : split + out]))
         return views
+
+    def uniform(self, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Return theta, of shape (p,), with weights and biases drawn uniformly within 1/sqrt(fan-in) of zero."""
+        layers = []
+        for out, into in self.shapes:
+            bound = 1.0 / math.sqrt(into)
+            drawn = torch.rand(out, into + 1, generator=generator, dtype=dtype) * (2 * bound) - bound
+            layers.append((drawn[:, :-1], drawn[:, -1]))
+        return self.flatten(layers)
 
     def flatten(self, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """Return theta, of shape (p,), from the layers' weights and biases."""

@@ -8,7 +8,6 @@ The networks of the paper's shape-learning problems are ``Network((32, 32), TANH
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -49,15 +48,12 @@ class Network:
 
     def initial(self, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return starting parameters, of shape (p,): uniform within 1/sqrt(fan-in), times the frequencies at first."""
-        layers = []
-        for level, (out, into) in enumerate(self.layout.shapes):
-            bound = 1.0 / math.sqrt(into)
-            weights = torch.rand(out, into + 1, generator=generator, dtype=dtype) * (2 * bound) - bound
-            if level == 0:
-                factors = torch.tensor(self.frequencies, dtype=dtype)
-                weights *= factors.repeat_interleave(self.widths[0])[:, None]
-            layers.append((weights[:, :-1], weights[:, -1]))
-        return self.layout.flatten(layers)
+        theta = self.layout.uniform(generator, dtype)
+        factors = torch.tensor(self.frequencies, dtype=dtype).repeat_interleave(self.widths[0])
+        weights, bias = self.layout.layers(theta)[0]  # views of theta
+        weights *= factors[:, None]
+        bias *= factors
+        return theta
 
     def value(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return f, of shape (N,), at points x, of shape (N, 3)."""

@@ -11,7 +11,6 @@ networks for shape reconstruction are ``Siren((32, 32, 32))``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -41,12 +40,7 @@ class Siren:
 
     def initial(self, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return smooth starting parameters, of shape (p,): uniform within 1/sqrt(fan-in), as the paper starts."""
-        layers = []
-        for out, into in self.layout.shapes:
-            bound = 1.0 / math.sqrt(into)
-            weights = torch.rand(out, into + 1, generator=generator, dtype=dtype) * (2 * bound) - bound
-            layers.append((weights[:, :-1], weights[:, -1]))
-        return self.layout.flatten(layers)
+        return self.layout.uniform(generator, dtype)
 
     def value(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return f, of shape (N,), at points x, of shape (N, 3)."""
