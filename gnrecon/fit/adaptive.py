@@ -22,17 +22,11 @@ from gnrecon.fit.detail import fit_detail
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.fit.smoothness import global_length
-from gnrecon.fit.start import Spectrum
+from gnrecon.fit.smoothness import global_length, smooth_spectrum
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Solution
 
 COARSE_POINTS, COARSE_UNITS = 5000, 1000
-DEGREES_OF_FREEDOM = 12.0
-"""Of the global features' spectrum: smooth."""
-
-SPACINGS = 4.0
-"""Least length of the global field's features, in spacings of the points that it sees: shorter ones oscillate."""
 
 HELD_SHARE, HELD_MOST = 6, 2000
 """One point in so many is left out of the global field, up to so many."""
@@ -66,8 +60,7 @@ def fit_adaptive(
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
     field = Siren((COARSE_UNITS,))
-    length = max(global_length(samples, held, scene, rng.spawn(1)[0]), SPACINGS * scene.coarse.spacing)
-    spectrum = Spectrum(length, DEGREES_OF_FREEDOM)
+    spectrum = smooth_spectrum(global_length(samples, held, scene, rng.spawn(1)[0]), scene)
     linear = replace(options, widths=field.widths, steps=0)
     fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())

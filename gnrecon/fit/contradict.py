@@ -21,7 +21,8 @@ from gnrecon.fit.loss import distance_term
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.fit.start import Spectrum, wide_start
+from gnrecon.fit.smoothness import LENGTHS, smooth_spectrum
+from gnrecon.fit.start import wide_start
 from gnrecon.fit.terms import Term
 from gnrecon.residuals.first_order import interface
 
@@ -29,9 +30,6 @@ CLEARLY = -0.5
 """Slope along a normal below which the field contradicts it; one that agrees has 1."""
 
 UNITS = 500
-LENGTH, SPACINGS, DEGREES_OF_FREEDOM = 0.25, 4.0, 12.0
-"""Of the features: their length in radii, and at least in spacings, and how smooth they are."""
-
 ROUNDS = 3
 OWN = 2
 """Tells this chance from the fit's own, which has the same seed, so that normals that stay leave the fit as it is."""
@@ -68,8 +66,7 @@ def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Gen
     def terms(x: torch.Tensor, distance: torch.Tensor, most: int) -> list[Term]:
         return [Term("interface", interface, scene.points[:most], None, 1.0), distance_term(scene, x, distance)]
 
-    length = max(LENGTH, SPACINGS * scene.coarse.spacing)
-    theta = wide_start(field, scene, terms, rng, Spectrum(length, DEGREES_OF_FREEDOM))
+    theta = wide_start(field, scene, terms, rng, smooth_spectrum(min(LENGTHS), scene))
     sdf = NeuralSDF(field, theta, samples.frame, scene.box)
     slopes: Float = np.einsum("ij,ij->i", sdf.gradient(samples.frame.to_world(samples.points)), samples.normals)
     return slopes

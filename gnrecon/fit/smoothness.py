@@ -12,13 +12,17 @@ import numpy as np
 import torch
 
 from gnrecon.cloud import Samples
-from gnrecon.field.features import Features
+from gnrecon.field.features import DEGREES_OF_FREEDOM, Features
 from gnrecon.fit.choose import Mask
 from gnrecon.fit.patch import Patch, PatchSystem
 from gnrecon.fit.scene import Scene
+from gnrecon.fit.start import Spectrum
 
 LENGTHS = (0.25, 0.5, 1.0)
 """Lengths to choose from, in radii."""
+
+SPACINGS = 4.0
+"""Least length of a global field's features, in spacings of the points that it sees: shorter ones oscillate."""
 
 ALIKE = 0.01
 """Share by which a longer one may predict worse than the best."""
@@ -29,6 +33,14 @@ POSITION, ANGLE = 0.1, 0.1
 
 SIZE = 1.0
 """Standard deviation of the field, in radii."""
+
+
+def smooth_spectrum(length: float, scene: Scene) -> Spectrum:
+    """Return the spectrum of a global field's features of a length in radii, or longer where points are few.
+
+    It is that of the detail's features, with which the length is chosen, too.
+    """
+    return Spectrum(max(length, SPACINGS * scene.coarse.spacing), DEGREES_OF_FREEDOM)
 
 
 def global_length(samples: Samples, held: Mask, scene: Scene, rng: np.random.Generator) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gnrecon.errors import FitError
 from gnrecon.field import Siren
-from gnrecon.fit.adaptive import DEGREES_OF_FREEDOM
+from gnrecon.field.features import DEGREES_OF_FREEDOM
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.start import COARSE, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.terms import Term
