@@ -13,10 +13,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.ingest.spacing import mean_distances
+
 Float = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
-_NEIGHBOURS = 8
 _WIDTH = 0.75
 """Of the kernel, in mean distances of a point to its nearest neighbours."""
 
@@ -31,13 +32,10 @@ def consistent_normals(points: Float, normals: Float) -> Float:
     points : array of shape (N, 3), distinct, samples of a closed surface; at most a few thousand
     normals : array of shape (N, 3), of unit length, a first guess, such as that of `gauss`
     """
-    from scipy.spatial import cKDTree
-
     scaled = points / np.abs(points).max()
-    k = min(_NEIGHBOURS, len(points) - 1)
-    apart = cKDTree(scaled).query(scaled, k + 1)[0][:, 1:].mean(axis=1)
+    apart, count = mean_distances(scaled)
     field = _Winding(scaled.astype(np.float32), (_WIDTH * apart).astype(np.float32))
-    mu = (normals * (np.pi / k * apart**2)[:, None]).astype(np.float32)
+    mu = (normals * (np.pi / count * apart**2)[:, None]).astype(np.float32)
     for _ in range(_ROUNDS):
         downhill = field.back(0.5 - field.at_points(mu))
         change = field.at_points(downhill)

@@ -16,10 +16,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.ingest.spacing import mean_distances
+
 Float = npt.NDArray[np.float64]
 
 _ALPHA = 2.0
-_NEIGHBOURS = 8
 
 
 def gauss_normals(points: Float) -> Float:
@@ -30,10 +31,8 @@ def gauss_normals(points: Float) -> Float:
     points : array of shape (N, 3), distinct, samples of a closed surface
     """
     from scipy.linalg import cho_factor, cho_solve
-    from scipy.spatial import cKDTree
 
-    k = min(_NEIGHBOURS, len(points) - 1)
-    width = cKDTree(points).query(points, k + 1)[0][:, 1:].mean(axis=1)
+    width, _ = mean_distances(points)
     offsets = points[None, :, :] - points[:, None, :]
     distances = np.maximum(np.linalg.norm(offsets, axis=2), width[:, None])
     A = (offsets / (4 * np.pi * distances**3)[:, :, None]).reshape(len(points), -1)

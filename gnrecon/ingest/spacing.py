@@ -1,4 +1,4 @@
-"""The typical distance between neighbouring points."""
+"""The distances between neighbouring points: of each, and what is typical of all."""
 
 from __future__ import annotations
 
@@ -26,6 +26,18 @@ def neighbour_spacing(points: Float) -> float:
     so is hardly moved by pairs of close points; `points` has shape (N, 3), N > 8.
     """
     return float(np.median(_distances(points, _NEIGHBOURS)[:, -1]) * np.sqrt(np.pi / _NEIGHBOURS))
+
+
+def mean_distances(points: Float) -> tuple[Float, int]:
+    """Return the mean distance of each point to its nearest others, of shape (N,), and their number: 8, or all.
+
+    `points` has shape (N, 3), N > 1, with coordinates about the origin.
+    """
+    from scipy.spatial import cKDTree
+
+    count = min(_NEIGHBOURS, len(points) - 1)
+    distances: Float = cKDTree(points).query(points, count + 1)[0][:, 1:]
+    return distances.mean(axis=1), count
 
 
 def _distances(points: Float, count: int) -> Float:
