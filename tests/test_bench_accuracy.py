@@ -16,7 +16,7 @@ from rich.console import Console
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 from benchmarks.__main__ import main as bench
-from benchmarks.accuracy.cases import CASES, GROUPS, HARD, chosen_cases
+from benchmarks.accuracy.cases import CASES, GROUPS, HARD
 from benchmarks.accuracy.main import main
 from benchmarks.accuracy.scans import AnalyticScan, tilted, unit
 from benchmarks.accuracy.solids import SOLIDS
@@ -25,6 +25,7 @@ from benchmarks.accuracy.table import accuracy_table, failures
 from benchmarks.alone import run_program
 from benchmarks.arrays import load_scan, load_truth, save_mesh, save_scan, save_truth
 from benchmarks.comparison import Protocol
+from benchmarks.groups import chosen_cases
 from benchmarks.methods import METHODS, OURS, PEERS
 from benchmarks.peers import oriented
 from benchmarks.problem import Problem
@@ -147,13 +148,13 @@ def test_every_analytic_case_can_be_drawn(name: str) -> None:
 
 
 def test_groups_and_names_choose_cases_once() -> None:
-    assert list(chosen_cases(["noisy", "plate", "noisy"])) == ["plate", *GROUPS["noisy"]]
-    assert list(chosen_cases(["clean", "noisy", "sparse"])) == list(GROUPS["analytic"])
+    assert list(chosen_cases(["noisy", "plate", "noisy"], GROUPS)) == ["plate", *GROUPS["noisy"]]
+    assert list(chosen_cases(["clean", "noisy", "sparse"], GROUPS)) == list(GROUPS["analytic"])
     assert {len(GROUPS[name]) for name in ("srb", "vipss")} == {6, 2}
-    assert set(chosen_cases(GROUPS)) == set(CASES)
+    assert set(chosen_cases(GROUPS, GROUPS)) == set(CASES)
     assert set(HARD).isdisjoint(GROUPS["clean"])
     with pytest.raises(UsageError, match="no case 'teapot'"):
-        chosen_cases(["teapot"])
+        chosen_cases(["teapot"], GROUPS)
 
 
 def test_the_files_truths_have_their_genus_and_bare_scans_no_normals(shared_data: Path) -> None:

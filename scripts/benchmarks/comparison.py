@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -18,6 +18,7 @@ from benchmarks.methods import OURS, PEERS
 from benchmarks.problem import Case, Problem
 from benchmarks.table import FIGURES
 from benchmarks.trial import Job, run_trial
+from gnrecon.options import Options
 
 FITS = {"gnrecon": {}, "Adam": {"optimiser": "adam"}, "L-BFGS": {"optimiser": "lbfgs"}}
 """Options of our own methods, beside those of the protocol."""
@@ -43,6 +44,18 @@ class Protocol:
     filter_scales: tuple[float, ...] = (2.0, 4.0)
     options: dict[str, Any] = field(default_factory=dict)
     limit: float | None = None
+
+    def at_quality(self, quality: str | None) -> Protocol:
+        """Return the same with gnrecon's own dial between time and accuracy at a name; None leaves it where it is.
+
+        Raises
+        ------
+        UsageError
+            When gnrecon refuses the options, so that it is told before all trials and not by each of them.
+        """
+        options = self.options if quality is None else self.options | {"quality": quality}
+        Options.of(**options)
+        return replace(self, options=options)
 
     def contestants(self, methods: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
         """Return the methods with their settings, one pair a trial."""

@@ -5,15 +5,14 @@ Lengths of the analytic scans are in radii, angles in degrees; see `scans.Analyt
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.accuracy.files import BareScan, RangeScan
 from benchmarks.accuracy.scans import AnalyticScan
 from benchmarks.cases import CASES as PAPER
+from benchmarks.groups import cases_of
 from benchmarks.problem import Case, Problem
-from gnrecon.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -88,26 +87,6 @@ GROUPS: dict[str, dict[str, Case]] = {
 }
 """Names that stand for several cases; `analytic` for the last three together."""
 
-CASES = {name: case for group in GROUPS.values() for name, case in group.items()}
+CASES = cases_of(GROUPS)
 HARD = {*NOISY, *SPARSE}
 """The cases in which gnrecon is to be better than its best peer."""
-
-
-def chosen_cases(names: Iterable[str]) -> dict[str, Case]:
-    """Return the cases that names of cases and of groups stand for, each once, in the order of the tables.
-
-    Raises
-    ------
-    UsageError
-        When a name is neither.
-    """
-    wanted: set[str] = set()
-    for name in names:
-        if name not in GROUPS and name not in CASES:
-            raise UsageError(f"There is no case {name!r}; the groups are {', '.join(GROUPS)}, the cases {_listed()}.")
-        wanted |= set(GROUPS.get(name, [name]))
-    return {name: case for name, case in CASES.items() if name in wanted}
-
-
-def _listed() -> str:
-    return ", ".join(map(repr, CASES))

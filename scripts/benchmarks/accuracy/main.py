@@ -5,18 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from rich.console import Console
 
-from benchmarks.accuracy.cases import CASES, GROUPS, chosen_cases
+from benchmarks.accuracy.cases import CASES, GROUPS
 from benchmarks.accuracy.sheet import PANEL, sheet_row
 from benchmarks.accuracy.summary import standing, summarise
 from benchmarks.accuracy.table import accuracy_table, failures
 from benchmarks.comparison import Protocol, problems_of, run_case
+from benchmarks.groups import chosen_cases
 from benchmarks.methods import METHODS
 from benchmarks.paper import lasting, positive, require_folders
 from benchmarks.problem import Case
@@ -24,7 +25,6 @@ from benchmarks.provenance import REPOSITORY, provenance
 from benchmarks.sheet import Pixels, draw_row, write_sheet
 from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode
-from gnrecon.options import Options
 
 DATA = REPOSITORY.parent / "shared/data"
 LIMIT = 3600.0
@@ -47,14 +47,11 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
         When a case or the quality is unknown.
     """
     chosen = _parser().parse_args(arguments)
-    protocol = protocol or Protocol(limit=LIMIT)
-    if chosen.quality is not None:
-        protocol = replace(protocol, options=protocol.options | {"quality": chosen.quality})
-    Options.of(**protocol.options)  # what gnrecon refuses is to be told now, not by each of its trials
+    protocol = (protocol or Protocol(limit=LIMIT)).at_quality(chosen.quality)
     require_folders(chosen.json, chosen.picture)
-    cases = chosen_cases(chosen.cases)
+    cases = chosen_cases(chosen.cases, GROUPS)
     for case in cases.values():
-        case.problem(chosen.data, 0)  # and so is a missing file
+        case.problem(chosen.data, 0)  # a missing file is to be told now, not after the cases before it
     report = provenance("accuracy", arguments)
     report |= {"protocol": asdict(protocol), "seeds": list(range(chosen.repeat)), "summary": [], "trials": []}
     console = Console(highlight=False, width=WIDTH)

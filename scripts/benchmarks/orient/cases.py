@@ -5,6 +5,7 @@ from __future__ import annotations
 from benchmarks.accuracy.cases import SRB, VIPSS, Within
 from benchmarks.accuracy.files import RangeScan
 from benchmarks.accuracy.scans import AnalyticScan
+from benchmarks.groups import cases_of
 from benchmarks.problem import Case
 
 FILES: dict[str, Case] = {
@@ -26,5 +27,5 @@ ANALYTIC: dict[str, Case] = {
     "block, hole": AnalyticScan("block", 3000, hole=0.3),
 }
 GROUPS = {"files": FILES, "analytic": ANALYTIC}
-CASES = FILES | ANALYTIC
+CASES = cases_of(GROUPS)
 """Where a scan has normals, they are the truth and are thrown away."""

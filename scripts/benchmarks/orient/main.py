@@ -16,14 +16,14 @@ from rich.table import Table
 from benchmarks.accuracy.main import DATA, LIMIT
 from benchmarks.accuracy.summary import summarise
 from benchmarks.comparison import Protocol, run_case
-from benchmarks.orient.cases import CASES, GROUPS
+from benchmarks.groups import chosen_cases
+from benchmarks.orient.cases import GROUPS
 from benchmarks.orient.sides import sides
 from benchmarks.paper import lasting, require_folders
 from benchmarks.problem import Problem
 from benchmarks.provenance import provenance
 from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, UsageError
-from gnrecon.options import Options
+from gnrecon.errors import ExitCode
 
 WIDTH = 160
 
@@ -41,12 +41,9 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
         When a case or the quality is unknown.
     """
     chosen = _parser().parse_args(arguments)
-    protocol = protocol or Protocol(limit=LIMIT)
-    if chosen.quality is not None:
-        protocol = replace(protocol, options=protocol.options | {"quality": chosen.quality})
-    Options.of(**protocol.options)
+    protocol = (protocol or Protocol(limit=LIMIT)).at_quality(chosen.quality)
     require_folders(chosen.json)
-    problems = {name: CASES[name].problem(chosen.data, 0) for name in _chosen(chosen.cases)}
+    problems = {name: case.problem(chosen.data, 0) for name, case in chosen_cases(chosen.cases, GROUPS).items()}
     report: dict[str, Any] = provenance("orient", arguments) | {"cases": []}
     for name, problem in problems.items():
         found = {"case": name} | sides(problem)
@@ -113,16 +110,6 @@ def _told(value: float | None, form: str) -> str:
 
 def _ratio(ours: float | None, other: float | None) -> str:
     return "-" if ours is None or not other else f"{ours / other:.2f}"
-
-
-def _chosen(names: Sequence[str]) -> list[str]:
-    wanted: set[str] = set()
-    for name in names:
-        if name not in GROUPS and name not in CASES:
-            known = ", ".join([*GROUPS, *map(repr, CASES)])
-            raise UsageError(f"There is no case {name!r}; the groups and cases are {known}.")
-        wanted |= set(GROUPS.get(name, [name]))
-    return [name for name in CASES if name in wanted]
 
 
 def _parser() -> argparse.ArgumentParser:
