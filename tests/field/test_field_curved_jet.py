@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from dense_rows import dense
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -13,7 +14,6 @@ from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import ACTIVATIONS, SINE, Network, Siren
 from gnrecon.field.activation import indices
-from gnrecon.linalg import LayerRows
 
 DEPTHS = [(5,), (1,), (4, 3), (3, 5, 4)]
 EXACT = {"rtol": 1e-9, "atol": 1e-9}
@@ -50,15 +50,6 @@ def draw(seed: int, name: str, widths: tuple[int, ...], count: int = 5) -> tuple
     network = Network(widths, kind, (1.0,) * kind.inputs)
     theta = 0.7 * torch.randn(network.layout.count, generator=generator, dtype=torch.float64)
     return network, theta, torch.randn(count, 3, generator=generator, dtype=torch.float64)
-
-
-def dense(layers: list[LayerRows]) -> Tensor:
-    blocks = []
-    for layer in layers:
-        block = layer.left.new_full((len(layer.left), layer.size), torch.nan)
-        layer.write(block)
-        blocks.append(block)
-    return torch.cat(blocks, dim=1)
 
 
 @each_activation

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from dense_rows import dense
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
-from gnrecon.field.jet import LayerRows
 from gnrecon.field.siren import batches
 
 DEPTHS = [(7,), (1,), (5, 8), (8, 5), (6, 4, 7), (3, 9, 2)]
@@ -39,16 +39,6 @@ def draw(seed: int, widths: tuple[int, ...], count: int = 6) -> tuple[Siren, Ten
     field = Siren(widths)
     theta = torch.randn(field.layout.count, generator=generator, dtype=torch.float64)
     return field, theta, torch.randn(count, 3, generator=generator, dtype=torch.float64), generator
-
-
-def dense(layers: list[LayerRows]) -> Tensor:
-    """All columns of the rows, in theta's order."""
-    blocks = []
-    for layer in layers:
-        block = layer.left.new_full((len(layer.left), layer.size), torch.nan)
-        layer.write(block)
-        blocks.append(block)
-    return torch.cat(blocks, dim=1)
 
 
 def autodiff_rows(widths: tuple[int, ...], theta: Tensor, x: Tensor, by_value: Tensor, by_gradient: Tensor) -> Tensor:
