@@ -14,6 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.errors import MeshError, UsageError
+from gnrecon.export.between import between
+from gnrecon.export.meshlab import from_meshlab, to_meshlab
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
@@ -59,11 +61,7 @@ def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30
         raise UsageError(f"The number of faces is {faces}, but a closed mesh has at least {FEWEST}.")
     if len(mesh.faces) <= faces:
         return mesh
-    import pymeshlab
-
-    centre, size = centre_and_size(mesh)
-    work = pymeshlab.MeshSet(verbose=False)
-    work.add_mesh(pymeshlab.Mesh((mesh.vertices - centre) / size, mesh.faces.astype(np.int32)))
+    work = to_meshlab(mesh)
     work.meshing_decimation_quadric_edge_collapse(
         targetfacenum=faces,
         qualitythr=0.5,
@@ -72,8 +70,7 @@ def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30
         planarquadric=True,
         autoclean=False,
     )
-    result = work.current_mesh()
-    fewer = Mesh(centre + size * result.vertex_matrix(), result.face_matrix().astype(np.int64))
+    fewer = from_meshlab(work, mesh)
     return project(settled(creased(fewer, field, angle), fewer.vertices, field, angle).mesh(), field)
 
 
@@ -105,7 +102,7 @@ def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
         raise UsageError(f"The tolerance is {tolerance} file units, but must be positive.")
     distance = tolerance
     for _ in range(ATTEMPTS):
-        simple = _collapsed(mesh, distance)
+        simple = collapsed(mesh, distance)
         moved = max(_farthest(mesh, simple), _farthest(simple, mesh))
         if moved <= tolerance:
             return Mesh(simple.vertices, simple.faces, unit(field.gradient(simple.vertices)))
@@ -113,7 +110,14 @@ def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
     raise MeshError(f"The surface would have moved by {moved:.3g}.")
 
 
-def _collapsed(mesh: Mesh, tolerance: float) -> Mesh:
+def collapsed(mesh: Mesh, tolerance: float) -> Mesh:
+    """Return a mesh as manifold3d simplifies it, by collapses of a tolerance each, in the unit of the vertices.
+
+    Raises
+    ------
+    MeshError
+        When nothing is left of it.
+    """
     _, size = centre_and_size(mesh)
     solid = to_solid(mesh, merge=False).simplify(tolerance / size)
     error = refusal(solid)
@@ -124,7 +128,5 @@ def _collapsed(mesh: Mesh, tolerance: float) -> Mesh:
 
 def _farthest(one: Mesh, other: Mesh) -> float:
     """Greatest distance to a mesh from another one's vertices, edge midpoints and face centres."""
-    corners = other.corners
-    sides = 0.5 * (corners + np.roll(corners, 1, axis=1))
-    points = np.concatenate([other.vertices, corners.mean(axis=1), sides.reshape(-1, 3)])
+    points = np.concatenate([other.vertices, between(other.corners)])
     return float(nearest_on_surface(one, points)[0].max())

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.export.solid import centre_and_size, refusal, to_solid
+from gnrecon.export.meshlab import to_meshlab
+from gnrecon.export.solid import refusal, to_solid
 from gnrecon.export.verify import MeshFacts, failures, verify
 from gnrecon.mesh import Mesh
 
@@ -98,14 +99,10 @@ def self_intersecting_faces(mesh: Mesh) -> int:
 
     Coordinates must be finite. Time grows with the number of faces: about 3 s for a million.
     """
-    import pymeshlab
-
     proper = mesh.faces[~_names_twice(mesh)]
     if not len(proper):
         return 0
-    centre, size = centre_and_size(mesh)
-    work = pymeshlab.MeshSet(verbose=False)
-    work.add_mesh(pymeshlab.Mesh((mesh.vertices - centre) / size, proper.astype(np.int32)))
+    work = to_meshlab(Mesh(mesh.vertices, proper))
     work.compute_selection_by_self_intersections_per_face()
     return int(work.current_mesh().selected_face_number())
 

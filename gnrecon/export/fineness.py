@@ -17,6 +17,7 @@ import numpy as np
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
+from gnrecon.export.between import between
 from gnrecon.export.project import project, side_lengths
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.mesh import Int, Mesh
@@ -120,8 +121,7 @@ def chord_error(mesh: Mesh, field: SignedDistance, bounds: Float, cell: float) -
     corners = corners[inner]
     if not len(corners):
         return 0.0
-    midpoints = (corners + np.roll(corners, -1, axis=1)) / 2
-    points = np.concatenate([corners.mean(axis=1), midpoints.reshape(-1, 3)])
+    points = between(corners)
     slopes = np.linalg.norm(field.gradient(points), axis=1)
     distances = np.abs(field.sdf(points)) / np.maximum(slopes, np.finfo(np.float64).tiny)
     return float(np.quantile(distances, QUANTILE, method="higher"))

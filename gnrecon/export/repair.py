@@ -16,7 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.errors import MeshError
-from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
+from gnrecon.export.meshlab import from_meshlab, to_meshlab
+from gnrecon.export.solid import from_solid, refusal, to_solid
 from gnrecon.export.topology import Edges, Mask, corner_fans, split_vertices, submesh
 from gnrecon.export.verify import require_sound, verify
 from gnrecon.mesh import Mesh
@@ -150,9 +151,7 @@ def _patch(mesh: Mesh) -> tuple[Mesh, list[str]]:
     """Cut crowded edges, close small holes and orient the faces with pymeshlab."""
     import pymeshlab
 
-    centre, size = centre_and_size(mesh)
-    work = pymeshlab.MeshSet(verbose=False)
-    work.add_mesh(pymeshlab.Mesh((mesh.vertices - centre) / size, mesh.faces.astype(np.int32)))
+    work = to_meshlab(mesh)
     work.meshing_remove_duplicate_vertices()
     work.meshing_remove_duplicate_faces()
     work.meshing_repair_non_manifold_edges(method="Split Vertices")
@@ -162,8 +161,7 @@ def _patch(mesh: Mesh) -> tuple[Mesh, list[str]]:
         work.meshing_close_holes(maxholesize=HOLE, selfintersection=False)
     except pymeshlab.PyMeshLabException as error:
         raise MeshError(f"The mesh could not be repaired: pymeshlab says {error}.") from error
-    result = work.current_mesh()
-    patched = Mesh(centre + size * result.vertex_matrix(), result.face_matrix().astype(np.int64))
+    patched = from_meshlab(work, mesh)
     before, after = verify(mesh), verify(patched)
     return patched, [
         f"Patched with pymeshlab: {before.boundary_edges} open, {before.crowded_edges} crowded and "

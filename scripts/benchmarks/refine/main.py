@@ -18,6 +18,10 @@ from benchmarks.refine.shapes import SHAPES
 from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode
 from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
+from gnrecon.export.between import between
+from gnrecon.export.decimate import collapsed
+from gnrecon.export.meshlab import from_meshlab, to_meshlab
+from gnrecon.export.solid import centre_and_size
 from gnrecon.fit import NeuralSDF
 from gnrecon.mesh import Mesh
 
@@ -71,7 +75,7 @@ def compare(name: str, field: SignedDistance, length: float, cells: int) -> list
         "remeshed by gnrecon": ours(RefineOptions(remesh=length)),
         "collapsed by pymeshlab": lambda given: pymeshlab_collapse(given, faces),
         "fewer faces by gnrecon": ours(RefineOptions(faces=faces)),
-        "simplified by manifold3d": lambda given: manifold_simplify(given, cell / 4),
+        "simplified by manifold3d": lambda given: collapsed(given, cell / 4),
         "simplified by gnrecon": ours(RefineOptions(simplify=cell / 4)),
     }
     return [{"field": name, "method": method} | measured(work, mesh, field) for method, work in methods.items()]
@@ -83,14 +87,12 @@ def measured(work: Work, mesh: Mesh, field: SignedDistance) -> dict[str, Any]:
     made = work(mesh)
     seconds = time.process_time() - begin
     angles = quality(made).angle_degrees
-    corners = made.vertices[made.faces]
-    between = np.concatenate([corners.mean(axis=1), (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2])
     return {
         "faces": len(made.faces),
         "least_angle": angles["min"],
         "angle_p1": angles["p1"],
         "vertices_off": float(np.abs(field.sdf(made.vertices)).max()),
-        "between_off": float(np.abs(field.sdf(between)).max()),
+        "between_off": float(np.abs(field.sdf(between(made.corners))).max()),
         "cpu_seconds": seconds,
     }
 
@@ -99,9 +101,11 @@ def pymeshlab_remesh(mesh: Mesh, length: float) -> Mesh:
     """Remesh by pymeshlab's isotropic explicit remeshing, ten iterations, features of 30 degrees kept."""
     import pymeshlab
 
+    _, size = centre_and_size(mesh)
+
     def work(meshes: Any) -> None:
-        size = pymeshlab.PureValue(length)
-        meshes.meshing_isotropic_explicit_remeshing(iterations=10, targetlen=size, featuredeg=30)
+        target = pymeshlab.PureValue(length / size)
+        meshes.meshing_isotropic_explicit_remeshing(iterations=10, targetlen=target, featuredeg=30)
 
     return _by_pymeshlab(mesh, work)
 
@@ -115,23 +119,9 @@ def pymeshlab_collapse(mesh: Mesh, faces: int) -> Mesh:
 
 
 def _by_pymeshlab(mesh: Mesh, work: Callable[[Any], None]) -> Mesh:
-    import pymeshlab
-
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
+    meshes = to_meshlab(mesh)
     work(meshes)
-    result = meshes.current_mesh()
-    return Mesh(result.vertex_matrix(), result.face_matrix().astype(np.int64))
-
-
-def manifold_simplify(mesh: Mesh, tolerance: float) -> Mesh:
-    """Simplify by manifold3d within a tolerance."""
-    import manifold3d
-
-    arrays = mesh.vertices.astype(np.float64), mesh.faces.astype(np.uint64)
-    solid = manifold3d.Manifold(manifold3d.Mesh64(*arrays)).simplify(tolerance)
-    result = solid.to_mesh64()
-    return Mesh(np.array(result.vert_properties)[:, :3], np.array(result.tri_verts).astype(np.int64))
+    return from_meshlab(meshes, mesh)
 
 
 def table(figures: Sequence[dict[str, Any]]) -> Table:
