@@ -151,7 +151,10 @@ Quality = Annotated[
 ]
 NormalResidual = Annotated[
     str,
-    typer.Option(help="Residual of the normals: vector, projection or cosine.", rich_help_panel=FIT),
+    typer.Option(
+        help="Residual of the normals: vector, projection, cosine, or one that another package brings.",
+        rich_help_panel=FIT,
+    ),
 ]
 Optimiser = Annotated[
     str,

@@ -9,7 +9,16 @@ from rich.console import Console
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.files import require_files
-from gnrecon.io import CLOUD_WRITERS, WRITERS, holds, read_any, write_cloud, write_mesh, written_origin
+from gnrecon.io import (
+    CLOUD_WRITERS,
+    holds,
+    read_any,
+    unverified,
+    writable,
+    write_cloud,
+    write_mesh,
+    written_origin,
+)
 from gnrecon.io.losses import losses
 from gnrecon.io.origin import told
 from gnrecon.mesh import Mesh
@@ -31,9 +40,9 @@ def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool 
     """
     require_files([source], [target], overwrite)
     extension = target.suffix.lower()
-    if extension not in WRITERS and extension not in CLOUD_WRITERS:
-        known = ", ".join(suffix[1:] for suffix in dict.fromkeys([*WRITERS, *CLOUD_WRITERS]))
-        raise UsageError(f"A file cannot be written as {extension or 'one without an extension'!r}; use {known}.")
+    if extension not in (known := dict.fromkeys([*writable(), *CLOUD_WRITERS])):
+        named = ", ".join(suffix[1:] for suffix in known)
+        raise UsageError(f"A file cannot be written as {extension or 'one without an extension'!r}; use {named}.")
     found, unread = read_any(source)
     sentences = [f"{source} holds what is not read: {', '.join(unread)}."] if unread else []
     console = Console(stderr=True, quiet=quiet)
@@ -49,11 +58,12 @@ def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]
     def compare(path: Path) -> None:
         lost.extend(losses(found, read_any(path)[0]))
 
-    if isinstance(found, Mesh) and target.suffix.lower() in WRITERS:
+    if isinstance(found, Mesh) and target.suffix.lower() in writable():
         unheld = [name for name, values in found.attributes.items() if not holds(target, name, values)]
         write_mesh(found, target, overwrite, compare)
         origin = written_origin(found, target)
         lost += [] if origin is None else [told(origin)]
+        lost += unverified(target)
         lost += [f"The format has no place for {', '.join(unheld)} of the vertices; PLY has."] if unheld else []
     else:
         cloud = PointCloud(found.vertices, found.normals, found.attributes) if isinstance(found, Mesh) else found
@@ -62,6 +72,6 @@ def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]
 
 
 def _summary(found: Mesh | PointCloud, target: Path) -> str:
-    if isinstance(found, Mesh) and target.suffix.lower() in WRITERS:
+    if isinstance(found, Mesh) and target.suffix.lower() in writable():
         return f"{target}: {len(found.vertices)} vertices, {len(found.faces)} faces."
     return f"{target}: {len(found.vertices if isinstance(found, Mesh) else found.points)} points."

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
+from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.terms import Term
 from gnrecon.residuals.first_order import eikonal, interface, signed_distance
@@ -27,14 +27,16 @@ NORMAL_REACH, LEAST_REACH = 0.4, 0.012
 EIKONAL_REACH = 0.05
 DISTANCE_ROW, DISTANCE_WEIGHT = 1e-4, 4e-4
 EIKONAL_COUNT = 3000
+LINEAR = ("vector", "projection")
+"""Residuals of normals that are linear in the field."""
 
 
 def start_terms(
     scene: Scene, options: FitOptions, rng: np.random.Generator, x: Tensor, distance: Tensor, most: int
 ) -> list[Term]:
     """Return the terms of a linear start: at most `most` data points, and volume samples x with their distances."""
-    # The start is a linear solve, and the cosine is not linear in f.
-    linear = replace(options, normals="vector") if options.normals == "cosine" else options
+    # The start is a linear solve, and other residuals than these two are not linear in f, or not known to be.
+    linear = options if options.normals in LINEAR else replace(options, normals="vector")
     return [*data_terms(scene, linear, rng, most), distance_term(scene, x, distance)]
 
 
@@ -74,7 +76,7 @@ def data_terms(
     beside = normal_weight(scene.coarse.spacing)
     return [
         Term("interface", interface, points, None, weight),
-        Term("normal", NORMAL_RESIDUALS[options.normals], points, normals, weight * beside),
+        Term("normal", normal_residual(options.normals), points, normals, weight * beside),
     ]
 
 

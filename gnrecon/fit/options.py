@@ -7,7 +7,10 @@ from typing import Any
 
 from gnrecon.errors import UsageError
 from gnrecon.linalg import SOLVERS
+from gnrecon.plugins import RESIDUALS, find, installed
 from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
+from gnrecon.residuals.named import named
+from gnrecon.residuals.second_order import SecondOrder
 
 NORMAL_RESIDUALS: dict[str, Residual] = {
     "vector": normal_vector,
@@ -40,7 +43,7 @@ class FitOptions:
         point from 1,000 to 2,000, and of one for four points from there to 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
         Features of the detail a cube, 300, 600 or 1,000, where there is detail.
-    normals : ``"vector"``, ``"projection"`` or ``"cosine"``
+    normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
         Residual of the given normals, see `gnrecon.residuals.first_order`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
         Gauss-Newton, or one of the methods that the paper compares with.
@@ -76,8 +79,7 @@ class FitOptions:
             raise UsageError(f"Network widths must be positive numbers, not {self.widths}.")
         if self.steps is not None and self.steps < 0:
             raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
-        if self.normals not in NORMAL_RESIDUALS:
-            raise UsageError(f"The normal residual must be one of {', '.join(NORMAL_RESIDUALS)}, not {self.normals!r}.")
+        normal_residual(self.normals)
         if self.quality not in QUALITIES:
             raise UsageError(f"The quality must be one of {', '.join(QUALITIES)}, not {self.quality!r}.")
         for name, known in (("optimiser", OPTIMISERS), ("solver", SOLVERS)):
@@ -126,3 +128,22 @@ class FitOptions:
     def as_dict(self) -> dict[str, Any]:
         """Return the options as plain values."""
         return asdict(self)
+
+
+def normal_residual(name: str) -> Residual:
+    """Return the residual of normals of a name: of this library, or of another package's ``gnrecon.residuals``.
+
+    Raises
+    ------
+    UsageError
+        When there is none, it cannot be loaded, or it needs second derivatives, which fits to scans do not have.
+    """
+    if name in NORMAL_RESIDUALS:
+        return NORMAL_RESIDUALS[name]
+    if find(RESIDUALS, name) is None:
+        known = [*NORMAL_RESIDUALS, *(one.entry.name for one in installed(RESIDUALS))]
+        raise UsageError(f"The normal residual must be one of {', '.join(known)}, not {name!r}.")
+    residual = named(name)
+    if isinstance(residual, SecondOrder):
+        raise UsageError(f"The residual {name!r} needs second derivatives, so that it cannot be that of normals.")
+    return residual

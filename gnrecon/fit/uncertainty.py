@@ -30,7 +30,7 @@ from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
 from gnrecon.fit.loss import normal_weight
-from gnrecon.fit.options import NORMAL_RESIDUALS, FitOptions
+from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
@@ -110,7 +110,7 @@ class Uncertainty:
         points, normals = (
             torch.as_tensor(values[chosen]).to(sdf.theta) for values in (samples.points, samples.normals)
         )
-        residual = NORMAL_RESIDUALS[sdf.options.get("normals", FitOptions.normals)]
+        residual = normal_residual(str(sdf.options.get("normals", FitOptions.normals)))
         weight = normal_weight(Density(samples.points).spacing)
         rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)

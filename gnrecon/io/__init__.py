@@ -3,10 +3,11 @@
 from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
 from gnrecon.io.objects import as_cloud, to_open3d, to_trimesh
+from gnrecon.io.plugged import readable, writable
 from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
 from gnrecon.io.scans import MOST_POINTS, Reading, cropped, read_scans
 from gnrecon.io.unpack import extension_of
-from gnrecon.io.write import check_writable, holds, write_cloud, write_mesh, written_origin
+from gnrecon.io.write import check_writable, holds, unverified, write_cloud, write_mesh, written_origin
 
 __all__ = [
     "CLOUD_WRITERS",
@@ -25,8 +26,11 @@ __all__ = [
     "read_mesh",
     "read_reference",
     "read_scans",
+    "readable",
     "to_open3d",
     "to_trimesh",
+    "unverified",
+    "writable",
     "write_cloud",
     "write_mesh",
     "write_text",

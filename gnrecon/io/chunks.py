@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from gnrecon.io.contents import Contents
-from gnrecon.io.formats import READERS
 from gnrecon.io.las import las_chunks, settled
+from gnrecon.io.plugged import reader_of
 from gnrecon.io.ply_chunks import ply_chunks
 from gnrecon.io.ptx import ptx_chunks
 from gnrecon.io.xyz_chunks import xyz_chunks
@@ -43,5 +43,5 @@ def chunks(path: Path, extension: str) -> Iterator[Contents]:
     """
     if extension in CHUNKED and path.stat().st_size >= LARGE:
         yield from CHUNKED[extension](path, ROWS)
-    else:
-        yield READERS[extension](path)
+    elif read := reader_of(extension):
+        yield read(path)

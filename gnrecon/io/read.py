@@ -12,6 +12,7 @@ from gnrecon.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.files import STANDARD_INPUT
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED
+from gnrecon.io.plugged import is_readable, readable, reader_of
 from gnrecon.io.unpack import extension_of, plain_file
 from gnrecon.mesh import Mesh
 
@@ -97,11 +98,12 @@ def extension_for(path: Path, format: str | None) -> str:
     UsageError
         When `format` is no supported one, or standard input is read without one.
     """
-    supported = ", ".join(suffix[1:] for suffix in READERS)
     if format is None and path == STANDARD_INPUT:
+        supported = ", ".join(suffix[1:] for suffix in readable())
         raise UsageError(f"Standard input has no extension: say with --format how to read it, as one of {supported}.")
     extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
-    if format is not None and extension not in READERS:
+    if format is not None and not is_readable(extension):
+        supported = ", ".join(suffix[1:] for suffix in readable())
         raise UsageError(f"The format {format!r} is not supported; expected one of {supported}.")
     return extension
 
@@ -111,7 +113,9 @@ def read_contents(path: Path, format: str | None) -> Contents:
     extension = extension_for(path, format)
     with reading(path), plain_file(path, extension) as file:
         check_file(file, extension)
-        contents = READERS[extension](file)
+        read = reader_of(extension)
+        assert read is not None, "check_file refuses what nothing reads"
+        contents = read(file)
         if not len(contents.points):
             raise InputError("the file holds no points.")
     return contents
@@ -154,9 +158,11 @@ def check_file(path: Path, extension: str) -> None:
         head = file.read(16)
     if not head.strip():
         raise InputError("the file is empty.")
-    if extension not in READERS:
-        supported = ", ".join(suffix[1:] for suffix in READERS)
+    if not is_readable(extension):
+        supported = ", ".join(suffix[1:] for suffix in readable())
         raise InputError(f"the extension {extension!r} is not supported; expected one of {supported}.")
+    if extension not in READERS:
+        return  # how files of other packages' formats begin is not known
     kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
     if kind == extension or {kind, extension} in SAME_BEGINNING or (kind == "ZIP archive" and extension in ZIPPED):
         return

@@ -13,8 +13,9 @@ from gnrecon.atomic import atomic_write
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import MeshError, UsageError
 from gnrecon.io.contents import no_faces
-from gnrecon.io.formats import CLOUD_WRITERS, HOLDS, WRITERS
+from gnrecon.io.formats import CLOUD_WRITERS, HOLDS
 from gnrecon.io.origin import far_origin, rounding, told
+from gnrecon.io.plugged import is_readable, writable, writer_of
 from gnrecon.mesh import Mesh
 
 _NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
@@ -31,7 +32,8 @@ def write_mesh(
     mesh : in file units
     path : target; its extension names the format
     overwrite : whether an existing file may be replaced
-    verify : called with the temporary file before it receives the target's name; what it raises prevents that
+    verify : called with the temporary file before it receives the target's name; what it raises prevents that. Not
+        called where nothing reads the format back, as it may be with those of other packages; a sentence says so
 
     Raises
     ------
@@ -42,22 +44,22 @@ def write_mesh(
     OutputError
         When the file cannot be written.
     """
-    extension = check_writable(path)
+    extension, write = _writer(path)
     if not len(mesh.faces):
         raise MeshError("The mesh has no faces, so there is nothing to write.")
     if not np.isfinite(mesh.vertices).all():
         raise MeshError("The mesh has vertices that are not finite, so it is not written.")
     if len(mesh.vertices) >= _INT32_LIMIT:
         raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices can name.")
-    held = {name: values for name, values in mesh.attributes.items() if HOLDS[extension](name, values)}
-    stored = _stored(mesh, path)
+    held = {name: values for name, values in mesh.attributes.items() if _holds(extension, name, values)}
+    stored, unread = _stored(mesh, path), unverified(path)
     try:
-        with atomic_write(path, overwrite, verify) as temporary:
-            WRITERS[extension](replace(mesh, attributes=held), temporary)
+        with atomic_write(path, overwrite, None if unread else verify) as temporary:
+            write(replace(mesh, attributes=held), temporary)
     except MeshError as error:
         # Rounding is then the likely reason.
         raise MeshError("; ".join([str(error).removesuffix("."), *stored]).removesuffix(".") + ".") from error
-    return _lost(mesh, held, extension) + stored
+    return _lost(mesh, held, extension) + stored + unread
 
 
 def write_cloud(
@@ -96,7 +98,7 @@ def holds(path: str | Path, name: str, values: npt.NDArray[np.generic]) -> bool:
     UsageError
         When the extension is no supported one.
     """
-    return HOLDS[check_writable(path)](name, values)
+    return _holds(check_writable(path), name, values)
 
 
 def written_origin(mesh: Mesh, path: str | Path) -> npt.NDArray[np.float64] | None:
@@ -110,15 +112,34 @@ def check_writable(path: str | Path) -> str:
     Raises
     ------
     UsageError
-        When the extension is no supported one.
+        When the extension is no supported one, or its writer, of another package, cannot be loaded.
     """
+    return _writer(path)[0]
+
+
+def unverified(path: str | Path) -> list[str]:
+    """Return a sentence where nothing reads the format that the path's extension names, so that it is not verified."""
     extension = Path(path).suffix.lower()
-    if extension not in WRITERS:
-        supported = ", ".join(suffix[1:] for suffix in WRITERS)
+    if is_readable(extension):
+        return []
+    return [f"{path} was not read back and verified, because nothing that is installed reads {extension[1:].upper()}."]
+
+
+def _writer(path: str | Path) -> tuple[str, Callable[[Mesh, Path], None]]:
+    """The extension of `path`, and what writes meshes so; the errors are those of `check_writable`."""
+    extension = Path(path).suffix.lower()
+    write = writer_of(extension)
+    if write is None:
+        supported = ", ".join(suffix[1:] for suffix in writable())
         raise UsageError(
             f"A mesh cannot be written as {extension or 'a file without an extension'!r}; use {supported}."
         )
-    return extension
+    return extension, write
+
+
+def _holds(extension: str, name: str, values: npt.NDArray[np.generic]) -> bool:
+    """Whether a format can hold an attribute; what other packages' formats hold is their own affair."""
+    return extension not in HOLDS or HOLDS[extension](name, values)
 
 
 def _lost(mesh: Mesh, held: Mapping[str, npt.NDArray[np.generic]], extension: str) -> list[str]:

@@ -12,6 +12,7 @@ from gnrecon.residuals.first_order import (
     signed_distance,
 )
 from gnrecon.residuals.formula import from_formula
+from gnrecon.residuals.named import named
 from gnrecon.residuals.second_order import (
     SecondOrder,
     clipped_strain,
@@ -31,6 +32,7 @@ __all__ = [
     "gauss_curvature",
     "interface",
     "mean_curvature",
+    "named",
     "normal_cosine",
     "normal_projection",
     "normal_vector",

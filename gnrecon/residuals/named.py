@@ -1,0 +1,96 @@
+"""Residuals by name: those of this library, and those that other packages bring.
+
+Another package's entry point in the group ``gnrecon.residuals`` names a function of values, gradients and targets that
+returns `Linearised`, or a `SecondOrder` one. What it returns is checked at each call, because a derivative of a wrong
+shape would otherwise fail far from its cause.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from gnrecon.errors import FitError, UsageError
+from gnrecon.plugins import RESIDUALS as GROUP
+from gnrecon.plugins import Plugin, find, installed
+from gnrecon.residuals.first_order import (
+    Linearised,
+    Residual,
+    design_region,
+    eikonal,
+    interface,
+    normal_cosine,
+    normal_projection,
+    normal_vector,
+    signed_distance,
+)
+from gnrecon.residuals.second_order import SecondOrder, gauss_curvature, mean_curvature, surface_strain
+
+RESIDUALS: dict[str, Residual | SecondOrder] = {
+    "interface": interface,
+    "design_region": design_region,
+    "signed_distance": signed_distance,
+    "normal_vector": normal_vector,
+    "normal_projection": normal_projection,
+    "normal_cosine": normal_cosine,
+    "eikonal": eikonal,
+    "mean_curvature": mean_curvature,
+    "gauss_curvature": gauss_curvature,
+    "surface_strain": surface_strain,
+}
+
+
+def named(name: str) -> Residual | SecondOrder:
+    """Return the residual of a name, of this library or of another package.
+
+    Raises
+    ------
+    UsageError
+        When there is none of that name, several packages offer it, or it cannot be loaded.
+    """
+    if name in RESIDUALS:
+        return RESIDUALS[name]
+    plugin = find(GROUP, name)
+    if plugin is None:
+        known = ", ".join([*RESIDUALS, *(one.entry.name for one in installed(GROUP))])
+        raise UsageError(f"There is no residual {name!r}; there are {known}.")
+    found = plugin.load()
+    return _second(plugin, found) if isinstance(found, SecondOrder) else _first(plugin, found)
+
+
+def _first(plugin: Plugin, residual: Residual) -> Residual:
+    def checked(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+        with plugin.guarded(FitError):
+            return _require(plugin, residual(value, gradient, target), len(value))
+
+    return checked
+
+
+def _second(plugin: Plugin, residual: SecondOrder) -> SecondOrder:
+    def checked(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | None) -> Linearised:
+        with plugin.guarded(FitError):
+            return _require(plugin, residual(value, gradient, hessian, target), len(value))
+
+    return SecondOrder(residual.name, checked)
+
+
+def _require(plugin: Plugin, found: object, count: int) -> Linearised:
+    """Refuse what is not linearised residuals of so many points.
+
+    Raises
+    ------
+    FitError
+        Naming the first thing that is wrong.
+    """
+    if not isinstance(found, Linearised):
+        raise FitError(f"{plugin.subject} returned {type(found).__name__}, but must return Linearised.")
+    rows = tuple(found.residual.shape)
+    if len(rows) != 2 or rows[0] != count:
+        raise FitError(f"{plugin.subject} returned residuals of shape {rows}, but ({count}, m) was expected.")
+    shapes = {"by_value": rows, "by_gradient": (*rows, 3), "by_hessian": (*rows, 3, 3)}
+    for name, expected in shapes.items():
+        part = getattr(found, name)
+        if part is not None and tuple(part.shape) != expected:
+            raise FitError(
+                f"{plugin.subject} returned {name} of shape {tuple(part.shape)}, but {expected} was expected."
+            )
+    return found
