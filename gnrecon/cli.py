@@ -17,7 +17,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from gnrecon.errors import ExitCode, GnreconError
+from gnrecon.errors import ExitCode, failure
 from gnrecon.version import __version__
 
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.
@@ -778,17 +778,10 @@ def _guarded(words: list[str], command: str) -> int:
         return request.exit_code
     except _CommandLineError as error:
         return _fail(error.format_message(), ExitCode.USAGE, words)
-    except GnreconError as error:
-        return _fail(str(error), error.exit_code, words)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("Interrupted; nothing was written.", ExitCode.INTERRUPTED, words)
-    except MemoryError as error:
-        return _fail(f"There is not enough memory. {error}".strip(), ExitCode.MEMORY, words)
-    except Exception as error:  # A fault of gnrecon itself: the user still gets one sentence, and a way to report it.
-        name = type(error).__name__
-        return _fail(
-            f"Unforeseen {name}: {error} Please report it with the output of --debug.", ExitCode.UNFORESEEN, words
-        )
+        return _fail(*failure(KeyboardInterrupt()), words)
+    except Exception as error:
+        return _fail(*failure(error), words)
 
 
 def _fail(sentence: str, code: ExitCode, words: list[str]) -> int:

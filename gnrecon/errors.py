@@ -72,3 +72,16 @@ class MemoryLimitError(GnreconError, MemoryError):
     """The work needs more memory than there is."""
 
     exit_code = ExitCode.MEMORY
+
+
+def failure(error: BaseException) -> tuple[str, ExitCode]:
+    """Return the sentence and the exit code that whatever ended a run is told by."""
+    if isinstance(error, GnreconError):
+        return str(error), error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return "Interrupted; nothing was written.", ExitCode.INTERRUPTED
+    if isinstance(error, MemoryError):
+        return f"There is not enough memory. {error}".strip(), ExitCode.MEMORY
+    # A fault of gnrecon itself: the user still gets one sentence, and a way to report it.
+    name = type(error).__name__
+    return f"Unforeseen {name}: {error} Please report it with the output of --debug.", ExitCode.UNFORESEEN

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 from gnrecon.atomic import atomic_write
 from gnrecon.errors import ExitCode, UsageError
-from gnrecon.export import render_sheet
+from gnrecon.export import render, render_sheet
 from gnrecon.files import require_files
 from gnrecon.io import check_writable, written_origin
 from gnrecon.optim import Record
@@ -39,6 +39,9 @@ STAGES = {
     "write": "Writing",
 }
 
+THUMBNAIL = (240, 180)
+"""Width and height of the small picture that an overview of many runs shows, in pixels."""
+
 
 @dataclass(frozen=True)
 class Files:
@@ -53,6 +56,7 @@ class Files:
     html: Path | None = None
     overwrite: bool = False
     format: str | None = None
+    thumbnail: Path | None = None
 
     def check(self) -> None:
         """Refuse before any work what would fail after it.
@@ -74,14 +78,22 @@ class Files:
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
         inputs = [path for path in (*self.scans, self.reference) if path is not None]
-        asked = (self.output, self.report, self.preview, self.model, self.html)
+        asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail)
         require_files(inputs, [path for path in asked if path is not None], self.overwrite)
 
 
 def run(
-    files: Files, options: dict[str, Any], *, command: str | None = None, quiet: bool = False, verbose: bool = False
+    files: Files,
+    options: dict[str, Any],
+    *,
+    command: str | None = None,
+    quiet: bool = False,
+    verbose: bool = False,
+    watcher: PipelineProgress | None = None,
 ) -> int:
-    """Reconstruct one scan and return the exit code; `command` is the line that asked for it, for the report.
+    """Reconstruct one scan and return the exit code.
+
+    `command` is the line that asked for it, for the report; a `watcher` is told of stages and steps in the bar's place.
 
     Raises
     ------
@@ -90,7 +102,7 @@ def run(
     """
     files.check()
     console = Console(stderr=True, quiet=quiet)
-    with shown(console, verbose) as progress:
+    with shown(console, verbose) if watcher is None else nullcontext(watcher) as progress:
         result = reconstruct(files.scans, reference=files.reference, format=files.format, progress=progress, **options)
         result.report["command"] = command
         progress.stage("write")
@@ -118,6 +130,9 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
         if files.preview is not None:
             picture = stack.enter_context(atomic_write(files.preview, files.overwrite))
             render_sheet(result.mesh, picture, points=result.cloud)
+        if files.thumbnail is not None:
+            small = stack.enter_context(atomic_write(files.thumbnail, files.overwrite))
+            render(result.mesh, small, size=THUMBNAIL)
         if files.model is not None:
             model = stack.enter_context(atomic_write(files.model, files.overwrite))
             result.sdf.save(model, overwrite=True)

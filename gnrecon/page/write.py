@@ -89,6 +89,11 @@ def page_text(report: Mapping[str, Any], mesh: Mesh, cloud: PointCloud | None = 
     )
 
 
+def style_text() -> str:
+    """Return the page's style sheet, for pages that are to look like it."""
+    return _verbatim("page.css")
+
+
 def _verbatim(name: str) -> Markup:
     return Markup((FOLDER / name).read_text(encoding="utf-8"))
 

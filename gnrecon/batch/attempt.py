@@ -1,0 +1,112 @@
+"""One attempt at a piece of work in a child process, within limits of time and memory.
+
+Memory is watched from outside, as the resident memory of the child and all that it has started: a limit of address
+space (``RLIMIT_AS``) would also count what torch and CUDA merely reserve.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from gnrecon.batch.children import WORK, Child, start_child
+from gnrecon.batch.job import Limits
+from gnrecon.batch.outcome import Cause, cause_of, describe_signal
+from gnrecon.errors import ExitCode
+
+LOOK = 0.1
+"""Seconds between two looks at a child."""
+
+
+@dataclass(frozen=True)
+class End:
+    """How an attempt ended.
+
+    Parameters
+    ----------
+    cause : why it failed; None where it went well
+    exit_code : of the child; None where it was ended for another reason than its memory
+    message : a sentence, where the child itself could not say one
+    peak_memory_mb : greatest resident memory that was seen, in MB of 10^6 bytes
+    """
+
+    cause: Cause | None
+    exit_code: int | None
+    message: str
+    peak_memory_mb: float
+
+
+def attempt(
+    argument: Mapping[str, Any],
+    *,
+    threads: int,
+    log: Path,
+    environment: Mapping[str, str],
+    limits: Limits,
+    stop: threading.Event | None = None,
+    work: str = WORK,
+) -> End:
+    """Do a piece of work in a child process and wait for its end, or bring it about.
+
+    Parameters
+    ----------
+    argument : of the work, plain values
+    threads : of the numerical libraries
+    log : file for what the child says
+    environment : variables that the child is to have
+    limits : Limits
+    stop : set by the caller when the child is to end now
+    work : module with ``work(argument) -> exit code``
+
+    Raises
+    ------
+    ForkerError
+        When no child can be started, or the process that started it has ended.
+    """
+    start, peak = time.monotonic(), 0.0
+    with start_child(threads, argument, log, environment, work) as child:
+        while (status := child.wait(LOOK)) is None:
+            memory = tree_memory_mb(child.pid)
+            peak = max(peak, memory)
+            if stop is not None and stop.is_set():
+                return _ended(child, Cause.INTERRUPTED, ExitCode.INTERRUPTED, "Interrupted.", peak)
+            if limits.memory_mb is not None and memory > limits.memory_mb:
+                said = f"It needed {memory:,.0f} MB of memory; the limit is {limits.memory_mb:,.0f} MB (--memory)."
+                return _ended(child, Cause.MEMORY, ExitCode.MEMORY, said, peak)
+            if limits.seconds is not None and time.monotonic() - start > limits.seconds:
+                said = f"It had not ended after {limits.seconds:g} s, which is the limit (--timeout)."
+                return _ended(child, Cause.TIMEOUT, None, said, peak)
+    message = describe_signal(-status) if status < 0 else ""
+    return End(cause_of(status), status, message, round(peak, 1))
+
+
+def _ended(child: Child, cause: Cause, exit_code: int | None, message: str, peak: float) -> End:
+    """Kill a child with all that it has started."""
+    for process in _tree(child.pid):
+        with suppress(psutil.Error):
+            process.kill()
+    return End(cause, exit_code, message, round(peak, 1))
+
+
+def tree_memory_mb(pid: int) -> float:
+    """Return the resident memory of a process and its descendants, in MB of 10^6 bytes; 0 of one that has ended."""
+    total = 0
+    for process in _tree(pid):
+        with suppress(psutil.Error):
+            total += process.memory_info().rss
+    return total / 1e6
+
+
+def _tree(pid: int) -> list[psutil.Process]:
+    try:
+        process = psutil.Process(pid)
+        return [process, *process.children(recursive=True)]
+    except psutil.Error:
+        return []

@@ -1,0 +1,193 @@
+"""One job from its beginning to its end: skipped when nothing has changed, tried, tried again, and recorded.
+
+An attempt writes into a folder of its own below the output folder. Only when its process has ended well are the files
+hashed and recorded, and then receive their names, so that whatever kills an attempt leaves nothing half written.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gnrecon.batch.attempt import End, attempt
+from gnrecon.batch.child import FAILURE
+from gnrecon.batch.identity import file_hash, hash_if_there, identity_of
+from gnrecon.batch.job import Job, running_folder
+from gnrecon.batch.outcome import PASSING, Cause, Outcome, Status, cause_of, figures_of
+from gnrecon.batch.record import Record, read_record
+from gnrecon.errors import ExitCode, GnreconError, OutputError
+
+REPORT, THUMBNAIL = "report.json", "thumbnail.png"
+
+
+def run_job(job: Job, stop: threading.Event | None = None, environment: Mapping[str, str] | None = None) -> Outcome:
+    """Do one job, in a child process, unless its result is there already; whatever happens is told by the outcome.
+
+    Parameters
+    ----------
+    job : Job
+    stop : set by the caller when the job is to end now
+    environment : variables that the child is to have
+    """
+    start = time.monotonic()
+    try:
+        outcome = _run(job, stop or threading.Event(), dict(environment or {}))
+    except GnreconError as error:
+        outcome = _failed(job, cause_of(error.exit_code), str(error), error.exit_code)
+    except OSError as error:
+        said = f"{error.filename or job.output}: {error.strerror or error}."
+        outcome = _failed(job, Cause.OUTPUT, said, ExitCode.OUTPUT)
+    return replace(outcome, seconds=round(time.monotonic() - start, 2))
+
+
+def _run(job: Job, stop: threading.Event, environment: dict[str, str]) -> Outcome:
+    try:
+        identity = identity_of(job)
+    except OSError as error:
+        said = f"{error.filename}: it cannot be read ({error.strerror})."
+        return _failed(job, Cause.INPUT, said, ExitCode.INPUT)
+    record = read_record(job.record())
+    if record is not None and not job.fresh and record.holds(identity, job.output):
+        return _told(job, Status.UNCHANGED, record.told)
+    _require_own(job, record)
+    for number in range(1, job.retry + 2):
+        outcome = replace(_attempt(job, identity, stop, environment), attempts=number)
+        if outcome.cause not in PASSING or stop.is_set():
+            break
+    return outcome
+
+
+def _require_own(job: Job, record: Record | None) -> None:
+    """Refuse to replace what is not this batch's own."""
+    if job.overwrite:
+        return
+    for name in job.file_names().values():
+        found = hash_if_there(job.output / name)
+        if found is not None and (record is None or not record.knows(name, found)):
+            raise OutputError(
+                f"{job.output / name} exists already and was not written by this batch, or was changed since; "
+                "choose another folder or add --overwrite."
+            )
+
+
+def _attempt(job: Job, identity: dict[str, Any], stop: threading.Event, environment: dict[str, str]) -> Outcome:
+    job.log().parent.mkdir(parents=True, exist_ok=True)
+    with _own_folder(job) as folder:
+        end = attempt(
+            _argument(job, folder),
+            threads=job.options["threads"],
+            log=job.log(),
+            environment={"TMPDIR": str(folder / "temporary"), **environment},
+            limits=job.limits,
+            stop=stop,
+        )
+        if end.cause is not None:
+            return _failed(job, end.cause, _sentence(end, folder), end.exit_code, end.peak_memory_mb)
+        return _adopt(job, folder, identity, end)
+
+
+@contextmanager
+def _own_folder(job: Job) -> Iterator[Path]:
+    """A folder that is gone afterwards, with the folders that the files' names need."""
+    running = running_folder(job.output)
+    running.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f"{Path(job.name).name}-", dir=running))
+    try:
+        (folder / "temporary").mkdir()
+        (folder / "files" / job.name).parent.mkdir(parents=True)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _argument(job: Job, folder: Path) -> dict[str, Any]:
+    """What the child is asked to do, as plain values."""
+    files = {kind: f"files/{name}" for kind, name in job.file_names().items()}
+    return {
+        "name": job.name,
+        "folder": str(folder.absolute()),
+        "scan": str(job.scan),
+        "files": {"report": REPORT, **files, "thumbnail": THUMBNAIL},
+        "options": dict(job.options),
+        "reference": None if job.reference is None else str(job.reference),
+        "command": shlex.join(["gnrecon", str(job.scan), "-o", str(job.output / job.file_names()["mesh"])]),
+    }
+
+
+def _sentence(end: End, folder: Path) -> str:
+    if end.message:
+        return end.message
+    try:
+        return (folder / FAILURE).read_text(encoding="utf-8")
+    except OSError:
+        return f"Its process ended with exit code {end.exit_code}."
+
+
+def _adopt(job: Job, folder: Path, identity: dict[str, Any], end: End) -> Outcome:
+    """Record a result, then let its files have their names."""
+    names = job.file_names()
+    report = folder / (f"files/{names['report']}" if "report" in names else REPORT)
+    told = json.loads(report.read_text(encoding="utf-8"))
+    facts = {"figures": figures_of(told), "metrics": told["metrics"], "peak_memory_mb": end.peak_memory_mb}
+    found = {name: hash_if_there(job.output / name) for name in names.values()}
+    Record(
+        identity,
+        {name: file_hash(folder / "files" / name) for name in names.values()},
+        {name: known for name, known in found.items() if known is not None},
+        facts,
+    ).write(job.record())
+    job.thumbnail().parent.mkdir(parents=True, exist_ok=True)
+    (folder / THUMBNAIL).replace(job.thumbnail())
+    for name in names.values():
+        (job.output / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "files" / name).replace(job.output / name)
+    _sync(job.output)
+    return _told(job, Status.MADE, facts)
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _told(job: Job, status: Status, told: Mapping[str, Any]) -> Outcome:
+    """The outcome of a result that is there, from what its record tells."""
+    files = {kind: str(job.output / name) for kind, name in job.file_names().items()}
+    return Outcome(
+        job.name,
+        str(job.scan),
+        status,
+        files=files,
+        thumbnail=str(job.thumbnail()),
+        log=str(job.log()),
+        **told,
+    )
+
+
+def _failed(
+    job: Job, cause: Cause | None, message: str, exit_code: int | None, peak_memory_mb: float | None = None
+) -> Outcome:
+    log = str(job.log()) if job.log().is_file() else ""
+    return Outcome(
+        job.name,
+        str(job.scan),
+        Status.FAILED,
+        cause,
+        message,
+        exit_code,
+        log=log,
+        peak_memory_mb=peak_memory_mb,
+    )

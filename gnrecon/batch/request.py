@@ -1,0 +1,71 @@
+"""What a batch is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gnrecon.batch.job import Limits
+from gnrecon.errors import UsageError
+from gnrecon.io import WRITERS
+
+
+@dataclass(frozen=True)
+class Request:
+    """A batch as the command line asks for it.
+
+    Parameters
+    ----------
+    sources : files, folders and patterns
+    output : folder for the meshes, made when missing
+    lists : files with a source on each line
+    patterns : of the files that are taken from folders; empty: all that can be read
+    recursive : whether subfolders are entered
+    name : template of the outputs' names, see `gnrecon.batch.naming`
+    mesh_format : extension of the meshes, without the dot
+    kinds : of files that are wanted beside each mesh, of `gnrecon.batch.outcome.FILES`
+    options : fields of `Options` that were given
+    jobs : at a time; None: as many as the machine takes
+    limits : of each attempt
+    retry : how often a failure that may pass is tried again
+    overwrite, fresh : as of `Job`
+    quiet : whether nothing but failures is said
+    command : the line that asked for it
+
+    Raises
+    ------
+    UsageError
+        When a value is out of its range.
+    """
+
+    sources: tuple[str, ...]
+    output: Path
+    lists: tuple[Path, ...] = ()
+    patterns: tuple[str, ...] = ()
+    recursive: bool = False
+    name: str | None = None
+    mesh_format: str = "obj"
+    kinds: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    jobs: int | None = None
+    limits: Limits = field(default_factory=Limits)
+    retry: int = 0
+    overwrite: bool = False
+    fresh: bool = False
+    quiet: bool = False
+    command: str | None = None
+
+    def __post_init__(self) -> None:
+        if f".{self.mesh_format}" not in WRITERS:
+            supported = ", ".join(suffix[1:] for suffix in WRITERS)
+            raise UsageError(f"Meshes cannot be written as {self.mesh_format!r}; use {supported}.")
+        if not self.sources and not self.lists:
+            raise UsageError("Name a folder, a pattern or scans, or a list of them by --list.")
+        if "-" in self.sources:
+            raise UsageError("A batch reads no standard input; name a folder, a pattern or scans.")
+        if self.jobs is not None and self.jobs < 1:
+            raise UsageError(f"The number of jobs must be positive, not {self.jobs}.")
+        if self.retry < 0:
+            raise UsageError(f"The number of further attempts must not be negative, not {self.retry}.")

@@ -1,0 +1,81 @@
+"""A whole batch: plan it, do it, show how far it is, and write its account."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from rich.console import Console
+from rich.table import Table
+
+from gnrecon.batch.capacity import fitting_jobs
+from gnrecon.batch.devices import cuda_devices
+from gnrecon.batch.live import Board
+from gnrecon.batch.local import run_locally
+from gnrecon.batch.outcome import Outcome, Status
+from gnrecon.batch.plan import THREADS, plan
+from gnrecon.batch.request import Request
+from gnrecon.batch.summary import NAME, Account, write_summary
+from gnrecon.batch.workplace import workplace
+from gnrecon.errors import ExitCode
+
+
+def run_batch(request: Request) -> int:
+    """Reconstruct all scans that are asked for, each in a process of its own, and return the exit code.
+
+    Work that was done before is not done again. Beside the meshes lies the account of the whole, see
+    `gnrecon.batch.summary`, also where the batch was interrupted.
+
+    Raises
+    ------
+    InputError
+        When a source is missing, or there is no scan.
+    UsageError
+        When options, names or formats make no sense, or another batch is at work in the output folder.
+    OutputError
+        When the output folder cannot be made, or the account not be written.
+    """
+    jobs = plan(request)
+    devices = cuda_devices(jobs)
+    threads = int(request.options.get("threads") or THREADS)
+    console, start = Console(stderr=True, quiet=request.quiet), time.monotonic()
+    outcomes: dict[str, Outcome] = {}
+    interrupted = False
+    with workplace(request.output):
+        count = request.jobs or len(devices) or fitting_jobs(jobs, threads)
+        board = Board(console, len(jobs), request.output)
+
+        def done(outcome: Outcome) -> None:
+            outcomes[outcome.name] = outcome
+            board.done(outcome)
+
+        try:
+            with board.shown():
+                run_locally(jobs, count, devices, done)
+        except KeyboardInterrupt:  # What was done until now is still worth its account.
+            interrupted = True
+        ordered = tuple(outcomes[job.name] for job in jobs if job.name in outcomes)
+        account = Account(ordered, len(jobs), count, threads, time.monotonic() - start, request.command)
+        write_summary(account, request.output)
+    console.print(_closing(account))
+    if interrupted:
+        told = request.output / f"{NAME}.json"
+        print(f"gnrecon: Interrupted; {told} tells what was done until then.", file=sys.stderr)
+        return ExitCode.INTERRUPTED
+    return ExitCode.BATCH if account.count(Status.FAILED) else ExitCode.OK
+
+
+def _closing(account: Account) -> Table:
+    """The failures, below a line of figures."""
+    made, unchanged = account.count(Status.MADE), account.count(Status.UNCHANGED)
+    title = f"{made + unchanged} of {account.total} scans reconstructed"
+    title += f", {unchanged} of them unchanged" if unchanged else ""
+    title += f", in {account.seconds:.0f} s"
+    causes = ", ".join(f"{count} {cause}" for cause, count in account.causes().items())
+    table = Table(title=title, caption=causes and f"failed: {causes}", title_justify="left", caption_justify="left")
+    for heading in ("scan", "cause", "seconds", "what happened"):
+        table.add_column(heading, overflow="fold")
+    for outcome in account.outcomes:
+        if outcome.failed:
+            table.add_row(outcome.scan, str(outcome.cause), f"{outcome.seconds:.1f}", outcome.message)
+    return table
