@@ -10,7 +10,8 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn
@@ -37,7 +38,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-POINTS, FIT, MESH, OUTPUT, DESIGN = "Points", "Fit", "Mesh", "Output", "Design"
+POINTS, FIT, MESH, OUTPUT, DESIGN, BATCH = "Points", "Fit", "Mesh", "Output", "Design", "Batch"
 
 Format = Annotated[
     str | None,
@@ -346,43 +347,7 @@ def reconstruct_command(
     """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""
     from gnrecon.run import Files, run
 
-    options = {
-        "read_points": read_points,
-        "crop": crop,
-        "clip_plane": clip_plane,
-        "units": units,
-        "fraction": fraction,
-        "max_points": max_points,
-        "spacing": spacing,
-        "subsample": subsample,
-        "holdout": holdout,
-        "outliers": outliers,
-        "clusters": clusters,
-        "smooth_scan": smooth_scan,
-        "orient": orient,
-        "widths": None if widths is None else parse_widths(widths),
-        "steps": steps,
-        "quality": quality,
-        "normal_residual": normal_residual,
-        "optimiser": optimiser,
-        "solver": solver,
-        "search": search,
-        "seed": seed,
-        "device": device,
-        "threads": threads,
-        "resolution": resolution,
-        "edge_length": edge_length,
-        "max_error": max_error,
-        "attributes": attributes,
-        "curvature": curvature,
-        "trim": trim,
-        "uncertainty": uncertainty,
-        "remesh": remesh,
-        "adaptive": adaptive,
-        "simplify": simplify,
-        "faces": faces,
-        "feature_angle": feature_angle,
-    }
+    options = _given(context, locals())
     del debug  # read from the arguments by `main`, which handles failures
     files = Files(tuple(scans), output, reference, report, preview, save, html, overwrite, format)
     if dry_run:
@@ -395,8 +360,54 @@ def reconstruct_command(
 
 @app.command("batch")
 def batch_command(
-    folder: Annotated[Path, typer.Argument(help="Folder of scans.")],
+    context: typer.Context,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the meshes.", rich_help_panel=OUTPUT)],
+    scans: Annotated[
+        list[str] | None,
+        typer.Argument(help="Folders of scans, scans, or patterns in quotes such as 'site/*/*.e57'."),
+    ] = None,
+    lists: Annotated[
+        list[Path],
+        typer.Option("--list", help="File with a scan, folder or pattern on each line.", rich_help_panel=BATCH),
+    ] = (),  # type: ignore[assignment]
+    pattern: Annotated[
+        list[str],
+        typer.Option(help="Take files of this name from folders, such as '*.ply'.", rich_help_panel=BATCH),
+    ] = (),  # type: ignore[assignment]
+    recursive: Annotated[
+        bool, typer.Option("--recursive", "-r", help="Enter subfolders.", rich_help_panel=BATCH)
+    ] = False,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEMPLATE",
+            help="Names of the outputs, from {stem}, {name}, {folder}, {parent} and {index}; by default "
+            "{folder}/{stem}.",
+            rich_help_panel=BATCH,
+        ),
+    ] = None,
+    jobs: Annotated[
+        str,
+        typer.Option(help="Scans at a time: a number, or auto, by cores and memory.", rich_help_panel=BATCH),
+    ] = "auto",
+    timeout: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Most time for a scan: 90, 10m, 2h.", rich_help_panel=BATCH),
+    ] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(metavar="SIZE", help="Most resident memory for a scan: 800MB, 4GB.", rich_help_panel=BATCH),
+    ] = None,
+    retry: Annotated[
+        int,
+        typer.Option(
+            help="Further attempts at a scan that was killed, took too long or too much memory.", rich_help_panel=BATCH
+        ),
+    ] = 0,
+    fresh: Annotated[
+        bool,
+        typer.Option("--fresh", help="Do again what is done already, too.", rich_help_panel=BATCH),
+    ] = False,
     mesh_format: Annotated[
         str,
         typer.Option("--format", help="Format of the meshes: obj, ply, stl, off, glb or 3mf.", rich_help_panel=OUTPUT),
@@ -446,51 +457,68 @@ def batch_command(
         bool,
         typer.Option("--pages", help="Write a page beside each mesh, see --html: NAME.html.", rich_help_panel=OUTPUT),
     ] = False,
+    previews: Annotated[
+        bool,
+        typer.Option("--previews", help="Write a picture beside each mesh: NAME.preview.png.", rich_help_panel=OUTPUT),
+    ] = False,
+    models: Annotated[
+        bool,
+        typer.Option("--models", help="Write each fitted field, too: NAME.gnr.", rich_help_panel=OUTPUT),
+    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Reconstruct every scan of a folder, each in a process of its own; one failure stops nothing."""
-    from gnrecon.batch import run_batch
+    """Reconstruct many scans, each in a process of its own; one failure stops nothing, and nothing is done twice."""
+    from gnrecon.batch.job import Limits
+    from gnrecon.batch.quantity import parse_megabytes, parse_seconds
+    from gnrecon.batch.request import Request
+    from gnrecon.batch.runner import run_batch
 
-    arguments = {
-        "--read-points": read_points,
-        "--units": units,
-        "--fraction": fraction,
-        "--max-points": max_points,
-        "--spacing": spacing,
-        "--subsample": subsample,
-        "--holdout": holdout,
-        "--outliers": outliers,
-        "--clusters": clusters,
-        "--smooth-scan": smooth_scan,
-        "--orient": orient,
-        "--widths": widths,
-        "--steps": steps,
-        "--quality": quality,
-        "--normal-residual": normal_residual,
-        "--optimiser": optimiser,
-        "--solver": solver,
-        "--search": search,
-        "--seed": seed,
-        "--device": device,
-        "--threads": threads,
-        "--resolution": resolution,
-        "--edge-length": edge_length,
-        "--max-error": max_error,
-        "--attributes": attributes,
-        "--trim": trim,
-        "--remesh": remesh,
-        "--simplify": simplify,
-        "--faces": faces,
-        "--feature-angle": feature_angle,
-    }
-    passed = [text for name, value in arguments.items() if value is not None for text in (name, str(value))]
-    passed += [word for box in crop for word in ("--crop", box)]
-    passed += [word for plane in clip_plane for word in ("--clip-plane", plane)]
-    passed += ["--curvature"] * curvature + ["--uncertainty"] * uncertainty + ["--adaptive"] * adaptive
-    passed += ["--overwrite"] * overwrite + ["--debug"] * debug
-    raise SystemExit(run_batch(folder, output, mesh_format, passed, reports=reports, pages=pages, quiet=quiet))
+    del debug
+    wanted = {"report": reports, "page": pages, "preview": previews, "model": models}
+    request = Request(
+        sources=tuple(scans or ()),
+        output=output,
+        lists=tuple(lists),
+        patterns=tuple(pattern),
+        recursive=recursive,
+        name=name,
+        mesh_format=mesh_format,
+        kinds=tuple(kind for kind, asked in wanted.items() if asked),
+        options=_given(context, locals()),
+        jobs=_parse_jobs(jobs),
+        limits=Limits(
+            None if timeout is None else parse_seconds(timeout), None if memory is None else parse_megabytes(memory)
+        ),
+        retry=retry,
+        overwrite=overwrite,
+        fresh=fresh,
+        quiet=quiet,
+        command=context.obj,
+    )
+    raise SystemExit(run_batch(request))
+
+
+def _given(context: typer.Context, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of the reconstruction among a command's values that were given, not left to their defaults."""
+    from gnrecon.options import Options
+
+    names = [option.name for option in fields(Options)]
+    sources = {name: context.get_parameter_source(name) for name in names}
+    options = {name: values[name] for name, source in sources.items() if source and source.name != "DEFAULT"}
+    if "widths" in options:
+        options["widths"] = parse_widths(options["widths"])
+    return options
+
+
+def _parse_jobs(text: str) -> int | None:
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"The number of jobs is a whole number or auto, not {text!r}.") from None
 
 
 @app.command("mesh")

@@ -11,18 +11,21 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from gnrecon.batch.children import WORK, Child, start_child
+from gnrecon.batch.children import WORK, Child, ForkerError, start_child
 from gnrecon.batch.job import Limits
 from gnrecon.batch.outcome import Cause, cause_of, describe_signal
 from gnrecon.errors import ExitCode
 
 LOOK = 0.1
 """Seconds between two looks at a child."""
+
+_PATIENCE = 5.0
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,14 @@ class End:
     exit_code : of the child; None where it was ended for another reason than its memory
     message : a sentence, where the child itself could not say one
     peak_memory_mb : greatest resident memory that was seen, in MB of 10^6 bytes
+    seconds : from the child's start to its end
     """
 
     cause: Cause | None
     exit_code: int | None
     message: str
     peak_memory_mb: float
+    seconds: float
 
 
 def attempt(
@@ -55,6 +60,8 @@ def attempt(
 ) -> End:
     """Do a piece of work in a child process and wait for its end, or bring it about.
 
+    Where the process that starts the children was itself ended from outside, it is started again, and so is the work.
+
     Parameters
     ----------
     argument : of the work, plain values
@@ -68,31 +75,50 @@ def attempt(
     Raises
     ------
     ForkerError
-        When no child can be started, or the process that started it has ended.
+        When no child can be started, or the process that starts them has ended twice.
     """
-    start, peak = time.monotonic(), 0.0
+    once = partial(_once, argument, threads, log, environment, limits, stop or threading.Event(), work)
+    try:
+        return once()
+    except ForkerError:
+        return once()
+
+
+def _once(
+    argument: Mapping[str, Any],
+    threads: int,
+    log: Path,
+    environment: Mapping[str, str],
+    limits: Limits,
+    stop: threading.Event,
+    work: str,
+) -> End:
     with start_child(threads, argument, log, environment, work) as child:
+        start, peak = time.monotonic(), 0.0
         while (status := child.wait(LOOK)) is None:
-            memory = tree_memory_mb(child.pid)
-            peak = max(peak, memory)
-            if stop is not None and stop.is_set():
-                return _ended(child, Cause.INTERRUPTED, ExitCode.INTERRUPTED, "Interrupted.", peak)
+            memory, seconds = tree_memory_mb(child.pid), round(time.monotonic() - start, 3)
+            peak = max(peak, round(memory, 1))
+            if stop.is_set():
+                return _killed(child, End(Cause.INTERRUPTED, ExitCode.INTERRUPTED, "Interrupted.", peak, seconds))
             if limits.memory_mb is not None and memory > limits.memory_mb:
                 said = f"It needed {memory:,.0f} MB of memory; the limit is {limits.memory_mb:,.0f} MB (--memory)."
-                return _ended(child, Cause.MEMORY, ExitCode.MEMORY, said, peak)
-            if limits.seconds is not None and time.monotonic() - start > limits.seconds:
+                return _killed(child, End(Cause.MEMORY, ExitCode.MEMORY, said, peak, seconds))
+            if limits.seconds is not None and seconds > limits.seconds:
                 said = f"It had not ended after {limits.seconds:g} s, which is the limit (--timeout)."
-                return _ended(child, Cause.TIMEOUT, None, said, peak)
+                return _killed(child, End(Cause.TIMEOUT, None, said, peak, seconds))
+        seconds = round(time.monotonic() - start, 3)
     message = describe_signal(-status) if status < 0 else ""
-    return End(cause_of(status), status, message, round(peak, 1))
+    return End(cause_of(status), status, message, peak, seconds)
 
 
-def _ended(child: Child, cause: Cause, exit_code: int | None, message: str, peak: float) -> End:
-    """Kill a child with all that it has started."""
+def _killed(child: Child, end: End) -> End:
+    """Kill a child with all that it has started, and wait until it has gone."""
     for process in _tree(child.pid):
         with suppress(psutil.Error):
             process.kill()
-    return End(cause, exit_code, message, round(peak, 1))
+    with suppress(ForkerError):
+        child.wait(_PATIENCE)
+    return end
 
 
 def tree_memory_mb(pid: int) -> float:

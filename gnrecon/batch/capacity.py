@@ -46,7 +46,7 @@ def available_cores() -> int:
 
 def available_memory_mb() -> float:
     """Return the memory that is free, in MB of 10^6 bytes, within the limit of the control group."""
-    free = psutil.virtual_memory().available
+    free = int(psutil.virtual_memory().available)
     with suppress(OSError, ValueError):
         limit = int((_CGROUP / "memory.max").read_text(encoding="ascii"))
         free = min(free, limit - int((_CGROUP / "memory.current").read_text(encoding="ascii")))

@@ -12,15 +12,10 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from gnrecon.batch.job import FAILURE, PROGRESS
 from gnrecon.errors import ExitCode, failure
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress
-
-STATE = "state.json"
-"""File in the attempt's folder that tells how far it is."""
-
-FAILURE = "failure.txt"
-"""File in the attempt's folder that holds the sentence on a failure."""
 
 _SELDOM = 0.5
 
@@ -67,7 +62,7 @@ def _reconstruct(argument: dict[str, Any], folder: Path) -> ExitCode:
         html=paths.get("page"),
         thumbnail=paths["thumbnail"],
     )
-    told = Told(argument["name"], folder / STATE)
+    told = Told(argument["name"], folder / PROGRESS)
     return ExitCode(run(files, argument["options"], command=argument["command"], watcher=told))
 
 

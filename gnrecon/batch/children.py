@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Any
 
 import gnrecon
-from gnrecon.errors import GnreconError
+from gnrecon.errors import ExitCode, GnreconError
 
 WORK = "gnrecon.batch.child"
 """Module whose function ``work`` a child runs."""
@@ -34,6 +34,8 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 class ForkerError(GnreconError, RuntimeError):
     """The process that forks others could not be started, or has ended."""
 
+    exit_code = ExitCode.UNFORESEEN
+
 
 class Child:
     """A running child; leaving its block ends it, if it has not ended by itself."""
@@ -42,6 +44,7 @@ class Child:
         self._connection, self._rest = connection, b""
         answer = self._receive()
         if answer is None:
+            connection.close()
             raise ForkerError("The process that starts the scans' own ones has ended.")
         self.pid = int(answer["pid"])
 
@@ -106,22 +109,26 @@ class Nursery:
             When no forker can be started, or it ends at once.
         """
         request = {"argument": dict(argument), "log": str(log), "environment": dict(environment)}
+        line = json.dumps(request).encode() + b"\n"
         with self._lock:
-            address = self._running()
+            if self._process is None:
+                self._start()
+            try:
+                return self._ask(line)
+            except ForkerError:  # it was ended from outside
+                self.close()
+                self._start()
+                return self._ask(line)
+
+    def _ask(self, line: bytes) -> Child:
         connection = socket.socket(socket.AF_UNIX)
         try:
-            connection.connect(address)
-            connection.sendall(json.dumps(request).encode() + b"\n")
-            return Child(connection)
+            connection.connect(str(self._address))
+            connection.sendall(line)
         except OSError as error:
             connection.close()
             raise ForkerError(f"The process that starts the scans' own ones has ended ({error.strerror}).") from error
-
-    def _running(self) -> str:
-        if self._process is None or self._process.poll() is not None:
-            self.close()
-            self._start()
-        return str(self._address)
+        return Child(connection)
 
     @property
     def _address(self) -> Path:

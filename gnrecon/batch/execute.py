@@ -12,17 +12,16 @@ import shlex
 import shutil
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from gnrecon.batch.attempt import End, attempt
-from gnrecon.batch.child import FAILURE
+from gnrecon.batch.children import WORK
 from gnrecon.batch.identity import file_hash, hash_if_there, identity_of
-from gnrecon.batch.job import Job, running_folder
+from gnrecon.batch.job import FAILURE, Job, running_folder
 from gnrecon.batch.outcome import PASSING, Cause, Outcome, Status, cause_of, figures_of
 from gnrecon.batch.record import Record, read_record
 from gnrecon.errors import ExitCode, GnreconError, OutputError
@@ -30,7 +29,9 @@ from gnrecon.errors import ExitCode, GnreconError, OutputError
 REPORT, THUMBNAIL = "report.json", "thumbnail.png"
 
 
-def run_job(job: Job, stop: threading.Event | None = None, environment: Mapping[str, str] | None = None) -> Outcome:
+def run_job(
+    job: Job, stop: threading.Event | None = None, environment: Mapping[str, str] | None = None, work: str = WORK
+) -> Outcome:
     """Do one job, in a child process, unless its result is there already; whatever happens is told by the outcome.
 
     Parameters
@@ -38,19 +39,27 @@ def run_job(job: Job, stop: threading.Event | None = None, environment: Mapping[
     job : Job
     stop : set by the caller when the job is to end now
     environment : variables that the child is to have
+    work : module with ``work(argument) -> exit code``, see `gnrecon.batch.child`
     """
-    start = time.monotonic()
     try:
-        outcome = _run(job, stop or threading.Event(), dict(environment or {}))
+        return _run(job, _Means(stop or threading.Event(), dict(environment or {}), work))
     except GnreconError as error:
-        outcome = _failed(job, cause_of(error.exit_code), str(error), error.exit_code)
+        return _failed(job, cause_of(error.exit_code), str(error), error.exit_code)
     except OSError as error:
         said = f"{error.filename or job.output}: {error.strerror or error}."
-        outcome = _failed(job, Cause.OUTPUT, said, ExitCode.OUTPUT)
-    return replace(outcome, seconds=round(time.monotonic() - start, 2))
+        return _failed(job, Cause.OUTPUT, said, ExitCode.OUTPUT)
 
 
-def _run(job: Job, stop: threading.Event, environment: dict[str, str]) -> Outcome:
+@dataclass(frozen=True)
+class _Means:
+    """How attempts are made, and when they are to end."""
+
+    stop: threading.Event
+    environment: dict[str, str]
+    work: str
+
+
+def _run(job: Job, means: _Means) -> Outcome:
     try:
         identity = identity_of(job)
     except OSError as error:
@@ -60,11 +69,12 @@ def _run(job: Job, stop: threading.Event, environment: dict[str, str]) -> Outcom
     if record is not None and not job.fresh and record.holds(identity, job.output):
         return _told(job, Status.UNCHANGED, record.told)
     _require_own(job, record)
-    for number in range(1, job.retry + 2):
-        outcome = replace(_attempt(job, identity, stop, environment), attempts=number)
-        if outcome.cause not in PASSING or stop.is_set():
-            break
-    return outcome
+    attempts, seconds = 0, 0.0
+    while True:
+        outcome = _attempt(job, identity, means)
+        attempts, seconds = attempts + 1, seconds + outcome.seconds
+        if outcome.cause not in PASSING or means.stop.is_set() or attempts > job.retry:
+            return replace(outcome, attempts=attempts, seconds=round(seconds, 2))
 
 
 def _require_own(job: Job, record: Record | None) -> None:
@@ -80,20 +90,21 @@ def _require_own(job: Job, record: Record | None) -> None:
             )
 
 
-def _attempt(job: Job, identity: dict[str, Any], stop: threading.Event, environment: dict[str, str]) -> Outcome:
+def _attempt(job: Job, identity: dict[str, Any], means: _Means) -> Outcome:
     job.log().parent.mkdir(parents=True, exist_ok=True)
     with _own_folder(job) as folder:
         end = attempt(
             _argument(job, folder),
             threads=job.options["threads"],
             log=job.log(),
-            environment={"TMPDIR": str(folder / "temporary"), **environment},
+            environment={"TMPDIR": str((folder / "temporary").absolute()), **means.environment},
             limits=job.limits,
-            stop=stop,
+            stop=means.stop,
+            work=means.work,
         )
         if end.cause is not None:
-            return _failed(job, end.cause, _sentence(end, folder), end.exit_code, end.peak_memory_mb)
-        return _adopt(job, folder, identity, end)
+            return _failed(job, end.cause, _sentence(end, folder), end.exit_code, end)
+        return replace(_adopt(job, folder, identity, end), seconds=end.seconds)
 
 
 @contextmanager
@@ -177,9 +188,7 @@ def _told(job: Job, status: Status, told: Mapping[str, Any]) -> Outcome:
     )
 
 
-def _failed(
-    job: Job, cause: Cause | None, message: str, exit_code: int | None, peak_memory_mb: float | None = None
-) -> Outcome:
+def _failed(job: Job, cause: Cause | None, message: str, exit_code: int | None, end: End | None = None) -> Outcome:
     log = str(job.log()) if job.log().is_file() else ""
     return Outcome(
         job.name,
@@ -189,5 +198,6 @@ def _failed(
         message,
         exit_code,
         log=log,
-        peak_memory_mb=peak_memory_mb,
+        seconds=0.0 if end is None else end.seconds,
+        peak_memory_mb=None if end is None else end.peak_memory_mb,
     )

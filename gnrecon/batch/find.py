@@ -76,7 +76,7 @@ def _expanded(source: str, search: Search, must: bool) -> Iterator[Found]:
     elif path.exists():
         yield Found(path)
     elif glob.has_magic(source):
-        for match in sorted(glob.glob(source, recursive=True)):
+        for match in sorted(glob.glob(source, recursive=True)):  # noqa: PTH207 - Path.glob takes no absolute patterns
             if Path(match).is_dir():
                 yield from _in_folder(Path(match), search)
             elif extension_of(Path(match)) in READERS:
@@ -88,7 +88,7 @@ def _expanded(source: str, search: Search, must: bool) -> Iterator[Found]:
 
 
 def _in_folder(folder: Path, search: Search) -> Iterator[Found]:
-    """The files of a folder that could be scans, sorted by path; no hidden ones, and none that the batch has written."""
+    """The files of a folder that could be scans, sorted by path; neither hidden ones nor the batch's own."""
     own, below = _outputs(search.output), _output_below(folder, search.output)
     for path in sorted(folder.rglob("*") if search.recursive else folder.iterdir()):
         inner = path.relative_to(folder)

@@ -19,6 +19,7 @@ import signal
 import socket
 import sys
 from importlib import import_module
+from types import FrameType
 from typing import Any, NoReturn
 
 from gnrecon.batch.fledgling import become_child
@@ -41,7 +42,7 @@ class Forker:
         self._ended, waker = socket.socketpair()
         waker.setblocking(False)
         self._waker = waker
-        signal.signal(signal.SIGCHLD, lambda number, frame: None)
+        signal.signal(signal.SIGCHLD, _wake)
         signal.set_wakeup_fd(waker.fileno(), warn_on_full_buffer=False)
         for source in (listener, self._ended, sys.stdin):
             self._selector.register(source, selectors.EVENT_READ)
@@ -124,6 +125,11 @@ class Forker:
         client.close()
 
 
+def _wake(number: int, frame: FrameType | None) -> None:
+    """Nothing is to be done; but without a handler, Python would write no byte."""
+    del number, frame
+
+
 def _end(pid: int) -> None:
     """Kill a child and what it has started."""
     for kill in (os.killpg, os.kill):  # the group may not be there yet
@@ -131,7 +137,7 @@ def _end(pid: int) -> None:
             kill(pid, signal.SIGKILL)
 
 
-def main(words: list[str]) -> int:
+def main(words: list[str]) -> NoReturn:
     """Listen on the socket that the first word names, for work that the second one names."""
     path, work = words
     module = import_module(work)
@@ -144,8 +150,9 @@ def main(words: list[str]) -> int:
         listener.listen(64)
         print("ready", flush=True)
         Forker(listener, work).serve()
-    return 0
+    # Nothing is left to be done, and the libraries take their time to go.
+    os._exit(0)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])

@@ -10,6 +10,9 @@ from typing import Any
 STATE = ".gnrecon"
 """Folder within the output folder: records, logs, thumbnails and what is being worked at."""
 
+PROGRESS, FAILURE = "progress.json", "failure.txt"
+"""Files in an attempt's folder: how far it is, and the sentence on its failure."""
+
 
 @dataclass(frozen=True)
 class Limits:

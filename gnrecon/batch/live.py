@@ -14,8 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from gnrecon.batch.child import STATE
-from gnrecon.batch.job import running_folder
+from gnrecon.batch.job import PROGRESS, running_folder
 from gnrecon.batch.outcome import Outcome, Status
 from gnrecon.run import STAGES
 
@@ -94,7 +93,7 @@ def _states(output: Path) -> list[tuple[str, str, float, float]]:
     found = []
     for folder in sorted(running_folder(output).glob("*")):
         try:
-            state = json.loads((folder / STATE).read_text(encoding="utf-8"))
+            state = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
             seconds = max(0.0, time.time() - state["begun"])
         except (OSError, ValueError):  # not begun yet, just ended, or being written
             continue

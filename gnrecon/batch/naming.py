@@ -5,7 +5,7 @@ from __future__ import annotations
 import string
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from gnrecon.errors import UsageError
@@ -21,7 +21,7 @@ class Found:
     """A scan, and the folder that it was found in, relative to the one that was asked for."""
 
     scan: Path
-    folder: PurePosixPath = PurePosixPath()
+    folder: PurePosixPath = field(default_factory=PurePosixPath)
 
     @property
     def stem(self) -> str:

@@ -1,4 +1,4 @@
-"""From what was asked for to the jobs that are to be done; whatever is wrong with all of them is said before any work."""
+"""From what was asked for to the jobs that are to be done; what is wrong with the whole is said before any work."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gnrecon.batch.capacity import fitting_jobs
@@ -57,7 +57,8 @@ def run_batch(request: Request) -> int:
         ordered = tuple(outcomes[job.name] for job in jobs if job.name in outcomes)
         account = Account(ordered, len(jobs), count, threads, time.monotonic() - start, request.command)
         write_summary(account, request.output)
-    console.print(_closing(account))
+    for line in _closing(account):
+        console.print(line, highlight=False, markup=False)
     if interrupted:
         told = request.output / f"{NAME}.json"
         print(f"gnrecon: Interrupted; {told} tells what was done until then.", file=sys.stderr)
@@ -65,17 +66,19 @@ def run_batch(request: Request) -> int:
     return ExitCode.BATCH if account.count(Status.FAILED) else ExitCode.OK
 
 
-def _closing(account: Account) -> Table:
-    """The failures, below a line of figures."""
+def _closing(account: Account) -> list[RenderableType]:
+    """A line of figures, and the failures."""
     made, unchanged = account.count(Status.MADE), account.count(Status.UNCHANGED)
-    title = f"{made + unchanged} of {account.total} scans reconstructed"
-    title += f", {unchanged} of them unchanged" if unchanged else ""
-    title += f", in {account.seconds:.0f} s"
+    line = f"{made + unchanged} of {account.total} scans reconstructed"
+    line += f", {unchanged} of them unchanged" if unchanged else ""
+    line += f", in {account.seconds:.0f} s"
+    if not account.count(Status.FAILED):
+        return [f"{line}."]
     causes = ", ".join(f"{count} {cause}" for cause, count in account.causes().items())
-    table = Table(title=title, caption=causes and f"failed: {causes}", title_justify="left", caption_justify="left")
+    table = Table()
     for heading in ("scan", "cause", "seconds", "what happened"):
         table.add_column(heading, overflow="fold")
     for outcome in account.outcomes:
         if outcome.failed:
             table.add_row(outcome.scan, str(outcome.cause), f"{outcome.seconds:.1f}", outcome.message)
-    return table
+    return [table, f"{line}; failed: {causes}."]

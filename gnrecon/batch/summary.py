@@ -1,4 +1,4 @@
-"""The account of a batch as files: ``summary.json`` for programs, ``summary.csv`` for tables, ``summary.html`` to look at."""
+"""The account of a batch: ``summary.json`` for programs, ``summary.csv`` for tables, ``summary.html`` to look at."""
 
 from __future__ import annotations
 

@@ -32,6 +32,8 @@ def workplace(output: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise UsageError(f"Another batch is at work in {output}; wait for its end, or choose another folder.") from None
+            raise UsageError(
+                f"Another batch is at work in {output}; wait for its end, or choose another folder."
+            ) from None
         shutil.rmtree(running_folder(output), ignore_errors=True)
         yield

@@ -1,0 +1,242 @@
+"""``gnrecon batch`` as a whole: failures are named and stop nothing, and a batch that was killed is continued."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import errands
+import jsonschema
+import numpy as np
+import psutil
+import pytest
+from errands import notes
+from scan_files import box, sphere, start, torus, write_scan
+
+from gnrecon.batch import local, runner
+from gnrecon.batch.execute import run_job
+from gnrecon.batch.job import Limits, running_folder
+from gnrecon.batch.outcome import Outcome
+from gnrecon.batch.request import Request
+from gnrecon.batch.runner import run_batch
+from gnrecon.cli import main
+from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
+from gnrecon.export import verify_file
+from gnrecon.schema import report_schema
+
+OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
+WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")
+
+
+def write_good(folder: Path) -> list[str]:
+    rng = np.random.default_rng(5)
+    folder.mkdir()
+    write_scan(folder / "ring.ply", *torus(600, rng))
+    write_scan(folder / "ball.ply", *sphere(300, rng))
+    np.savetxt(folder / "plate.xyz", np.hstack(box(500, rng, (2.0, 1.0, 0.6))))
+    return ["ball", "plate", "ring"]
+
+
+def write_bad(folder: Path) -> None:
+    (folder / "torn.ply").write_bytes((folder / "ring.ply").read_bytes()[:5000])
+    (folder / "void.ply").touch()
+    for name in ("hangs", "killed"):
+        (folder / f"{name}.ply").write_bytes((folder / "ring.ply").read_bytes())
+
+
+def summary(folder: Path) -> dict[str, dict[str, object]]:
+    """What became of each scan, by its name."""
+    found = json.loads((folder / "summary.json").read_text())
+    assert found["failed"] == sum(scan["status"] == "failed" for scan in found["scans"])
+    return {scan["name"]: scan for scan in found["scans"]}
+
+
+@contextmanager
+def accidents(output: Path) -> Iterator[None]:
+    """Let the child of the scan "killed" be killed, and that of "hangs" be stopped, as soon as they are there."""
+    over = threading.Event()
+
+    def befall() -> None:
+        while not over.wait(0.01):
+            for name, number in (("killed", signal.SIGSEGV), ("hangs", signal.SIGSTOP)):
+                for folder in running_folder(output).glob(f"{name}-*"):
+                    for process in psutil.process_iter():
+                        if _works_in(process, folder):
+                            process.send_signal(number)
+
+    thread = threading.Thread(target=befall)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def _works_in(process: psutil.Process, folder: Path) -> bool:
+    """Whether a process is the child of an attempt, which its environment tells only where its log is open."""
+    try:
+        return any(file.path.endswith(f"logs/{folder.name.rpartition('-')[0]}.log") for file in process.open_files())
+    except psutil.Error:
+        return False
+
+
+def files(folder: Path, *, names: Callable[[Path], bool]) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file() and names(path)}
+
+
+def test_a_batch_that_was_killed_is_continued_and_every_failure_is_named(tmp_path: Path) -> None:
+    scans, meshes = tmp_path / "scans", tmp_path / "new" / "meshes"
+    good = write_good(scans)
+    write_bad(scans)
+    words = ("batch", scans, "-o", meshes, *WORDS, "--format", "ply", "--jobs", 1, "--timeout", "20m")
+    process = start(*words)
+    records = meshes / ".gnrecon" / "records"
+    while process.poll() is None and not list(records.glob("*.json")):
+        time.sleep(0.02)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    # Nothing that it had started outlives it.
+    assert not psutil.wait_procs(children, timeout=20)[1]
+    finished = [path.stem for path in records.glob("*.json")]
+    assert 1 <= len(finished) < len(good)
+    request = Request(
+        (str(scans),),
+        meshes,
+        mesh_format="ply",
+        options=OPTIONS,
+        jobs=2,
+        limits=Limits(seconds=15.0),
+        quiet=True,
+    )
+    with accidents(meshes):
+        assert run_batch(request) == ExitCode.BATCH
+    told = summary(meshes)
+    assert {name for name, scan in told.items() if scan["status"] == "unchanged"} == set(finished)
+    assert {name for name, scan in told.items() if scan["status"] != "failed"} == set(good)
+    causes = {name: (scan["cause"], scan["message"]) for name, scan in told.items() if scan["status"] == "failed"}
+    assert causes == {
+        "torn": ("input", f"{scans}/torn.ply: the header declares 600 vertex rows, but the file ends after 100."),
+        "void": ("input", f"{scans}/void.ply: the file is empty."),
+        "killed": ("signal", "Killed by SIGSEGV."),
+        "hangs": ("timeout", "It had not ended after 15 s, which is the limit (--timeout)."),
+    }
+    assert not list(running_folder(meshes).glob("*"))
+    # An undisturbed run of the good ones makes the same bytes, whatever its number of jobs and its other files.
+    for name in ("torn.ply", "void.ply", "hangs.ply", "killed.ply"):
+        (scans / name).unlink()
+    alone = replace(request, output=tmp_path / "alone", jobs=3, kinds=("report", "page"), limits=Limits())
+    assert run_batch(alone) == ExitCode.OK
+    is_mesh = lambda path: path.suffix == ".ply"  # noqa: E731
+    assert files(meshes, names=is_mesh) == files(tmp_path / "alone", names=is_mesh)
+    assert verify_file(meshes / "ring.ply").closed
+    report = json.loads((tmp_path / "alone" / "ring.report.json").read_text())
+    jsonschema.validate(report, report_schema())
+    assert (report["input"], report["resources"]["threads"]) == (str(scans / "ring.ply"), 1)
+    assert "ring.ply" in (tmp_path / "alone" / "ring.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def errand_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the jobs of this process's batches be errands."""
+    monkeypatch.setattr(local, "run_job", lambda *words: run_job(*words, work=errands.WORK))
+
+
+def write_errands(folder: Path, **texts: str) -> Path:
+    folder.mkdir()
+    for name, text in texts.items():
+        (folder / f"{name}.ply").write_text(text)
+    return folder
+
+
+@pytest.mark.usefixtures("errand_runs")
+def test_an_account_of_all_is_written_and_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    scans = write_errands(tmp_path / "scans", a="good", b="exit 4", c="good", d="signal SIGABRT")
+    request = Request((str(scans),), tmp_path / "out", jobs=2, kinds=("model",), command="gnrecon batch scans")
+    assert run_batch(request) == ExitCode.BATCH
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert "2 of 4 scans reconstructed, in " in captured.err
+    assert "failed: 1 fit, 1 signal." in captured.err
+    assert f"{scans}/a.ply: {tmp_path}/out/a.obj (made)" in captured.err
+    assert [(scan["status"], scan["cause"]) for scan in summary(tmp_path / "out").values()] == [
+        ("made", None), ("failed", "fit"), ("made", None), ("failed", "signal")
+    ]  # fmt: skip
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {".gnrecon", "a.obj", "a.gnr", "c.obj", "c.gnr", "summary.json", "summary.csv", "summary.html"}
+    # The failures are tried again, the others left as they are.
+    (scans / "b.ply").write_text("good")
+    (scans / "d.ply").unlink()
+    assert run_batch(replace(request, quiet=True)) == ExitCode.OK
+    assert capfd.readouterr() == ("", "")
+    assert notes(scans, "ended") == ["a", "c", "b"]
+
+
+@pytest.mark.usefixtures("errand_runs")
+def test_names_and_folders(tmp_path: Path) -> None:
+    scans = write_errands(tmp_path / "scans", a="good", b="good")
+    write_errands(scans / "deep", a="good")
+    request = Request((str(scans),), tmp_path / "out", recursive=True, jobs=3, quiet=True)
+    assert run_batch(request) == ExitCode.OK
+    assert sorted(summary(tmp_path / "out")) == ["a", "b", "deep/a"]
+    assert (tmp_path / "out" / "deep" / "a.obj").is_file()
+    assert run_batch(replace(request, name="{parent}-{stem}")) == ExitCode.OK
+    assert (tmp_path / "out" / "deep-a.obj").is_file()
+
+
+@pytest.mark.usefixtures("errand_runs")
+def test_an_interrupted_batch_keeps_the_account_of_what_it_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scans = write_errands(tmp_path / "scans", a="good", b="good 60", c="good")
+
+    class Impatient(runner.Board):
+        def done(self, outcome: Outcome) -> None:
+            raise KeyboardInterrupt(outcome.name)
+
+    monkeypatch.setattr(runner, "Board", Impatient)
+    began = time.monotonic()
+    request = Request((str(scans),), tmp_path / "out", jobs=2, quiet=True)
+    assert run_batch(request) == ExitCode.INTERRUPTED
+    assert time.monotonic() - began < 30
+    told = tmp_path / "out" / "summary.json"
+    assert list(summary(tmp_path / "out")) == ["a"]
+    assert json.loads(told.read_text())["scans_asked_for"] == 3
+    assert capfd.readouterr().err == f"gnrecon: Interrupted; {told} tells what was done until then.\n"
+    assert not list(running_folder(tmp_path / "out").glob("*"))
+    assert not (tmp_path / "out" / "b.obj").exists()
+
+
+def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
+    out = tmp_path / "meshes"
+    with pytest.raises(InputError, match="no file or folder"):
+        run_batch(Request((str(tmp_path / "missing"),), out))
+    (tmp_path / "README.md").touch()
+    with pytest.raises(InputError, match="There are no scans in"):
+        run_batch(Request((str(tmp_path),), out))
+    (tmp_path / "a.obj").touch()
+    with pytest.raises(UsageError, match=r"a\.obj is a scan itself"):
+        run_batch(Request((str(tmp_path),), tmp_path))
+    with pytest.raises(UsageError, match="resolution must be at least 16"):
+        run_batch(Request((str(tmp_path),), out, options={"resolution": 3}))
+    with pytest.raises(OutputError, match="cannot be made"):
+        run_batch(Request((str(tmp_path),), tmp_path / "README.md" / "meshes"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "a.obj"]
+
+
+def test_a_missing_folder_has_its_exit_code(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    handler = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        main(["batch", str(tmp_path / "missing"), "-o", str(tmp_path / "meshes")])
+    signal.signal(signal.SIGTERM, handler)
+    assert end.value.code == ExitCode.INPUT
+    assert capfd.readouterr() == ("", f"gnrecon: There is no file or folder {tmp_path / 'missing'}.\n")
+    assert not (tmp_path / "meshes").exists()
