@@ -150,18 +150,18 @@ def _adopt(job: Job, folder: Path, identity: dict[str, Any], end: End) -> Outcom
     report = folder / (f"files/{names['report']}" if "report" in names else REPORT)
     told = json.loads(report.read_text(encoding="utf-8"))
     facts = {"figures": figures_of(told), "metrics": told["metrics"], "peak_memory_mb": end.peak_memory_mb}
+    job.thumbnail().parent.mkdir(parents=True, exist_ok=True)
+    (folder / THUMBNAIL).replace(job.thumbnail())
     found = {name: hash_if_there(job.output / name) for name in names.values()}
-    Record(
+    record = Record(
         identity,
         {name: file_hash(folder / "files" / name) for name in names.values()},
         {name: known for name, known in found.items() if known is not None},
+        (folder / "files").relative_to(job.output).as_posix(),
         facts,
-    ).write(job.record())
-    job.thumbnail().parent.mkdir(parents=True, exist_ok=True)
-    (folder / THUMBNAIL).replace(job.thumbnail())
-    for name in names.values():
-        (job.output / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / "files" / name).replace(job.output / name)
+    )
+    record.write(job.record())
+    record.place(job.output)
     _sync(job.output)
     return _told(job, Status.MADE, facts)
 

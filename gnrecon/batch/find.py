@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from gnrecon.batch.job import STATE
 from gnrecon.batch.naming import Found
-from gnrecon.batch.record import recorded_files
+from gnrecon.batch.record import all_records
 from gnrecon.errors import InputError
 from gnrecon.io import READERS, extension_of
 
@@ -110,7 +110,7 @@ def _output_below(folder: Path, output: Path | None) -> Path | None:
 def _outputs(output: Path | None) -> set[Path]:
     if output is None:
         return set()
-    return {(output / name).resolve() for name in recorded_files(output / STATE / "records")}
+    return {(output / name).resolve() for record in all_records(output / STATE / "records") for name in record.outputs}
 
 
 def _matches(inner: Path, patterns: Sequence[str]) -> bool:

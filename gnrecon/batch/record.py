@@ -1,8 +1,9 @@
 """The record of a finished scan: by it a batch that is started again knows what need not be done twice.
 
 A record is written when a result was verified and hashed, and before its files receive their names. So at whatever
-moment a batch is killed, a record either agrees with the files that are there, or the scan is done again; and a file
-that is there is either known to a record, as the result or as what it was about to replace, or somebody else's.
+moment a batch is killed, what a record tells of is either in place, or in the attempt's folder, from where the next
+start brings it; and a file that is there is either known to a record, as the result or as what it was about to replace,
+or somebody else's.
 """
 
 from __future__ import annotations
@@ -26,12 +27,14 @@ class Record:
     identity : what it depends on, as of `identity_of`
     outputs : hash of each file of the result, by its path relative to the output folder
     replaced : hash of each file that this result was to replace
+    staged : folder that holds the files until they receive their names, relative to the output folder
     told : what is told of it beside its files, fields of `Outcome`
     """
 
     identity: Mapping[str, Any]
     outputs: Mapping[str, str]
     replaced: Mapping[str, str]
+    staged: str
     told: Mapping[str, Any]
 
     def holds(self, identity: Mapping[str, Any], folder: Path) -> bool:
@@ -43,6 +46,13 @@ class Record:
     def knows(self, name: str, found: str) -> bool:
         """Whether a file of this name and hash is one of the batch's own."""
         return found in (self.outputs.get(name), self.replaced.get(name))
+
+    def place(self, folder: Path) -> None:
+        """Let the files that still wait in the attempt's folder have their names."""
+        for name, known in self.outputs.items():
+            if hash_if_there(folder / self.staged / name) == known:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / self.staged / name).replace(folder / name)
 
     def write(self, path: Path) -> None:
         """Write the record atomically; an older one is replaced.
@@ -64,7 +74,7 @@ def read_record(path: Path) -> Record | None:
         return None
 
 
-def recorded_files(folder: Path) -> set[Path]:
-    """Return the files that the records below a folder tell of, relative to the output folder."""
-    records = (read_record(path) for path in sorted(folder.rglob("*.json")))
-    return {Path(name) for record in records if record is not None for name in record.outputs}
+def all_records(folder: Path) -> list[Record]:
+    """Return the records below a folder; a hidden file is one that was not yet written to its end."""
+    records = [read_record(path) for path in sorted(folder.rglob("*.json")) if not path.name.startswith(".")]
+    return [record for record in records if record is not None]

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gnrecon.batch.job import STATE, running_folder
+from gnrecon.batch.record import all_records
 from gnrecon.errors import OutputError, UsageError
 
 
@@ -35,5 +36,9 @@ def workplace(output: Path) -> Iterator[None]:
             raise UsageError(
                 f"Another batch is at work in {output}; wait for its end, or choose another folder."
             ) from None
+        for record in all_records(output / STATE / "records"):
+            record.place(output)
         shutil.rmtree(running_folder(output), ignore_errors=True)
+        for left in (output / STATE / "records").rglob(".*.json"):
+            left.unlink(missing_ok=True)
         yield

@@ -112,7 +112,7 @@ def job(folder: Path, name: str, text: str, limits: Limits | None = None, **more
     """A scan of a folder that says what is to be done, as a job whose outputs go into a folder below."""
     scans = folder / "scans"
     scans.mkdir(exist_ok=True)
-    scan = scans / f"{name}.ply"
+    scan = scans / f"{Path(name).name}.ply"
     if not scan.exists() or scan.read_text() != text:
         scan.write_text(text)
     output = folder / "meshes"

@@ -20,6 +20,7 @@ from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import Job, Limits, running_folder
 from gnrecon.batch.outcome import Cause, Outcome, Status
 from gnrecon.batch.record import read_record
+from gnrecon.batch.workplace import workplace
 from gnrecon.errors import ExitCode
 
 
@@ -104,6 +105,19 @@ def test_what_others_wrote_or_changed_is_left_alone(tmp_path: Path) -> None:
     mesh.write_text("retouched")
     assert done(one).cause == Cause.OUTPUT
     assert mesh.read_text() == "retouched"
+
+
+def test_a_batch_killed_before_the_files_had_their_names_gives_them_at_its_next_start(tmp_path: Path) -> None:
+    one = job(tmp_path, "deep/good", "good", kinds=("page",))
+    first = done(one)
+    record = read_record(one.record())
+    assert record is not None
+    for name in record.outputs:
+        staged = one.output / record.staged / name
+        staged.parent.mkdir(parents=True, exist_ok=True)
+        (one.output / name).rename(staged)
+    with workplace(one.output):
+        assert done(one) == replace(first, status=Status.UNCHANGED, attempts=0, seconds=0.0)
 
 
 def test_a_batch_killed_before_the_files_had_their_names_knows_them_as_its_own(tmp_path: Path) -> None:
