@@ -259,6 +259,20 @@ FeatureAngle = Annotated[
         rich_help_panel=MESH,
     ),
 ]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="TOML file with options by their names, and tables of them for certain scans.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+SetOption = Annotated[
+    list[str],
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="An option as a word; may be given again.", rich_help_panel=OUTPUT
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
@@ -335,6 +349,12 @@ def reconstruct_command(
             rich_help_panel=OUTPUT,
         ),
     ] = None,
+    config: Config = None,
+    words: SetOption = (),  # type: ignore[assignment]
+    save_config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration to write, with all options in effect, for --config.", rich_help_panel=OUTPUT),
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Tell what would be done, and write nothing.", rich_help_panel=OUTPUT),
@@ -346,10 +366,14 @@ def reconstruct_command(
 ) -> None:
     """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""
     from gnrecon.run import Files, run
+    from gnrecon.settings import LIMITS, REFERENCE, read_settings
 
-    options = _given(context, locals())
+    settings = read_settings(config, words, _given(context, locals()))
+    options = {name: value for name, value in settings.of(scans[0]).items() if name not in LIMITS}
+    truth = reference or options.pop(REFERENCE, None)
+    options.pop(REFERENCE, None)
     del debug  # read from the arguments by `main`, which handles failures
-    files = Files(tuple(scans), output, reference, report, preview, save, html, overwrite, format)
+    files = Files(tuple(scans), output, truth, report, preview, save, html, overwrite, format, config=save_config)
     if dry_run:
         from gnrecon.commands.info import info
 
@@ -465,17 +489,29 @@ def batch_command(
         bool,
         typer.Option("--models", help="Write each fitted field, too: NAME.gnr.", rich_help_panel=OUTPUT),
     ] = False,
+    reference_dir: Annotated[
+        Path | None,
+        typer.Option(help="Folder of references, one for each scan, to measure against.", rich_help_panel=BATCH),
+    ] = None,
+    reference_name: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEMPLATE", help="Their names, from the same fields; by default {stem}.", rich_help_panel=BATCH
+        ),
+    ] = None,
+    config: Config = None,
+    words: SetOption = (),  # type: ignore[assignment]
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Reconstruct many scans, each in a process of its own; one failure stops nothing, and nothing is done twice."""
-    from gnrecon.batch.job import Limits
-    from gnrecon.batch.quantity import parse_megabytes, parse_seconds
     from gnrecon.batch.request import Request
     from gnrecon.batch.runner import run_batch
+    from gnrecon.settings import read_settings
 
     del debug
+    limits = {name: text for name, text in (("timeout", timeout), ("memory", memory)) if text is not None}
     wanted = {"report": reports, "page": pages, "preview": previews, "model": models}
     request = Request(
         sources=tuple(scans or ()),
@@ -486,11 +522,10 @@ def batch_command(
         name=name,
         mesh_format=mesh_format,
         kinds=tuple(kind for kind, asked in wanted.items() if asked),
-        options=_given(context, locals()),
+        settings=read_settings(config, words, _given(context, locals()) | limits),
+        references=reference_dir,
+        reference_name=reference_name,
         jobs=_parse_jobs(jobs),
-        limits=Limits(
-            None if timeout is None else parse_seconds(timeout), None if memory is None else parse_megabytes(memory)
-        ),
         retry=retry,
         overwrite=overwrite,
         fresh=fresh,

@@ -21,6 +21,7 @@ from gnrecon.optim import Record
 from gnrecon.page import page_text
 from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
+from gnrecon.settings import settings_text
 
 STAGES = {
     "read": "Reading",
@@ -57,6 +58,7 @@ class Files:
     overwrite: bool = False
     format: str | None = None
     thumbnail: Path | None = None
+    config: Path | None = None
 
     def check(self) -> None:
         """Refuse before any work what would fail after it.
@@ -78,7 +80,7 @@ class Files:
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
         inputs = [path for path in (*self.scans, self.reference) if path is not None]
-        asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail)
+        asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
         require_files(inputs, [path for path in asked if path is not None], self.overwrite)
 
 
@@ -136,6 +138,10 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
         if files.model is not None:
             model = stack.enter_context(atomic_write(files.model, files.overwrite))
             result.sdf.save(model, overwrite=True)
+        if files.config is not None:
+            config = stack.enter_context(atomic_write(files.config, files.overwrite))
+            values = {**result.report["options"], "reference": files.reference}
+            config.write_text(settings_text(values, files.scans[0]), encoding="utf-8")
         if files.html is not None:
             page = stack.enter_context(atomic_write(files.html, files.overwrite))
             page.write_text(page_text(result.report, result.mesh, result.cloud), encoding="utf-8")

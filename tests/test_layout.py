@@ -28,6 +28,8 @@ ROWS = [
     {"fit", "ingest", "io", "export"},
     {"design"},
     {"options", "report", "schema", "shapes"},
+    {"values"},
+    {"settings"},
     {"meshing", "adorn", "page", "estimate"},
     {"shaping"},
     {"pipeline"},

@@ -93,6 +93,8 @@ def _require_own(job: Job, record: Record | None) -> None:
 def _attempt(job: Job, identity: dict[str, Any], means: _Means) -> Outcome:
     job.log().parent.mkdir(parents=True, exist_ok=True)
     with _own_folder(job) as folder:
+        if "config" in job.kinds:
+            (folder / "files" / job.file_names()["config"]).write_text(job.config, encoding="utf-8")
         end = attempt(
             _argument(job, folder),
             threads=job.options["threads"],
@@ -131,8 +133,15 @@ def _argument(job: Job, folder: Path) -> dict[str, Any]:
         "files": {"report": REPORT, **files, "thumbnail": THUMBNAIL},
         "options": dict(job.options),
         "reference": None if job.reference is None else str(job.reference),
-        "command": shlex.join(["gnrecon", str(job.scan), "-o", str(job.output / job.file_names()["mesh"])]),
+        "command": _command(job),
     }
+
+
+def _command(job: Job) -> str:
+    """What makes the same mesh again."""
+    paths = {kind: str(job.output / name) for kind, name in job.file_names().items()}
+    config = ["--config", paths["config"]] if "config" in paths else []
+    return shlex.join(["gnrecon", str(job.scan), "-o", paths["mesh"], *config])
 
 
 def _sentence(end: End, folder: Path) -> str:

@@ -41,6 +41,7 @@ class Job:
     mesh_format : extension of the mesh, without the dot
     kinds : of files that are wanted beside the mesh, of `gnrecon.batch.outcome.FILES`
     reference : truth to measure the mesh against
+    config : text of a configuration that makes the same mesh, for the file beside it
     limits : of each attempt
     retry : how often a failure that may pass is tried again
     overwrite : whether files that no record of this folder knows may be replaced
@@ -54,6 +55,7 @@ class Job:
     mesh_format: str = "obj"
     kinds: tuple[str, ...] = ()
     reference: Path | None = None
+    config: str = ""
     limits: Limits = field(default_factory=Limits)
     retry: int = 0
     overwrite: bool = False

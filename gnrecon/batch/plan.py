@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gnrecon.batch.find import Search, find_scans
-from gnrecon.batch.job import Job
-from gnrecon.batch.naming import named
+from gnrecon.batch.job import Job, Limits
+from gnrecon.batch.naming import Found, named
+from gnrecon.batch.pair import reference_of
+from gnrecon.batch.quantity import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
 from gnrecon.errors import UsageError
 from gnrecon.options import Options
+from gnrecon.settings import settings_text
 
 THREADS = 1
 """Of a job that is not told otherwise: several scans at a time use the cores better than several threads for one do."""
@@ -32,24 +35,35 @@ def plan(request: Request) -> list[Job]:
     search = Search(request.patterns, request.recursive, request.output)
     found = find_scans(request.sources, request.lists, search)
     names = named(found, request.name)
-    options = Options.of(**{"threads": THREADS, **request.options}).as_dict()
-    jobs = [
-        Job(
-            name,
-            one.scan,
-            request.output,
-            options,
-            mesh_format=request.mesh_format,
-            kinds=request.kinds,
-            limits=request.limits,
-            retry=request.retry,
-            overwrite=request.overwrite,
-            fresh=request.fresh,
-        )
-        for one, name in zip(found, names, strict=True)
-    ]
+    pairs = [reference_of(one, index, request) for index, one in enumerate(found, 1)]
+    if request.references is not None and not any(pairs):
+        raise UsageError(f"None of the scans has a reference in {request.references}; see --reference-name.")
+    jobs = [_job(request, one, name, reference) for one, name, reference in zip(found, names, pairs, strict=True)]
     _require_harmless(jobs, [one.scan for one in found])
     return jobs
+
+
+def _job(request: Request, found: Found, name: str, paired: Path | None) -> Job:
+    values = request.settings.of(found.scan)
+    reference = values.pop("reference", None) or paired
+    timeout, memory = values.pop("timeout", None), values.pop("memory", None)
+    options = Options.of(**{"threads": THREADS, **values}).as_dict()
+    return Job(
+        name,
+        found.scan,
+        request.output,
+        options,
+        mesh_format=request.mesh_format,
+        kinds=(*request.kinds, "config"),
+        reference=reference,
+        config=settings_text({**options, "reference": reference}, found.scan),
+        limits=Limits(
+            None if timeout is None else parse_seconds(timeout), None if memory is None else parse_megabytes(memory)
+        ),
+        retry=request.retry,
+        overwrite=request.overwrite,
+        fresh=request.fresh,
+    )
 
 
 def _require_harmless(jobs: Sequence[Job], scans: Sequence[Path]) -> None:

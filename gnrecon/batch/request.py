@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from gnrecon.batch.job import Limits
 from gnrecon.errors import UsageError
 from gnrecon.io import WRITERS
+from gnrecon.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -26,9 +24,10 @@ class Request:
     name : template of the outputs' names, see `gnrecon.batch.naming`
     mesh_format : extension of the meshes, without the dot
     kinds : of files that are wanted beside each mesh, of `gnrecon.batch.outcome.FILES`
-    options : fields of `Options` that were given
+    settings : options, references and limits, for all scans or for some
+    references : folder of references
+    reference_name : template of a reference's path in there, with its extension or without
     jobs : at a time; None: as many as the machine takes
-    limits : of each attempt
     retry : how often a failure that may pass is tried again
     overwrite, fresh : as of `Job`
     quiet : whether nothing but failures is said
@@ -48,9 +47,10 @@ class Request:
     name: str | None = None
     mesh_format: str = "obj"
     kinds: tuple[str, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=Settings)
+    references: Path | None = None
+    reference_name: str | None = None
     jobs: int | None = None
-    limits: Limits = field(default_factory=Limits)
     retry: int = 0
     overwrite: bool = False
     fresh: bool = False
@@ -67,5 +67,7 @@ class Request:
             raise UsageError("A batch reads no standard input; name a folder, a pattern or scans.")
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"The number of jobs must be positive, not {self.jobs}.")
+        if self.reference_name is not None and self.references is None:
+            raise UsageError("A template of references needs the folder that they lie in: add --reference-dir.")
         if self.retry < 0:
             raise UsageError(f"The number of further attempts must not be negative, not {self.retry}.")

@@ -13,7 +13,7 @@ from gnrecon.batch.devices import cuda_devices
 from gnrecon.batch.live import Board
 from gnrecon.batch.local import run_locally
 from gnrecon.batch.outcome import Outcome, Status
-from gnrecon.batch.plan import THREADS, plan
+from gnrecon.batch.plan import plan
 from gnrecon.batch.request import Request
 from gnrecon.batch.summary import NAME, Account, write_summary
 from gnrecon.batch.workplace import workplace
@@ -37,12 +37,15 @@ def run_batch(request: Request) -> int:
     """
     jobs = plan(request)
     devices = cuda_devices(jobs)
-    threads = int(request.options.get("threads") or THREADS)
+    threads = max(int(job.options["threads"]) for job in jobs)
     console, start = Console(stderr=True, quiet=request.quiet), time.monotonic()
     outcomes: dict[str, Outcome] = {}
     interrupted = False
     with workplace(request.output):
         count = request.jobs or len(devices) or fitting_jobs(jobs, threads)
+        without = sum(job.reference is None for job in jobs)
+        if request.references is not None and without:
+            console.print(f"{without} of {len(jobs)} scans have no reference in {request.references}.", soft_wrap=True)
         board = Board(console, len(jobs), request.output)
 
         def done(outcome: Outcome) -> None:

@@ -21,7 +21,7 @@ from scan_files import box, sphere, start, torus, write_scan
 
 from gnrecon.batch import local, runner
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import Limits, running_folder
+from gnrecon.batch.job import running_folder
 from gnrecon.batch.outcome import Outcome
 from gnrecon.batch.request import Request
 from gnrecon.batch.runner import run_batch
@@ -29,6 +29,7 @@ from gnrecon.cli import main
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.export import verify_file
 from gnrecon.schema import report_schema
+from gnrecon.settings import Settings, read_settings
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
 WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")
@@ -108,13 +109,14 @@ def test_a_batch_that_was_killed_is_continued_and_every_failure_is_named(tmp_pat
     assert not psutil.wait_procs(children, timeout=20)[1]
     finished = [path.stem for path in records.glob("[a-z]*.json")]
     assert 1 <= len(finished) < len(good)
+    config = tmp_path / "batch.toml"
+    config.write_text('[scans."hangs.*"]\ntimeout = "2s"\n')
     request = Request(
         (str(scans),),
         meshes,
         mesh_format="ply",
-        options=OPTIONS,
+        settings=read_settings(config, [], OPTIONS),
         jobs=2,
-        limits=Limits(seconds=15.0),
         quiet=True,
     )
     with accidents(meshes):
@@ -127,13 +129,13 @@ def test_a_batch_that_was_killed_is_continued_and_every_failure_is_named(tmp_pat
         "torn": ("input", f"{scans}/torn.ply: the header declares 600 vertex rows, but the file ends after 100."),
         "void": ("input", f"{scans}/void.ply: the file is empty."),
         "killed": ("signal", "Killed by SIGSEGV."),
-        "hangs": ("timeout", "It had not ended after 15 s, which is the limit (--timeout)."),
+        "hangs": ("timeout", "It had not ended after 2 s, which is the limit (--timeout)."),
     }
     assert not list(running_folder(meshes).glob("*"))
     # An undisturbed run of the good ones makes the same bytes, whatever its number of jobs and its other files.
     for name in ("torn.ply", "void.ply", "hangs.ply", "killed.ply"):
         (scans / name).unlink()
-    alone = replace(request, output=tmp_path / "alone", jobs=3, kinds=("report", "page"), limits=Limits())
+    alone = replace(request, output=tmp_path / "alone", jobs=3, kinds=("report", "page"))
     assert run_batch(alone) == ExitCode.OK
     is_mesh = lambda path: path.suffix == ".ply"  # noqa: E731
     assert files(meshes, names=is_mesh) == files(tmp_path / "alone", names=is_mesh)
@@ -171,7 +173,18 @@ def test_an_account_of_all_is_written_and_printed(tmp_path: Path, capfd: pytest.
         ("made", None), ("failed", "fit"), ("made", None), ("failed", "signal")
     ]  # fmt: skip
     written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {".gnrecon", "a.obj", "a.gnr", "c.obj", "c.gnr", "summary.json", "summary.csv", "summary.html"}
+    assert written == {
+        ".gnrecon",
+        "a.obj",
+        "a.gnr",
+        "a.config.toml",
+        "c.obj",
+        "c.gnr",
+        "c.config.toml",
+        "summary.json",
+        "summary.csv",
+        "summary.html",
+    }
     # The failures are tried again, the others left as they are.
     (scans / "b.ply").write_text("good")
     (scans / "d.ply").unlink()
@@ -226,7 +239,7 @@ def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"a\.obj is a scan itself"):
         run_batch(Request((str(tmp_path),), tmp_path))
     with pytest.raises(UsageError, match="resolution must be at least 16"):
-        run_batch(Request((str(tmp_path),), out, options={"resolution": 3}))
+        run_batch(Request((str(tmp_path),), out, settings=Settings({"resolution": 3})))
     with pytest.raises(OutputError, match="cannot be made"):
         run_batch(Request((str(tmp_path),), tmp_path / "README.md" / "meshes"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "a.obj"]
