@@ -428,6 +428,16 @@ def batch_command(
             help="Further attempts at a scan that was killed, took too long or too much memory.", rich_help_panel=BATCH
         ),
     ] = 0,
+    engine: Annotated[
+        str,
+        typer.Option(help="local, or dask for a Dask cluster of this machine's processes.", rich_help_panel=BATCH),
+    ] = "local",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="A Dask cluster that is there, such as tcp://host:8786.", rich_help_panel=BATCH
+        ),
+    ] = None,
     fresh: Annotated[
         bool,
         typer.Option("--fresh", help="Do again what is done already, too.", rich_help_panel=BATCH),
@@ -527,6 +537,8 @@ def batch_command(
         reference_name=reference_name,
         jobs=_parse_jobs(jobs),
         retry=retry,
+        engine=engine,
+        scheduler=scheduler,
         overwrite=overwrite,
         fresh=fresh,
         quiet=quiet,

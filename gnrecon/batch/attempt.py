@@ -18,7 +18,7 @@ from typing import Any
 import psutil
 
 from gnrecon.batch.children import WORK, Child, ForkerError, start_child
-from gnrecon.batch.job import Limits
+from gnrecon.batch.job import Limits, Stop
 from gnrecon.batch.outcome import Cause, cause_of, describe_signal
 from gnrecon.errors import ExitCode
 
@@ -55,7 +55,7 @@ def attempt(
     log: Path,
     environment: Mapping[str, str],
     limits: Limits,
-    stop: threading.Event | None = None,
+    stop: Stop | None = None,
     work: str = WORK,
 ) -> End:
     """Do a piece of work in a child process and wait for its end, or bring it about.
@@ -90,7 +90,7 @@ def _once(
     log: Path,
     environment: Mapping[str, str],
     limits: Limits,
-    stop: threading.Event,
+    stop: Stop,
     work: str,
 ) -> End:
     with start_child(threads, argument, log, environment, work) as child:

@@ -21,7 +21,7 @@ from typing import Any
 from gnrecon.batch.attempt import End, attempt
 from gnrecon.batch.children import WORK
 from gnrecon.batch.identity import file_hash, hash_if_there, identity_of
-from gnrecon.batch.job import FAILURE, Job, running_folder
+from gnrecon.batch.job import FAILURE, Job, Stop, running_folder
 from gnrecon.batch.outcome import PASSING, Cause, Outcome, Status, cause_of, figures_of
 from gnrecon.batch.record import Record, read_record
 from gnrecon.errors import ExitCode, GnreconError, OutputError
@@ -30,7 +30,7 @@ REPORT, THUMBNAIL = "report.json", "thumbnail.png"
 
 
 def run_job(
-    job: Job, stop: threading.Event | None = None, environment: Mapping[str, str] | None = None, work: str = WORK
+    job: Job, stop: Stop | None = None, environment: Mapping[str, str] | None = None, work: str = WORK
 ) -> Outcome:
     """Do one job, in a child process, unless its result is there already; whatever happens is told by the outcome.
 
@@ -54,7 +54,7 @@ def run_job(
 class _Means:
     """How attempts are made, and when they are to end."""
 
-    stop: threading.Event
+    stop: Stop
     environment: dict[str, str]
     work: str
 

@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 STATE = ".gnrecon"
 """Folder within the output folder: records, logs, thumbnails and what is being worked at."""
 
 PROGRESS, FAILURE = "progress.json", "failure.txt"
 """Files in an attempt's folder: how far it is, and the sentence on its failure."""
+
+
+class Stop(Protocol):
+    """Tells whether work is to end now, as `threading.Event` does."""
+
+    def is_set(self) -> bool:
+        """Whether it is to end."""
 
 
 @dataclass(frozen=True)

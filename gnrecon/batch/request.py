@@ -29,6 +29,8 @@ class Request:
     reference_name : template of a reference's path in there, with its extension or without
     jobs : at a time; None: as many as the machine takes
     retry : how often a failure that may pass is tried again
+    engine : ``"local"`` or ``"dask"``
+    scheduler : address of a Dask scheduler, which means the engine, too
     overwrite, fresh : as of `Job`
     quiet : whether nothing but failures is said
     command : the line that asked for it
@@ -52,6 +54,8 @@ class Request:
     reference_name: str | None = None
     jobs: int | None = None
     retry: int = 0
+    engine: str = "local"
+    scheduler: str | None = None
     overwrite: bool = False
     fresh: bool = False
     quiet: bool = False
@@ -69,5 +73,7 @@ class Request:
             raise UsageError(f"The number of jobs must be positive, not {self.jobs}.")
         if self.reference_name is not None and self.references is None:
             raise UsageError("A template of references needs the folder that they lie in: add --reference-dir.")
+        if self.engine not in ("local", "dask"):
+            raise UsageError(f"The engine is local or dask, not {self.engine!r}.")
         if self.retry < 0:
             raise UsageError(f"The number of further attempts must not be negative, not {self.retry}.")

@@ -9,6 +9,7 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gnrecon.batch.capacity import fitting_jobs
+from gnrecon.batch.cluster import run_on_cluster
 from gnrecon.batch.devices import cuda_devices
 from gnrecon.batch.live import Board
 from gnrecon.batch.local import run_locally
@@ -54,7 +55,10 @@ def run_batch(request: Request) -> int:
 
         try:
             with board.shown():
-                run_locally(jobs, count, devices, done)
+                if request.engine == "dask" or request.scheduler is not None:
+                    run_on_cluster(jobs, request.scheduler, count, devices, done)
+                else:
+                    run_locally(jobs, count, devices, done)
         except KeyboardInterrupt:  # What was done until now is still worth its account.
             interrupted = True
         ordered = tuple(outcomes[job.name] for job in jobs if job.name in outcomes)

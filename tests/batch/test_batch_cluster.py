@@ -1,0 +1,88 @@
+"""The batch on a Dask cluster: a worker that is killed costs nothing, and nothing is done twice."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import errands
+import psutil
+import pytest
+from errands import job, notes
+
+from gnrecon.batch.cluster import Abandoned, run_on_cluster
+from gnrecon.batch.job import running_folder
+from gnrecon.batch.outcome import Outcome, Status
+from gnrecon.errors import UsageError
+
+# Dask's own threads and sockets go when they please.
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+def test_nothing_is_lost_and_nothing_done_twice_where_a_worker_is_killed(tmp_path: Path) -> None:
+    jobs = [job(tmp_path, f"s{number}", "good 0.4") for number in range(6)]
+    jobs += [job(tmp_path, "bad", "exit 4"), job(tmp_path, "killed", "signal SIGSEGV")]
+    outcomes: list[Outcome] = []
+
+    def done(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        if len(outcomes) == 2:
+            kill_a_worker(tmp_path)
+
+    run_on_cluster(jobs, None, 2, [], done, work=errands.WORK)
+    causes = {outcome.name: outcome.cause for outcome in outcomes}
+    assert len(causes) == len(outcomes) == len(jobs)
+    assert {name: str(cause) for name, cause in causes.items() if cause is not None} == {
+        "bad": "fit",
+        "killed": "signal",
+    }
+    ended = notes(tmp_path / "scans", "ended")
+    assert set(ended) == {f"s{number}" for number in range(6)}
+    # What was finished when the worker was killed is not done twice; the scan that it had is begun again.
+    assert [ended.count(outcome.name) for outcome in outcomes[:2] if not outcome.failed] == [1, 1]
+    assert len(notes(tmp_path / "scans", "began")) > len(jobs)
+    assert not list(running_folder(tmp_path / "meshes").glob(".batch-*"))
+    # What is there is not done again, whichever the engine.
+    again: list[Outcome] = []
+    run_on_cluster(jobs[:6], None, 1, [], again.append, work=errands.WORK)
+    assert {outcome.status for outcome in again} == {Status.UNCHANGED}
+
+
+def kill_a_worker(folder: Path) -> None:
+    """Kill the worker that forked the child of a running scan."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        for process in psutil.Process().children(recursive=True):
+            try:
+                forker = process.parent()
+                if _is_child(process, folder) and forker is not None and (worker := forker.parent()) is not None:
+                    os.kill(worker.pid, signal.SIGKILL)
+                    return
+            except psutil.Error:
+                continue
+    raise AssertionError("no scan is running")
+
+
+def _is_child(process: psutil.Process, folder: Path) -> bool:
+    return any(Path(file.path).is_relative_to(folder / "meshes" / ".gnrecon" / "logs") for file in process.open_files())
+
+
+def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gnrecon.batch.cluster._PATIENCE", "1s")
+    outcomes: list[Outcome] = []
+    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+        with pytest.raises(UsageError, match=f"No scheduler answers at {re.escape(address)}"):
+            run_on_cluster([job(tmp_path, "a", "good")], address, 1, [], outcomes.append)
+    assert not outcomes
+
+
+def test_a_sign_that_is_late_is_no_end(tmp_path: Path) -> None:
+    stop = Abandoned(tmp_path / "sign")
+    assert not stop.is_set()
+    (tmp_path / "sign").touch()
+    assert not stop.is_set()
+    (tmp_path / "sign").unlink()
+    assert stop.is_set()
