@@ -68,7 +68,8 @@ def _items(kind: Any, value: Any) -> tuple[Any, ...] | None:
     if isinstance(value, str) and kind is str:
         return (value,)
     if isinstance(value, str):
-        value = [_read(part) for part in value.split(",")]
+        read = _read(value)
+        value = read if isinstance(read, list) else [_read(part) for part in value.split(",")]
     items = [_as(kind, item) for item in value] if isinstance(value, list) else [_as(kind, value)]
     return None if any(item is None for item in items) else tuple(items)
 
