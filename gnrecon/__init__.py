@@ -32,7 +32,17 @@ if TYPE_CHECKING:
     )
     from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
     from gnrecon.ingest import prepare, survey
-    from gnrecon.io import as_cloud, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
+    from gnrecon.io import (
+        as_cloud,
+        as_mesh,
+        read_cloud,
+        read_mesh,
+        to_open3d,
+        to_pymeshlab,
+        to_trimesh,
+        write_cloud,
+        write_mesh,
+    )
     from gnrecon.options import Options
     from gnrecon.page import write_page
     from gnrecon.pipeline import Progress, Reconstruction, reconstruct
@@ -54,7 +64,17 @@ _ROOMS = {
     ),
     "gnrecon.fit": ("FitOptions", "NeuralSDF", "Uncertainty", "fit"),
     "gnrecon.ingest": ("prepare", "survey"),
-    "gnrecon.io": ("as_cloud", "read_cloud", "read_mesh", "to_open3d", "to_trimesh", "write_mesh"),
+    "gnrecon.io": (
+        "as_cloud",
+        "as_mesh",
+        "read_cloud",
+        "read_mesh",
+        "to_open3d",
+        "to_pymeshlab",
+        "to_trimesh",
+        "write_cloud",
+        "write_mesh",
+    ),
     "gnrecon.options": ("Options",),
     "gnrecon.page": ("write_page",),
     "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
@@ -84,6 +104,7 @@ __all__ = [
     "UsageError",
     "__version__",
     "as_cloud",
+    "as_mesh",
     "examine",
     "extract",
     "fit",
@@ -101,9 +122,11 @@ __all__ = [
     "shaped",
     "survey",
     "to_open3d",
+    "to_pymeshlab",
     "to_trimesh",
     "trim",
     "verify",
+    "write_cloud",
     "write_mesh",
     "write_page",
 ]

@@ -36,7 +36,18 @@ from gnrecon.export import (
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units, layers_of, prepare, survey
-from gnrecon.io import Reading, as_cloud, cropped, read_reference, read_scans, to_open3d, to_trimesh, write_mesh
+from gnrecon.io import (
+    Reading,
+    as_cloud,
+    as_shape,
+    cropped,
+    read_reference,
+    read_scans,
+    to_open3d,
+    to_pymeshlab,
+    to_trimesh,
+    write_mesh,
+)
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
@@ -120,6 +131,10 @@ class Reconstruction:
         """Return the mesh as an `open3d.geometry.TriangleMesh`."""
         return to_open3d(self.mesh)
 
+    def to_pymeshlab(self) -> Any:
+        """Return the mesh as a `pymeshlab.MeshSet`."""
+        return to_pymeshlab(self.mesh)
+
 
 def reconstruct(
     source: Any,
@@ -134,11 +149,12 @@ def reconstruct(
 
     Parameters
     ----------
-    source : path, list of paths, array of shape (N, 3) or (N, 6), PointCloud, open3d or trimesh point cloud
-        Points, in any unit, with or without normals. Several files are merged, after the poses that they hold.
+    source : path, list of paths, array of shape (N, 3) or (N, 6), PointCloud, or whatever else `as_cloud` takes
+        Points, in any unit, with or without normals: other libraries' clouds and meshes, tensors, named columns.
+        Several files are merged, after the poses that they hold.
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
-    reference : path, Mesh or PointCloud, optional
+    reference : path, Mesh, PointCloud, or another library's, optional
         Truth to measure the mesh against.
     format : str, optional
         Extension that says how the scan's file is read, such as ``"ply"``; by default its own.
@@ -307,7 +323,9 @@ def _named(source: Any) -> str:
 
 
 def _reference(reference: Any) -> Mesh | PointCloud | None:
-    return read_reference(reference) if isinstance(reference, str | Path) else reference
+    if reference is None:
+        return None
+    return read_reference(reference) if isinstance(reference, str | Path) else as_shape(reference)
 
 
 def _verify(path: Path, bordered: bool) -> None:

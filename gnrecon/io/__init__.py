@@ -2,7 +2,8 @@
 
 from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
-from gnrecon.io.objects import as_cloud, to_open3d, to_trimesh
+from gnrecon.io.handed import to_open3d, to_pymeshlab, to_trimesh
+from gnrecon.io.objects import as_cloud, as_mesh, as_shape
 from gnrecon.io.plugged import readable, writable
 from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
 from gnrecon.io.scans import MOST_POINTS, Reading, cropped, read_scans
@@ -16,6 +17,8 @@ __all__ = [
     "WRITERS",
     "Reading",
     "as_cloud",
+    "as_mesh",
+    "as_shape",
     "atomic_write",
     "check_writable",
     "cropped",
@@ -28,6 +31,7 @@ __all__ = [
     "read_scans",
     "readable",
     "to_open3d",
+    "to_pymeshlab",
     "to_trimesh",
     "unverified",
     "writable",

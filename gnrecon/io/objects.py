@@ -1,4 +1,4 @@
-"""Clouds and meshes of other libraries, in and out of ours.
+"""Clouds and meshes of other libraries as ours.
 
 An object's type is told from the module that defines it, so that no library is imported that the caller has not loaded.
 """
@@ -13,7 +13,14 @@ import numpy.typing as npt
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
+from gnrecon.io.contents import from_columns
 from gnrecon.mesh import Mesh
+
+_POINTS = (
+    "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, or a cloud of open3d, trimesh or "
+    "pymeshlab"
+)
+_MESH = "a mesh of open3d, trimesh or pymeshlab, or a pair of vertices, of shape (V, 3), and faces, of shape (F, 3)"
 
 
 def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
@@ -21,8 +28,10 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
 
     Parameters
     ----------
-    obj : array of shape (N, 3), or (N, 6) with normals; torch tensor of the same; open3d PointCloud (legacy or tensor);
-        trimesh PointCloud or Trimesh; PointCloud; Mesh
+    obj : array of shape (N, 3), or (N, 6) with normals; torch tensor of the same; structured array, mapping or data
+        frame of columns x, y, z, nx, ny, nz, red, ... as in files; open3d PointCloud (legacy or tensor); trimesh
+        PointCloud; pymeshlab Mesh or MeshSet (its current mesh); PointCloud; Mesh and other libraries' meshes, of which
+        the vertices are taken
     normals : array of shape (N, 3), optional
         Used instead of those that `obj` carries.
 
@@ -31,80 +40,149 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
     InputError
         When `obj` is none of these, or shapes do not fit.
     """
-    cloud = _convert(obj)
+    found = _known(obj)
+    if found is None:
+        found = _columns(obj) if _names(obj) else _from_array(_array(obj))
+    cloud = PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
     return cloud if normals is None else cloud.with_normals(_array(normals))
 
 
-def _convert(obj: Any) -> PointCloud:
-    if isinstance(obj, PointCloud):
+def as_mesh(obj: Any) -> Mesh:
+    """Return a mesh from any of the common carriers of meshes.
+
+    Parameters
+    ----------
+    obj : open3d TriangleMesh (legacy or tensor); trimesh Trimesh; pymeshlab Mesh or MeshSet (its current mesh); a pair
+        of vertices, of shape (V, 3), and faces, of shape (F, 3), as arrays or tensors; Mesh
+
+    Raises
+    ------
+    InputError
+        When `obj` is none of these, has no faces, or shapes do not fit.
+    """
+    found = _known(obj)
+    if found is None and isinstance(obj, tuple | list) and len(obj) == 2:
+        vertices, faces = (_array(part, _MESH) for part in obj)
+        if vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3:
+            found = Mesh(vertices, faces.astype(np.int64))
+    if not isinstance(found, Mesh) or not len(found.faces):
+        raise InputError(f"Expected {_MESH}, but got {type(obj).__name__}{' without faces' if found else ''}.")
+    return found
+
+
+def as_shape(obj: Any) -> Mesh | PointCloud:
+    """Return a mesh where an object has faces, else a cloud.
+
+    Raises
+    ------
+    InputError
+        As `as_cloud` does.
+    """
+    found = _known(obj)
+    return as_cloud(obj) if found is None else found
+
+
+def _known(obj: Any) -> Mesh | PointCloud | None:
+    """What an object of a library that is known here holds; None where it is none."""
+    if isinstance(obj, PointCloud | Mesh):
         return obj
-    if isinstance(obj, Mesh):
-        return PointCloud(obj.vertices, obj.vertex_normals(), obj.attributes)
     libraries = {kind.__module__.partition(".")[0] for kind in type(obj).__mro__}
-    if "open3d" in libraries and hasattr(obj, "point"):
+    if "open3d" in libraries and (hasattr(obj, "point") or hasattr(obj, "vertex")):
         return _from_open3d_tensor(obj)
-    if "open3d" in libraries and hasattr(obj, "points"):
-        colors = {"colors": np.array(obj.colors)} if obj.has_colors() else {}
-        return PointCloud(np.array(obj.points), np.array(obj.normals) if obj.has_normals() else None, colors)
+    if "open3d" in libraries and (hasattr(obj, "points") or hasattr(obj, "triangles")):
+        return _from_open3d(obj)
     if "trimesh" in libraries and hasattr(obj, "vertices"):
-        has_faces = hasattr(obj, "faces") and len(obj.faces) > 0
-        normals = np.array(obj.vertex_normals) if has_faces else None
-        seen = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
-        # A cloud without colours may say that it has some, and hold none.
-        return PointCloud(np.array(obj.vertices), normals, {"colors": seen} if len(seen) else {})
-    return _from_array(_array(obj))
+        return _from_trimesh(obj)
+    if "pymeshlab" in libraries and (hasattr(obj, "current_mesh") or hasattr(obj, "vertex_matrix")):
+        return _from_pymeshlab(obj)
+    return None
 
 
-def _from_open3d_tensor(obj: Any) -> PointCloud:
-    arrays = {name: obj.point[name].cpu().numpy() for name in obj.point}
+def _made(
+    points: Any, faces: Any, normals: Any = None, attributes: dict[str, npt.NDArray[Any]] | None = None
+) -> Mesh | PointCloud:
+    """A mesh where there are faces, with colours as 8-bit numbers, else a cloud."""
+    held = attributes or {}
+    if faces is None or not len(faces):
+        return PointCloud(points, normals, held)
+    return Mesh(points, faces, normals, held | ({"colors": as_bytes(held["colors"])} if "colors" in held else {}))
+
+
+def _from_open3d(obj: Any) -> Mesh | PointCloud:
+    if hasattr(obj, "points"):
+        colors = {"colors": np.array(obj.colors)} if obj.has_colors() else {}
+        return _made(np.array(obj.points), None, np.array(obj.normals) if obj.has_normals() else None, colors)
+    colors = {"colors": np.array(obj.vertex_colors)} if obj.has_vertex_colors() else {}
+    normals = np.array(obj.vertex_normals) if obj.has_vertex_normals() else None
+    return _made(np.array(obj.vertices), np.array(obj.triangles), normals, colors)
+
+
+def _from_open3d_tensor(obj: Any) -> Mesh | PointCloud:
+    carrier = obj.point if hasattr(obj, "point") else obj.vertex
+    arrays = {name: carrier[name].cpu().numpy() for name in carrier}
     if "positions" not in arrays:
-        raise InputError("The open3d point cloud holds no positions.")
+        raise InputError("The open3d point cloud or mesh holds no positions.")
     points = arrays.pop("positions")
-    return PointCloud(points, arrays.pop("normals", None), arrays)
+    indexed = hasattr(obj, "triangle") and "indices" in obj.triangle
+    faces = obj.triangle.indices.cpu().numpy() if indexed else None
+    return _made(points, faces, arrays.pop("normals", None), arrays)
 
 
-def _array(obj: Any) -> npt.NDArray[np.float64]:
+def _from_trimesh(obj: Any) -> Mesh | PointCloud:
+    has_faces = hasattr(obj, "faces") and len(obj.faces) > 0
+    seen = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
+    # A cloud without colours may say that it has some, and hold none.
+    held = {"colors": seen} if len(seen) else {}
+    if not has_faces:
+        return _made(np.array(obj.vertices), None, None, held)
+    held = {name: np.array(values) for name, values in obj.vertex_attributes.items()} | held
+    return _made(np.array(obj.vertices), np.array(obj.faces), np.array(obj.vertex_normals), held)
+
+
+def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
+    if hasattr(obj, "current_mesh"):
+        if not obj.mesh_number():
+            raise InputError("The pymeshlab MeshSet holds no mesh.")
+        obj = obj.current_mesh()
+    points, faces, normals = obj.transformed_vertex_matrix(), obj.face_matrix(), obj.vertex_normal_matrix()
+    colors, values = obj.vertex_color_matrix(), obj.vertex_scalar_array()
+    # Every mesh there has normals, made of its faces, and colours and values, white and zero where nothing was given.
+    held = {} if (colors == 1).all() else {"colors": np.rint(255 * colors).astype(np.uint8)}
+    held |= {"quality": values} if values.any() else {}
+    turn = obj.transform_matrix()[:3, :3]
+    own = np.linalg.solve(turn.T, normals.T).T if normals.any() and not len(faces) else None
+    return _made(points, faces, own, held)
+
+
+def _columns(obj: Any) -> PointCloud:
+    """A cloud of named columns, which may be those of a structured array, a mapping or a data frame."""
+    contents = from_columns({name: _column(obj[name]) for name in _names(obj)})
+    return PointCloud(contents.points, contents.normals, contents.attributes)
+
+
+def _names(obj: Any) -> list[str]:
+    if getattr(getattr(obj, "dtype", None), "names", None):
+        return list(obj.dtype.names)
+    return [str(name) for name in obj.keys()] if hasattr(obj, "keys") else []  # noqa: SIM118 - a data frame's are columns
+
+
+def _column(values: Any) -> npt.NDArray[Any]:
+    column = np.array(values.detach().cpu() if hasattr(values, "detach") else values)
+    if column.ndim != 1 or column.dtype.kind not in "biuf":
+        raise InputError(f"Expected columns of numbers, each of shape (N,), but got {column.dtype} of {column.shape}.")
+    return column
+
+
+def _array(obj: Any, expected: str = _POINTS) -> npt.NDArray[np.float64]:
     if hasattr(obj, "detach"):  # a torch tensor, on whatever device
         obj = obj.detach().cpu().numpy()
     try:
         return np.array(obj, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(
-            f"Expected points as an array of shape (N, 3) or (N, 6), or a cloud of open3d or trimesh, "
-            f"but got {type(obj).__name__}."
-        ) from None
+        raise InputError(f"Expected {expected}, but got {type(obj).__name__}.") from None
 
 
 def _from_array(rows: npt.NDArray[np.float64]) -> PointCloud:
     if rows.ndim != 2 or rows.shape[1] not in (3, 6):
         raise InputError(f"Expected points of shape (N, 3) or (N, 6), but got {rows.shape}.")
     return PointCloud(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
-
-
-def to_trimesh(mesh: Mesh) -> Any:
-    """Return a ``trimesh.Trimesh`` with the same vertices, faces, vertex normals and attributes, unprocessed."""
-    import trimesh
-
-    return trimesh.Trimesh(
-        mesh.vertices,
-        mesh.faces,
-        # A copy of the normals, because trimesh makes the array that it is given read-only.
-        vertex_normals=mesh.vertex_normals().copy(),
-        vertex_colors=mesh.attributes.get("colors"),
-        vertex_attributes={name: values for name, values in mesh.attributes.items() if name != "colors"},
-        process=False,
-    )
-
-
-def to_open3d(mesh: Mesh) -> Any:
-    """Return a legacy ``open3d.geometry.TriangleMesh`` with the same vertices, faces, vertex normals and colours."""
-    import open3d
-
-    result = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
-    )
-    result.vertex_normals = open3d.utility.Vector3dVector(mesh.vertex_normals())
-    if "colors" in mesh.attributes:
-        shares = as_bytes(mesh.attributes["colors"])[:, :3] / 255
-        result.vertex_colors = open3d.utility.Vector3dVector(shares)
-    return result

@@ -1,6 +1,6 @@
 """How files are read and written by their extension: by the built-in table, else by what other packages bring.
 
-A reader of another package takes a path and returns a `PointCloud`, a `Mesh`, or anything that `as_cloud` takes; a
+A reader of another package takes a path and returns a `PointCloud`, a `Mesh`, or anything else that `as_shape` takes; a
 writer takes a `Mesh` and a path. What comes back is checked as any input is, because nothing is known of that code.
 Extensions that are built in stay what they are.
 """
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from gnrecon.errors import InputError, OutputError
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, WRITERS
-from gnrecon.io.objects import as_cloud
+from gnrecon.io.objects import as_shape
 from gnrecon.mesh import Mesh
 from gnrecon.plugins import READERS as READER_GROUP
 from gnrecon.plugins import WRITERS as WRITER_GROUP
@@ -85,7 +85,7 @@ def _read(plugin: Plugin, read: Callable[[Path], Any], path: Path) -> Contents:
         found = read(path)
     with plugin.guarded(InputError):
         try:
-            shape = found if isinstance(found, Mesh) else as_cloud(found)
+            shape = as_shape(found)
         except InputError as error:
             raise InputError(f"{plugin} returned what is no cloud: {error}") from error
         attributes = {name: _column(plugin, name, values) for name, values in shape.attributes.items()}

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from gnrecon.cloud import PointCloud
+from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
-from gnrecon.io import as_cloud, to_open3d, to_trimesh
+from gnrecon.io import as_cloud, as_mesh, to_open3d, to_pymeshlab, to_trimesh
 from gnrecon.mesh import Mesh
 
 RNG = np.random.default_rng(0)
@@ -88,6 +91,108 @@ def test_meshes_go_out_unprocessed() -> None:
         np.testing.assert_array_equal(np.asarray(faces), doubled.faces)
     np.testing.assert_allclose(np.asarray(to_open3d(doubled).vertex_normals), doubled.vertex_normals())
     np.testing.assert_allclose(to_trimesh(doubled).vertex_normals, doubled.vertex_normals())
+
+
+MESHES = {
+    "plain": Mesh(POINTS[:4], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+    "rich": Mesh(
+        POINTS[:4],
+        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+        NORMALS[:4],
+        {"colors": RNG.integers(0, 255, (4, 4), dtype=np.uint8), "heat": RNG.normal(size=4)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize(
+    ("out", "keeps"),
+    [(to_trimesh, 4), (to_open3d, 3), (lambda mesh: to_open3d(mesh, tensor=True), 4), (to_pymeshlab, 4)],
+    ids=["trimesh", "open3d", "open3d tensor", "pymeshlab"],
+)
+def test_meshes_go_through_other_libraries_and_back(name: str, out: Callable[[Mesh], Any], keeps: int) -> None:
+    mesh = MESHES[name]
+    back = as_mesh(out(mesh))
+    np.testing.assert_array_equal(back.vertices, mesh.vertices)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    # MeshLab makes its own.
+    normals = Mesh(mesh.vertices, mesh.faces) if out is to_pymeshlab else mesh
+    np.testing.assert_allclose(back.vertex_normals(), normals.vertex_normals(), atol=1e-12)
+    assert ("colors" in back.attributes) == ("colors" in mesh.attributes)
+    if "colors" in mesh.attributes:
+        np.testing.assert_array_equal(back.attributes["colors"][:, :keeps], mesh.attributes["colors"][:, :keeps])
+    np.testing.assert_array_equal(as_cloud(out(mesh)).points, mesh.vertices)
+
+
+def test_attributes_go_out_where_there_is_a_place_for_them() -> None:
+    mesh = MESHES["rich"].with_attributes({"quality": np.arange(4), "vector": np.eye(4, 3), "pair": np.eye(4, 2)})
+    meshes = to_pymeshlab(mesh)
+    theirs = meshes.current_mesh()
+    np.testing.assert_array_equal(theirs.vertex_scalar_array(), np.arange(4))
+    np.testing.assert_array_equal(theirs.vertex_custom_scalar_attribute_array("heat"), mesh.attributes["heat"])
+    np.testing.assert_array_equal(theirs.vertex_custom_point_attribute_matrix("vector"), np.eye(4, 3))
+    np.testing.assert_array_equal(as_mesh(theirs).attributes["quality"], np.arange(4))
+    tensors = to_open3d(mesh, tensor=True)
+    np.testing.assert_array_equal(tensors.vertex["pair"].numpy(), np.eye(4, 2))
+    np.testing.assert_array_equal(as_mesh(tensors).attributes["heat"][:, 0], mesh.attributes["heat"])
+    np.testing.assert_array_equal(as_mesh(to_trimesh(mesh)).attributes["heat"], mesh.attributes["heat"])
+
+
+@pytest.mark.parametrize("normals", [NORMALS, None])
+@pytest.mark.parametrize("out", [to_open3d, lambda cloud: to_open3d(cloud, tensor=True), to_pymeshlab, to_trimesh])
+def test_clouds_go_through_other_libraries_and_back(out: Callable[[PointCloud], Any], normals: Any) -> None:
+    colors = RNG.integers(0, 255, (20, 3), dtype=np.uint8)
+    back = as_cloud(out(PointCloud(POINTS, normals, {"colors": colors})))
+    check(back, normals=normals is not None and out is not to_trimesh)
+    np.testing.assert_array_equal(as_bytes(back.attributes["colors"])[:, :3], colors)
+
+
+def test_named_columns() -> None:
+    columns = dict(zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack([POINTS, NORMALS]).T, strict=True))
+    columns |= {"red": np.arange(20), "green": np.arange(20), "blue": np.arange(20), "time": np.arange(20.0)}
+    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    for obj in (columns, rows):
+        check(as_cloud(obj), normals=True)
+        np.testing.assert_array_equal(as_cloud(obj).attributes["colors"], np.tile(np.arange(20)[:, None], 3))
+        np.testing.assert_array_equal(as_cloud(obj).attributes["time"], np.arange(20))
+    with pytest.raises(InputError, match="expected columns named x, y and z, but found x, y"):
+        as_cloud({"x": POINTS[:, 0], "y": POINTS[:, 1]})
+    with pytest.raises(InputError, match=r"columns of numbers, each of shape \(N,\)"):
+        as_cloud({"x": POINTS, "y": POINTS, "z": POINTS})
+
+
+def test_a_moved_layer_of_meshlab_is_where_it_was_moved_to() -> None:
+    meshes = to_pymeshlab(PointCloud(POINTS, NORMALS))
+    meshes.compute_matrix_from_translation(axisx=1.0, freeze=False)
+    np.testing.assert_allclose(as_cloud(meshes).points, POINTS + np.eye(3)[0], atol=1e-8)
+    meshes.compute_matrix_from_rotation(rotaxis="Z axis", angle=90.0, freeze=False)
+    x, y, z = NORMALS.T
+    np.testing.assert_allclose(as_cloud(meshes).normals, np.stack([-y, x, z], axis=1), atol=1e-8)
+
+
+def test_pairs_of_vertices_and_faces_are_meshes() -> None:
+    import torch
+
+    mesh = MESHES["plain"]
+    for pair in ((mesh.vertices, mesh.faces), [mesh.vertices.tolist(), torch.as_tensor(mesh.faces)]):
+        np.testing.assert_array_equal(as_mesh(pair).vertices, mesh.vertices)
+        np.testing.assert_array_equal(as_mesh(pair).faces, mesh.faces)
+    assert as_mesh(mesh) is mesh
+
+
+@pytest.mark.parametrize(
+    "obj", [POINTS, PointCloud(POINTS), (POINTS, POINTS[:, :2]), (POINTS, "faces"), "mesh.ply", None]
+)
+def test_what_has_no_faces_is_no_mesh(obj: object) -> None:
+    with pytest.raises(InputError, match="Expected a mesh of open3d"):
+        as_mesh(obj)
+
+
+def test_an_empty_set_of_meshes_is_refused() -> None:
+    import pymeshlab
+
+    with pytest.raises(InputError, match="holds no mesh"):
+        as_cloud(pymeshlab.MeshSet())
 
 
 def test_no_library_is_loaded_that_the_caller_does_not_use() -> None:
