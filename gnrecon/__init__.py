@@ -9,6 +9,7 @@ The names below are imported on first use, so that ``import gnrecon`` is fast.
 
 from __future__ import annotations
 
+import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -130,6 +131,10 @@ __all__ = [
     "write_mesh",
     "write_page",
 ]
+
+
+# A library is silent unless the program that uses it asks for its log.
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 
 def __getattr__(name: str) -> Any:

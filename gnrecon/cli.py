@@ -277,7 +277,16 @@ Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that exist; never the input.", rich_help_panel=OUTPUT)
 ]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but failures.", rich_help_panel=OUTPUT)]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print a line for each step.", rich_help_panel=OUTPUT)]
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "-v", "--verbose", help="Print choices, counts, and a line for each stage and step.", rich_help_panel=OUTPUT
+    ),
+]
+Log = Annotated[
+    Path | None,
+    typer.Option(help="File to append a log to: all that -v prints and more, with times.", rich_help_panel=OUTPUT),
+]
 Debug = Annotated[bool, typer.Option("--debug", help="Show a traceback on failure.", rich_help_panel=OUTPUT)]
 
 
@@ -355,6 +364,7 @@ def reconstruct_command(
         Path | None,
         typer.Option(help="Configuration to write, with all options in effect, for --config.", rich_help_panel=OUTPUT),
     ] = None,
+    log: Log = None,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Tell what would be done, and write nothing.", rich_help_panel=OUTPUT),
@@ -379,7 +389,7 @@ def reconstruct_command(
 
         files.check()
         raise SystemExit(info(scans, options, format))
-    raise SystemExit(run(files, options, command=context.obj, quiet=quiet, verbose=verbose))
+    raise SystemExit(run(files, options, command=context.obj, quiet=quiet, verbose=verbose, log=log))
 
 
 @app.command("batch")

@@ -5,6 +5,7 @@ A reconstruction and `gnrecon mesh`, which meshes a saved field again, both do t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from gnrecon.export import SignedDistance, extract, project, refine, remove_stra
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
+
+_log = logging.getLogger(__name__)
 
 SAFE = 0.95
 """Share of the wanted chord error at which a mesh is fine enough: projected as a whole, it may differ a little."""
@@ -96,6 +99,7 @@ def mesh_field(
         # The first step need not be exact, only the last.
         mesh = project(mesh, fast, steps=1, advance=part(advance, 0.0, 0.3))
         mesh = project(mesh, field, steps=1, advance=part(advance, 0.3, 1.0))
+    _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []
     if options.refine().anything:
         with stages("refine"):

@@ -6,7 +6,9 @@ The way of the data: file -> cloud -> samples -> fitted field -> mesh -> report.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +50,7 @@ from gnrecon.io import (
     to_trimesh,
     write_mesh,
 )
+from gnrecon.logs import TOLD
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import mesh_field
 from gnrecon.optim import Record, Solution
@@ -55,6 +58,9 @@ from gnrecon.options import Options
 from gnrecon.region import Region
 from gnrecon.report import Stages, plain, versions
 from gnrecon.schema import SCHEMA_VERSION
+from gnrecon.version import __version__
+
+_log = logging.getLogger(__name__)
 
 
 class Progress:
@@ -184,6 +190,8 @@ def reconstruct(
 def limited(threads: int | None) -> Iterator[None]:
     """Run a block with so many of torch's threads (None: as many as before), and say so where memory does not suffice.
 
+    Other threads of the program, and those that it starts later, have as many of torch's threads as before.
+
     Raises
     ------
     MemoryLimitError
@@ -192,7 +200,7 @@ def limited(threads: int | None) -> Iterator[None]:
     before = torch.get_num_threads()
     try:
         if threads is not None:
-            torch.set_num_threads(threads)
+            _set_here(threads)
         yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
         raise
@@ -204,13 +212,33 @@ def limited(threads: int | None) -> Iterator[None]:
             raise _out_of_memory(error) from error
         raise
     finally:
-        torch.set_num_threads(before)
+        if threads is not None:
+            _set_here(before)
+
+
+def _set_here(threads: int) -> None:
+    """Set how many threads torch has for this thread's calls alone; torch sets it for threads that begin later, too."""
+    with ThreadPoolExecutor(1) as apart:
+        default = apart.submit(torch.get_num_threads).result()
+        torch.set_num_threads(threads)
+        apart.submit(torch.set_num_threads, default).result()
 
 
 def _run(
     read: Callable[[], tuple[PointCloud, Reading]], source: Any, reference: Any, progress: Progress, options: Options
 ) -> Reconstruction:
     stages = Stages(progress.stage, options.device)
+    _log.info("gnrecon %s reconstructs %s.", __version__, _named(source))
+    _log.debug("Options: %s.", options)
+
+    def remark(sentence: str) -> None:
+        _log.info(sentence, extra=TOLD)
+        progress.remark(sentence)
+
+    def step(record: Record) -> None:
+        _log.debug("Step %d of at most %d: %s.", record.step, total, record)
+        progress.step(record, total)
+
     with stages("read"):
         cloud, reading = read()
         progress.advance(0.5)
@@ -222,15 +250,15 @@ def _run(
     options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
     warnings = [] if layers is None else [layers.describe()]
     for sentence in [*reading.remarks(), *counts.remarks(), *warnings]:
-        progress.remark(sentence)
+        remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
-        sdf, solution = fit(samples, options.fit(), lambda record: progress.step(record, total), progress.advance)
+        sdf, solution = fit(samples, options.fit(), step, progress.advance)
         residuals = Misfit.of(sdf, samples)
         unseen = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
-    progress.remark(solution.status)
+    remark(solution.status)
     if unseen is not None:
-        progress.remark(f"At {counts.held_out} points that the fit never saw: {unseen.describe()}")
+        remark(f"At {counts.held_out} points that the fit never saw: {unseen.describe()}")
     # The field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
     mesh, actions = meshed.mesh, meshed.actions
@@ -242,7 +270,7 @@ def _run(
             mesh, trimming = trim(mesh, around.distances(mesh.vertices), reach)
         actions = [*actions, *trimming.describe()]
     for sentence in actions:
-        progress.remark(sentence)
+        remark(sentence)
     with stages("verify"):
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with stages("attributes"):
@@ -251,7 +279,7 @@ def _run(
         sources = Sources(mesh, sdf, cloud, around, distances, samples, options)
         mesh, attributes, remarks = adorn(sources, progress.advance)
     for sentence in [*(unsupported.describe() if trimming is None else []), *remarks]:
-        progress.remark(sentence)
+        remark(sentence)
     metrics = None
     if truth is not None:
         with stages("measure"):

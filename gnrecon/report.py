@@ -5,6 +5,7 @@ What the numbers mean, and their units, is told for each by the JSON schema besi
 
 from __future__ import annotations
 
+import logging
 import math
 import platform
 import time
@@ -17,6 +18,8 @@ import torch
 
 from gnrecon.memory import PeakMemory, process_peak_mb
 from gnrecon.version import __version__
+
+_log = logging.getLogger(__name__)
 
 _NAMED = ("numpy", "scipy", "torch", "open3d", "scikit-image", "manifold3d", "trimesh")
 
@@ -43,6 +46,7 @@ class Stages:
     def __call__(self, name: str) -> Iterator[None]:
         """Time a block and watch its memory."""
         self._announce(name)
+        _log.debug("Stage %s begins.", name)
         with PeakMemory() as peak:
             start, cpu_start = time.perf_counter(), time.process_time()
             yield
@@ -50,6 +54,7 @@ class Stages:
         self._sampled |= peak.sampled
         times = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu_seconds, 3)}
         self._done.append({"name": name, **times, "peak_memory_mb": peak.mb})
+        _log.info("Stage %s: %.1f s (%.1f s of processors), %.0f MB at most.", name, seconds, cpu_seconds, peak.mb)
 
     @property
     def _on_cuda(self) -> bool:

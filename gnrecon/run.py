@@ -17,6 +17,7 @@ from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import render, render_sheet
 from gnrecon.files import require_files
 from gnrecon.io import check_writable, written_origin
+from gnrecon.logs import logged
 from gnrecon.optim import Record
 from gnrecon.page import page_text
 from gnrecon.pipeline import Progress as PipelineProgress
@@ -79,9 +80,14 @@ class Files:
             raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
-        inputs = [path for path in (*self.scans, self.reference) if path is not None]
+        inputs, targets = self.named()
+        require_files(inputs, targets, self.overwrite)
+
+    def named(self) -> tuple[list[Path], list[Path]]:
+        """Return the files that are read, and those that are written."""
         asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
-        require_files(inputs, [path for path in asked if path is not None], self.overwrite)
+        inputs = [path for path in (*self.scans, self.reference) if path is not None]
+        return inputs, [path for path in asked if path is not None]
 
 
 def run(
@@ -91,11 +97,18 @@ def run(
     command: str | None = None,
     quiet: bool = False,
     verbose: bool = False,
+    log: Path | None = None,
     watcher: PipelineProgress | None = None,
 ) -> int:
     """Reconstruct one scan and return the exit code.
 
-    `command` is the line that asked for it, for the report; a `watcher` is told of stages and steps in the bar's place.
+    Parameters
+    ----------
+    files, options : what is read and written, and how, see `Options`
+    command : the line that asked for it, for the report
+    quiet, verbose : say nothing but failures; print choices, counts, stages and steps
+    log : file to append to what the library logs
+    watcher : told of stages and steps in the bar's place
 
     Raises
     ------
@@ -104,7 +117,9 @@ def run(
     """
     files.check()
     console = Console(stderr=True, quiet=quiet)
-    with shown(console, verbose) if watcher is None else nullcontext(watcher) as progress:
+    others = [path for paths in files.named() for path in paths]
+    bar = shown(console, verbose) if watcher is None else nullcontext(watcher)
+    with logged(console if verbose else None, log, others), bar as progress:
         result = reconstruct(files.scans, reference=files.reference, format=files.format, progress=progress, **options)
         result.report["command"] = command
         progress.stage("write")

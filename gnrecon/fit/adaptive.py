@@ -9,6 +9,7 @@ so that clean scans are interpolated and noisy ones smoothed, without a setting.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,8 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.smoothness import global_length, smooth_spectrum
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Solution
+
+_log = logging.getLogger(__name__)
 
 COARSE_POINTS, COARSE_UNITS = 5000, 1000
 
@@ -61,6 +64,13 @@ def fit_adaptive(
     scene = Scene.of(seen, options.device, rng)
     field = Siren((COARSE_UNITS,))
     spectrum = smooth_spectrum(global_length(samples, held, scene, rng.spawn(1)[0]), scene)
+    _log.info(
+        "The global field has %d features of length %.3g radii, and sees %d points; %d are left out.",
+        COARSE_UNITS,
+        spectrum.length,
+        len(rows),
+        out,
+    )
     linear = replace(options, widths=field.widths, steps=0)
     fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())

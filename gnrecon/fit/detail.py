@@ -8,6 +8,7 @@ the data (`patch`) with a length and noise that the data itself chose (`choose`)
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ from gnrecon.fit.choose import Int, Leftover, Mask, Volume, choose
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import CoarseDistance
+
+_log = logging.getLogger(__name__)
 
 CELL = 5.0
 """Edge of a cube, in lengths."""
@@ -63,6 +66,13 @@ def fit_detail(
     """
     leftover = left_over(sdf, samples)
     belief = choose(leftover, held, leftover.density.radius, rng, device)
+    _log.info(
+        "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",
+        belief.length,
+        belief.position,
+        belief.angle,
+        features,
+    )
     advance(CHOSEN)
     coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
     return _Cubes.of(leftover, belief, features, rng, device).detail(sdf, coarse, rng, advance)
@@ -112,6 +122,7 @@ class _Cubes:
                 amplitudes.append(system.solve(self.belief.position, self.belief.angle))
             advance(CHOSEN + (1.0 - CHOSEN) * (number + 1) / len(keys))
         solved = torch.stack(amplitudes)
+        _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
         noise = self.belief.position, self.belief.angle
         return Detail(self.partition, np.array(kept), np.array(lengths), self.features, solved, *noise)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from gnrecon.ingest.smooth import smoothed
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample as thin
 from gnrecon.lengths import parse_reach
+
+_log = logging.getLogger(__name__)
 
 CLEANED, ORIENTED = 0.2, 0.7
 """About which shares of the time have passed after cleaning and after the normals."""
@@ -82,6 +85,15 @@ def prepare(
     counts = replace(counts, normals=orientation.how, confidence=orientation.confidence, flipped=orientation.flipped)
     assert kept.normals is not None
     frame = Frame.of(kept.points)
+    _log.info(
+        "Kept %d of %d points, %d apart from the fit; normals: %s; centre %s, radius %.6g.",
+        len(kept),
+        len(cloud),
+        len(held_out),
+        orientation.how,
+        frame.center.tolist(),
+        frame.scale,
+    )
     held = _held_samples(held_out, frame)
     return Samples(frame.to_unit(kept.points), kept.normals, frame, held, orientation.estimated), counts
 

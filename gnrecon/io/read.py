@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,8 @@ from gnrecon.io.formats import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED
 from gnrecon.io.plugged import is_readable, readable, reader_of
 from gnrecon.io.unpack import extension_of, plain_file
 from gnrecon.mesh import Mesh
+
+_log = logging.getLogger(__name__)
 
 
 def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
@@ -118,6 +121,7 @@ def read_contents(path: Path, format: str | None) -> Contents:
         contents = read(file)
         if not len(contents.points):
             raise InputError("the file holds no points.")
+    _log.info("Read %d points and %d faces of %s.", len(contents.points), len(contents.faces), path)
     return contents
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,6 +18,8 @@ from gnrecon.io.same_scan import Moments, same_scans
 from gnrecon.io.unpack import plain_file
 from gnrecon.mesh import Mesh
 from gnrecon.region import Region
+
+_log = logging.getLogger(__name__)
 
 MOST_POINTS = 2_000_000
 """Points that are kept of a scan by default: a surface is described well by far fewer."""
@@ -140,6 +143,7 @@ def _gather(path: Path, format: str | None, gatherer: Gatherer, moments: Moments
             gatherer.add(_with_normals(chunk))
         if gatherer.seen == before:
             raise InputError("the file holds no points.")
+    _log.info("Read %d points of %s as %s.", gatherer.seen - before, path, extension)
     return extension
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from gnrecon.mesh import Mesh
 
 _NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
 _INT32_LIMIT = 2**31
+
+_log = logging.getLogger(__name__)
 
 
 def write_mesh(
@@ -59,6 +62,7 @@ def write_mesh(
     except MeshError as error:
         # Rounding is then the likely reason.
         raise MeshError("; ".join([str(error).removesuffix("."), *stored]).removesuffix(".") + ".") from error
+    _log.info("Wrote %d vertices and %d faces to %s.", len(mesh.vertices), len(mesh.faces), path)
     return _lost(mesh, held, extension) + stored + unread
 
 

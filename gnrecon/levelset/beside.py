@@ -14,6 +14,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Generic, TypeVar
 
+import torch
+
 Input = TypeVar("Input")
 Answer = TypeVar("Answer")
 
@@ -28,7 +30,8 @@ class Beside(Generic[Input, Answer]):
 
     def __init__(self, work: Callable[[Input], Answer]) -> None:
         self._work = work
-        self._pool = ThreadPoolExecutor(1)
+        # As many of torch's threads as the one that asks has.
+        self._pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(torch.get_num_threads(),))
         self._last: Future[Answer] | None = None
 
     def __call__(self, current: Input) -> Answer:

@@ -20,6 +20,7 @@ last one always does.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from dataclasses import dataclass, field, replace
@@ -36,6 +37,8 @@ from gnrecon.linalg.preconditioner import Jacobi
 from gnrecon.linalg.row_space import RowSpace, constant_on_groups
 from gnrecon.linalg.sampled_gram import SampledGram
 from gnrecon.linalg.system import DampedSystem, LinearSolver
+
+_log = logging.getLogger(__name__)
 
 FEWER = 0.8
 THIN = 8
@@ -98,6 +101,7 @@ class Auto:
         if self.choice is None or not self.choice.serves(jacobian, constant):
             memory = _memory(jacobian.device) if self.memory_bytes is None else self.memory_bytes
             self.choice = choose(jacobian, constant, memory, self.energy)
+            _log.info("%s", self.choice.why)
         self.choice = self.choice.reconsidered(jacobian)
         return self.choice.solver.linearise(jacobian, residual, lambda _: D)
 

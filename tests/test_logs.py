@@ -1,0 +1,134 @@
+"""What the library logs, and what the command line makes of it; without either, nothing is said."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scan_files import torus, write_scan
+
+from gnrecon.cli import main
+from gnrecon.errors import Cancelled, ExitCode
+from gnrecon.pipeline import Progress, reconstruct
+
+FEW: dict[str, Any] = {"widths": (150,), "steps": 1, "resolution": 24}
+WORDS = ("--widths", "150", "--steps", "1", "--resolution", "24")
+STAGES = ["read", "ingest", "fit", "extract", "project", "repair", "verify", "attributes"]
+
+
+@pytest.fixture(scope="module")
+def cloud() -> tuple[np.ndarray, np.ndarray]:
+    return torus(600, np.random.default_rng(3))
+
+
+@pytest.fixture
+def scan(tmp_path: Path, cloud: tuple[np.ndarray, np.ndarray]) -> Path:
+    return write_scan(tmp_path / "ring.ply", *cloud)
+
+
+def run(*words: object) -> int:
+    handler = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        main([str(word) for word in words])
+    signal.signal(signal.SIGTERM, handler)
+    return int(end.value.code or 0)
+
+
+def test_the_library_says_nothing_by_itself() -> None:
+    script = (
+        "import logging, gnrecon\nlogging.getLogger('gnrecon.fit').error('loud')\nprint(logging.getLogger().handlers)"
+    )
+    repository = Path(__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=repository, check=True)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+class Told(Progress):
+    """Keeps the remarks."""
+
+    def __init__(self) -> None:
+        self.remarks: list[str] = []
+
+    def remark(self, sentence: str) -> None:
+        self.remarks.append(sentence)
+
+
+def test_stages_choices_steps_and_remarks_are_logged(
+    cloud: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "gnrecon")
+    told = Told()
+    reconstruct(*cloud, progress=told, **FEW)
+    said = [record.getMessage() for record in caplog.records]
+    assert [line.split()[1] for line in said if line.endswith("begins.")] == STAGES
+    assert [line.split()[1].rstrip(":") for line in said if line.endswith("MB at most.")] == STAGES
+    assert sum(line.startswith("Step 1 of at most 1: Record(step=1") for line in said) == 1
+    assert any(line.startswith("Kept 600 of 600 points") for line in said)
+    assert any(line.startswith("Extracted ") and line.endswith("with 24 cells.") for line in said)
+    assert [record.getMessage() for record in caplog.records if getattr(record, "told", False)] == told.remarks
+    assert {record.name.partition(".")[0] for record in caplog.records} == {"gnrecon"}
+
+
+def test_a_log_is_appended_to_and_ends_with_the_failure(
+    scan: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log, mesh = tmp_path / "run.log", tmp_path / "mesh.obj"
+    assert run(scan, "-o", mesh, "--log", log, *WORDS, "-q") == ExitCode.OK
+    first = log.read_text()
+    assert capfd.readouterr().err == ""
+    assert all(line[:4].isdigit() and " gnrecon." in line for line in first.splitlines())
+    for words in (f"Read 600 points of {scan} as .ply.", "Stage fit: ", f"faces to {mesh}."):
+        assert words in first
+    (tmp_path / "bad.xyz").write_text("1 2 3\n")
+    assert run(tmp_path / "bad.xyz", "-o", tmp_path / "other.obj", "--log", log, *WORDS) == ExitCode.INPUT
+    assert log.read_text().startswith(first)
+    assert "ERROR gnrecon.logs: InputError: Only 1 of 1 points" in log.read_text()
+    assert "Traceback" in log.read_text()
+    # Nothing is left behind in this process.
+    assert [type(handler) for handler in logging.getLogger("gnrecon").handlers] == [logging.NullHandler]
+    assert logging.getLogger("gnrecon").level == logging.NOTSET
+
+
+def test_verbose_shows_the_log_and_tells_remarks_once(
+    scan: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run(scan, "-o", tmp_path / "mesh.obj", "-v", *WORDS) == ExitCode.OK
+    lines = capfd.readouterr().err.splitlines()
+    assert [line.split()[1].rstrip(":") for line in lines if line.startswith("Stage ")] == STAGES
+    assert sum(line.startswith("step    1/1") for line in lines) == 1
+    assert len(lines) == len(set(lines))
+    assert run(scan, "-o", tmp_path / "plain.obj", *WORDS) == ExitCode.OK
+    assert not [line for line in capfd.readouterr().err.splitlines() if line.startswith("Stage ")]
+    assert (tmp_path / "mesh.obj").read_bytes() == (tmp_path / "plain.obj").read_bytes()
+
+
+def test_a_log_that_cannot_be_written_is_refused(scan: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    before = scan.read_bytes()
+    for log, code, words in (
+        (scan, ExitCode.USAGE, "is named twice"),
+        (tmp_path / "mesh.obj", ExitCode.USAGE, "is named twice"),
+        (tmp_path / "no" / "run.log", ExitCode.OUTPUT, "cannot be written: No such file or directory"),
+    ):
+        assert run(scan, "-o", tmp_path / "mesh.obj", "--log", log, *WORDS) == code
+        assert words in capfd.readouterr().err
+    assert scan.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["ring.ply"]
+
+
+def test_a_cancelled_run_is_logged(
+    cloud: tuple[np.ndarray, np.ndarray], scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del cloud
+
+    def cancel(*_: object) -> None:
+        raise Cancelled
+
+    monkeypatch.setattr("gnrecon.run.Shown.stage", cancel)
+    assert run(scan, "-o", tmp_path / "mesh.obj", "--log", tmp_path / "run.log") == ExitCode.INTERRUPTED
+    assert "Cancelled: Cancelled; nothing was written." in (tmp_path / "run.log").read_text()

@@ -1,0 +1,106 @@
+"""Several threads, and an importing program: results do not depend on what runs beside them, and nothing is shared."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+from typing import Any
+
+import numpy as np
+import torch
+from scan_files import box, torus
+
+from gnrecon.optim import Record
+from gnrecon.pipeline import Progress, Reconstruction, limited, reconstruct
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
+HEAVY = ("torch", "open3d", "scipy", "trimesh", "pymeshlab", "skimage", "rich", "typer", "matplotlib")
+
+
+class Together(Progress):
+    """Lets the threads go on only when all of them are at the same place."""
+
+    def __init__(self, barrier: Barrier) -> None:
+        self._barrier = barrier
+
+    def stage(self, name: str) -> None:
+        del name
+        self._barrier.wait(60)
+
+    def step(self, record: Record, total: int) -> None:
+        del record, total
+        self._barrier.wait(60)
+
+
+def made(progress: Progress | None) -> list[Callable[[], Reconstruction]]:
+    """Two different reconstructions of as many stages and steps."""
+    ring, brick = torus(600, np.random.default_rng(1)), box(600, np.random.default_rng(2), (2.0, 1.5, 1.0))
+    return [
+        lambda: reconstruct(*ring, seed=1, progress=progress, **FEW),
+        lambda: reconstruct(*brick, seed=2, progress=progress, curvature=True, **FEW),
+    ]
+
+
+def parts(found: Reconstruction) -> list[Any]:
+    fit = found.report["fit"]["history"]
+    losses = [{name: value for name, value in record.items() if name != "seconds"} for record in fit]
+    return [
+        found.mesh.vertices.tobytes(),
+        found.mesh.faces.tobytes(),
+        {name: values.tobytes() for name, values in found.mesh.attributes.items()},
+        found.sdf.theta.numpy().tobytes(),
+        losses,
+        found.report["actions"],
+    ]
+
+
+def test_two_threads_find_what_one_finds() -> None:
+    alone = [parts(run()) for run in made(None)]
+    with ThreadPoolExecutor(2) as pool:
+        beside = list(pool.map(lambda run: parts(run()), made(Together(Barrier(2)))))
+    assert beside == alone
+
+
+def test_the_process_is_left_as_it_was() -> None:
+    def state() -> list[Any]:
+        return [
+            dict(os.environ),
+            list(warnings.filters),
+            np.geterr(),
+            np.random.get_state()[1].tolist(),
+            torch.initial_seed(),
+            torch.get_rng_state().tolist(),
+            torch.get_default_dtype(),
+            torch.get_num_threads(),
+            torch.is_grad_enabled(),
+            torch.are_deterministic_algorithms_enabled(),
+            str(Path.cwd()),
+        ]
+
+    before = state()
+    reconstruct(*torus(600, np.random.default_rng(1)), threads=1, **FEW)
+    assert state() == before
+
+
+def test_a_limit_of_threads_is_that_of_one_run() -> None:
+    def counts() -> tuple[int, int]:
+        with ThreadPoolExecutor(1) as fresh:
+            return torch.get_num_threads(), fresh.submit(torch.get_num_threads).result()
+
+    before = counts()
+    with limited(before[0] + 2):
+        assert counts() == (before[0] + 2, before[1])
+    assert counts() == before
+
+
+def test_importing_gnrecon_imports_no_heavy_library() -> None:
+    script = f"import sys, gnrecon\ndir(gnrecon)\nprint([name for name in {HEAVY} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=REPOSITORY, check=True)
+    assert done.stdout == "[]\n"
