@@ -84,7 +84,7 @@ def _parameters(signature: inspect.Signature) -> list[str]:
         if parameter.kind is parameter.KEYWORD_ONLY and not starred:
             parts.append("*")
             starred = True
-        prefix = {parameter.VAR_KEYWORD: "**", parameter.VAR_POSITIONAL: "*"}.get(parameter.kind, "")
+        prefix = "**" if parameter.kind is parameter.VAR_KEYWORD else ""
         default = "" if parameter.default is parameter.empty else f" = {_shown(parameter.default)}"
         parts.append(f"{prefix}{parameter.name}: {_typed(parameter.annotation)}{default}")
     return parts

@@ -12,7 +12,7 @@ from gnrecon.batch.job import STATE
 from gnrecon.batch.naming import Found
 from gnrecon.batch.record import all_records
 from gnrecon.errors import InputError
-from gnrecon.io import READERS, extension_of
+from gnrecon.io import extension_of, readable
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def find_scans(sources: Sequence[str], lists: Sequence[Path], search: Search) ->
     if not found:
         told = ", ".join([*sources, *map(str, lists)])
         wanted = f"that match {' or '.join(search.patterns)}; " if search.patterns else "; "
-        raise InputError(f"There are no scans in {told} {wanted}extensions read are {', '.join(READERS)}.")
+        raise InputError(f"There are no scans in {told} {wanted}extensions read are {', '.join(readable())}.")
     return list(found.values())
 
 
@@ -76,10 +76,11 @@ def _expanded(source: str, search: Search, must: bool) -> Iterator[Found]:
     elif path.exists():
         yield Found(path)
     elif glob.has_magic(source):
+        known = readable()
         for match in sorted(glob.glob(source, recursive=True)):  # noqa: PTH207 - Path.glob takes no absolute patterns
             if Path(match).is_dir():
                 yield from _in_folder(Path(match), search)
-            elif extension_of(Path(match)) in READERS:
+            elif extension_of(Path(match)) in known:
                 yield Found(Path(match))
     elif must:
         raise InputError(f"There is no file or folder {source}.")
@@ -89,6 +90,7 @@ def _expanded(source: str, search: Search, must: bool) -> Iterator[Found]:
 
 def _in_folder(folder: Path, search: Search) -> Iterator[Found]:
     """The files of a folder that could be scans, sorted by path; neither hidden ones nor the batch's own."""
+    known = readable()
     own, below = _outputs(search.output), _output_below(folder, search.output)
     for path in sorted(folder.rglob("*") if search.recursive else folder.iterdir()):
         inner = path.relative_to(folder)
@@ -96,7 +98,7 @@ def _in_folder(folder: Path, search: Search) -> Iterator[Found]:
             continue
         if below is not None and path.resolve().is_relative_to(below):
             continue
-        if extension_of(path) in READERS and path.is_file() and _matches(inner, search.patterns):
+        if extension_of(path) in known and path.is_file() and _matches(inner, search.patterns):
             yield Found(path, PurePosixPath(inner.parent.as_posix()))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from gnrecon.batch.naming import Found, filled
 from gnrecon.batch.request import Request
 from gnrecon.errors import InputError
-from gnrecon.io import READERS
+from gnrecon.io import readable
 
 _TEMPLATES = ("{folder}/{stem}", "{stem}")
 
@@ -31,7 +31,7 @@ def reference_of(found: Found, index: int, request: Request) -> Path | None:
         raise InputError(f"There is no folder {request.references}.")
     for template in _TEMPLATES if request.reference_name is None else (request.reference_name,):
         wanted = request.references / filled(template, found, index)
-        candidates = [wanted, *(wanted.with_name(wanted.name + extension) for extension in READERS)]
+        candidates = [wanted, *(wanted.with_name(wanted.name + extension) for extension in readable())]
         there = next((path for path in candidates if path.is_file()), None)
         if there is not None:
             return there

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gnrecon.errors import UsageError
-from gnrecon.io import WRITERS
+from gnrecon.io import writable
 from gnrecon.settings import Settings
 
 
@@ -62,8 +62,8 @@ class Request:
     command: str | None = None
 
     def __post_init__(self) -> None:
-        if f".{self.mesh_format}" not in WRITERS:
-            supported = ", ".join(suffix[1:] for suffix in WRITERS)
+        if f".{self.mesh_format}" not in (known := writable()):
+            supported = ", ".join(suffix[1:] for suffix in known)
             raise UsageError(f"Meshes cannot be written as {self.mesh_format!r}; use {supported}.")
         if not self.sources and not self.lists:
             raise UsageError("Name a folder, a pattern or scans, or a list of them by --list.")
