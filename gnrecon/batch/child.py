@@ -6,6 +6,7 @@ Only when everything was written and verified there do the files receive their n
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 import traceback
@@ -95,5 +96,11 @@ class Told(Progress):
 
     def _write(self) -> None:
         self._told = time.monotonic()
-        state = {"name": self._name, "begun": self._begun, "stage": self._stage, "share": round(self._share, 3)}
+        state = {
+            "name": self._name,
+            "pid": os.getpid(),
+            "begun": self._begun,
+            "stage": self._stage,
+            "share": round(self._share, 3),
+        }
         self._path.write_text(json.dumps(state), encoding="utf-8")

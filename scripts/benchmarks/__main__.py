@@ -28,6 +28,7 @@ BENCHMARKS = {
     "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
     "orient": Benchmark("benchmarks.orient.main", "estimated normals, and their meshes, beside open3d's"),
     "refine": Benchmark("benchmarks.refine.main", "remeshing and fewer faces, beside the libraries' own"),
+    "batch": Benchmark("benchmarks.batch.main", "many scans, some broken, killed and continued; and throughput"),
     "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),
 }
 

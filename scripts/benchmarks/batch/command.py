@@ -1,0 +1,52 @@
+"""The command line in processes of its own, and what they cost."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import gnrecon
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a command took: its exit code, seconds, and processor seconds of all its processes together."""
+
+    exit_code: int
+    seconds: float
+    cpu_seconds: float
+
+
+def run(*words: str, at: Callable[[], bool] | None = None, deed: Callable[[int], None] | None = None) -> Cost:
+    """Run ``gnrecon`` with some words to its end.
+
+    Parameters
+    ----------
+    at : asked now and then whether the moment has come
+    deed : done then, with the process's number
+    """
+    environment = os.environ | {"PYTHONPATH": str(Path(str(gnrecon.__file__)).parents[1])}
+    before, start = _children_cpu(), time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gnrecon", *words],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while process.poll() is None:
+        if at is not None and deed is not None and at():
+            deed(process.pid)
+            at = None
+        time.sleep(0.05)
+    return Cost(process.returncode, time.perf_counter() - start, _children_cpu() - before)
+
+
+def _children_cpu() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
