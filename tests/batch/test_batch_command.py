@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from scan_files import box, sphere, start, torus, write_scan
 
 from gnrecon.batch import local, runner
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import running_folder
+from gnrecon.batch.job import PROGRESS, running_folder
 from gnrecon.batch.outcome import Outcome
 from gnrecon.batch.request import Request
 from gnrecon.batch.runner import run_batch
@@ -64,12 +65,11 @@ def accidents(output: Path) -> Iterator[None]:
     over = threading.Event()
 
     def befall() -> None:
-        while not over.wait(0.01):
+        while not over.wait(0.02):
             for name, number in (("killed", signal.SIGSEGV), ("hangs", signal.SIGSTOP)):
-                for folder in running_folder(output).glob(f"{name}-*"):
-                    for process in psutil.process_iter():
-                        if _works_in(process, folder):
-                            process.send_signal(number)
+                for progress in running_folder(output).glob(f"{name}-*/{PROGRESS}"):
+                    with suppress(OSError, ValueError):
+                        os.kill(json.loads(progress.read_text())["pid"], number)
 
     thread = threading.Thread(target=befall)
     thread.start()
@@ -78,14 +78,6 @@ def accidents(output: Path) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
-
-
-def _works_in(process: psutil.Process, folder: Path) -> bool:
-    """Whether a process is the child of an attempt, which its environment tells only where its log is open."""
-    try:
-        return any(file.path.endswith(f"logs/{folder.name.rpartition('-')[0]}.log") for file in process.open_files())
-    except psutil.Error:
-        return False
 
 
 def files(folder: Path, *, names: Callable[[Path], bool]) -> dict[str, bytes]:
@@ -143,7 +135,33 @@ def test_a_batch_that_was_killed_is_continued_and_every_failure_is_named(tmp_pat
     report = json.loads((tmp_path / "alone" / "ring.report.json").read_text())
     jsonschema.validate(report, report_schema())
     assert (report["input"], report["resources"]["threads"]) == (str(scans / "ring.ply"), 1)
-    assert "ring.ply" in (tmp_path / "alone" / "ring.html").read_text(encoding="utf-8")
+    assert "ring.config.toml" in (tmp_path / "alone" / "ring.html").read_text(encoding="utf-8")
+    # And so does a single run with the options in effect.
+    same = tmp_path / "same.ply"
+    assert (
+        command(
+            "reconstruct",
+            scans / "ring.ply",
+            "-o",
+            same,
+            "--config",
+            tmp_path / "alone" / "ring.config.toml",
+            "--quiet",
+        )
+        == 0
+    )
+    assert same.read_bytes() == (meshes / "ring.ply").read_bytes()
+
+
+def command(*words: object) -> int:
+    """Run the command line within this process; return its exit code."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(SystemExit) as end:
+            main([str(word) for word in words])
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    return int(end.value.code or 0)
 
 
 @pytest.fixture
@@ -246,10 +264,6 @@ def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
 
 
 def test_a_missing_folder_has_its_exit_code(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    handler = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as end:
-        main(["batch", str(tmp_path / "missing"), "-o", str(tmp_path / "meshes")])
-    signal.signal(signal.SIGTERM, handler)
-    assert end.value.code == ExitCode.INPUT
+    assert command("batch", tmp_path / "missing", "-o", tmp_path / "meshes") == ExitCode.INPUT
     assert capfd.readouterr() == ("", f"gnrecon: There is no file or folder {tmp_path / 'missing'}.\n")
     assert not (tmp_path / "meshes").exists()
