@@ -23,6 +23,7 @@ from gnrecon.run import STAGES, Shown
 from gnrecon.schema import report_schema
 
 SMALL: dict[str, Any] = {"widths": (100,), "steps": 2, "resolution": 32}
+SMALLEST = ("--widths", "80", "--steps", "0", "--resolution", "24")
 
 Cloud = tuple[np.ndarray, np.ndarray]
 
@@ -111,6 +112,44 @@ def test_any_call_may_end_the_run(cloud: Cloud, method: str, stage: str) -> None
     with pytest.raises(Cancelled, match=r"^Cancelled; nothing was written\.$"):
         reconstruct(*cloud, progress=told, max_points=300, **SMALL)
     assert [*told.shares][-1] == stage
+
+
+EVERY_STAGE = [
+    "read",
+    "ingest",
+    "fit",
+    "extract",
+    "project",
+    "refine",
+    "repair",
+    "trim",
+    "verify",
+    "attributes",
+    "measure",
+]
+
+
+@pytest.mark.parametrize("stage", EVERY_STAGE)
+def test_a_run_may_end_at_every_stage(cloud: Cloud, stage: str) -> None:
+    told = Ledger("stage", stage)
+    few: dict[str, Any] = {"widths": (80,), "steps": 0, "resolution": 24, "max_points": 300}
+    with pytest.raises(Cancelled):
+        reconstruct(*cloud, reference=PointCloud(*cloud), progress=told, simplify=0.05, trim="20s", **few)
+    assert [*told.shares] == EVERY_STAGE[: EVERY_STAGE.index(stage) + 1]
+
+
+def test_a_command_that_ends_before_it_writes_leaves_nothing(
+    tmp_path: Path, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gnrecon.run.Shown.stage", lambda _, name: cancel() if name == "write" else None)
+    scan = write_scan(tmp_path / "ring.ply", *cloud)
+    handler = signal.getsignal(signal.SIGTERM)
+    asked = [str(tmp_path / name) for name in ("mesh.obj", "report.json", "model.gnr")]
+    with pytest.raises(SystemExit) as end:
+        main([str(scan), "-o", asked[0], "--report", asked[1], "--save", asked[2], *SMALLEST])
+    signal.signal(signal.SIGTERM, handler)
+    assert end.value.code == ExitCode.INTERRUPTED
+    assert [path.name for path in tmp_path.iterdir()] == ["ring.ply"]
 
 
 def test_a_part_tells_of_the_whole() -> None:
