@@ -184,9 +184,20 @@ SearchOption = Annotated[
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", rich_help_panel=FIT)]
 Device = Annotated[str, typer.Option(help="cpu or cuda.", rich_help_panel=FIT)]
 Threads = Annotated[int | None, typer.Option(help="CPU threads; torch's choice when not given.", rich_help_panel=FIT)]
+WorkDir = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Keep the work of the fit here, solved by blocks, so that the same run takes it up again after a kill.",
+        rich_help_panel=FIT,
+    ),
+]
 Resolution = Annotated[
     int | None,
-    typer.Option(help="Cells along the longest side of the box; at least 16, by default 256.", rich_help_panel=MESH),
+    typer.Option(
+        help="Cells along the longest side of the box; at least 16, by default 256, of large scans up to 1,024.",
+        rich_help_panel=MESH,
+    ),
 ]
 _EDGE_LENGTH = "Mean length of the mesh's edges, in file units, instead of a resolution."
 _MAX_ERROR = (
@@ -326,6 +337,7 @@ def reconstruct_command(
     seed: Seed = 0,
     device: Device = "cpu",
     threads: Threads = None,
+    work_dir: WorkDir = None,
     resolution: Resolution = None,
     edge_length: EdgeLength = None,
     max_error: MaxError = None,

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
+
+import numpy as np
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
+from gnrecon.fit.large import LARGE
 from gnrecon.fit.options import FitOptions
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.orient import require_orientation
+from gnrecon.ingest.spacing import neighbour_spacing
 from gnrecon.io import MOST_POINTS
 from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.region import Region
 
-RESOLUTION = 256
-"""Cells where nothing else was asked for."""
+RESOLUTION, MOST_CELLS = 256, 1024
+"""Cells where nothing else was asked for, and the most of them that a large scan gets by itself."""
+
+CELL_SPACINGS = 1.5
+"""Edge of a cell, in spacings of a large scan's points: about one vertex for each of them."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,8 @@ class Options:
     uncertainty : bool
         Whether vertices carry ``sigma``, the standard deviation of their position along the normal, see `Uncertainty`.
     resolution : int, optional
-        Cells of the extraction along the longest side of the shape's box; 256 unless there is an edge length.
+        Cells of the extraction along the longest side of the shape's box; unless there is an edge length 256, and of
+        200,000 points or more as many up to 1,024 as make a cell one and a half spacings of the points.
     edge_length : float, file units, optional
         Mean length of the mesh's edges, from which the number of cells follows.
     max_error : float, file units, optional
@@ -83,7 +91,10 @@ class Options:
     widths, steps, quality, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
-        CPU threads of the fit; by default what torch chooses.
+        CPU threads of the fit, and processes that solve the blocks of a large one; by default what torch chooses.
+    work_dir : str, optional
+        Folder in which the work of the fit is kept, so that a run that was killed is taken up again by the same one.
+        The fit is then solved by blocks, as that of 200,000 points or more always is; see `gnrecon.fit.large`.
 
     Raises
     ------
@@ -126,10 +137,9 @@ class Options:
     seed: int = 0
     device: str = "cpu"
     threads: int | None = None
+    work_dir: str | None = None
 
     def __post_init__(self) -> None:
-        if self.resolution is None and self.edge_length is None:
-            object.__setattr__(self, "resolution", RESOLUTION)
         for name in ("crop", "clip_plane"):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
@@ -156,6 +166,8 @@ class Options:
         if self.holdout is not None and not 0 < self.holdout < 1:
             raise UsageError(f"The share of points to hold out is {self.holdout}, but must lie between 0 and 1.")
         require_orientation(self.orient)
+        if self.work_dir is not None and not self.fit().adaptive:
+            raise UsageError("A work folder serves the default fit alone, not one network (--widths, --steps).")
         self.fit()
         self.refine()
 
@@ -233,6 +245,22 @@ class Options:
         if self.edge_length is not None:
             return cells_for_edges(self.edge_length, bounds)
         return self.resolution or RESOLUTION
+
+    def for_scan(self, points: Float, bounds: Float) -> Options:
+        """Return the options with the cells that a scan gets where none were asked for.
+
+        Parameters
+        ----------
+        points : array of shape (N, 3), file units, that will be fitted
+        bounds : box in which they will be meshed, of shape (2, 3), file units
+        """
+        if self.resolution is not None or self.edge_length is not None:
+            return self
+        cells = RESOLUTION
+        if len(points) >= LARGE:
+            longest = float(np.ptp(bounds, axis=0).max())
+            cells = math.ceil(longest / (CELL_SPACINGS * neighbour_spacing(points)))
+        return replace(self, resolution=min(max(cells, RESOLUTION), MOST_CELLS))
 
     def fit(self) -> FitOptions:
         """Return the options of the fit."""

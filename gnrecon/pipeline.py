@@ -37,6 +37,7 @@ from gnrecon.export import (
     vertex_error,
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
+from gnrecon.fit.work import require_work_folder
 from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units, layers_of, prepare, survey
 from gnrecon.io import (
     Reading,
@@ -176,6 +177,8 @@ def reconstruct(
     """
     chosen = Options.of(**options)
     require_device(chosen.device)
+    if chosen.work_dir is not None:
+        require_work_folder(chosen.work_dir)
     with limited(chosen.threads):
         return _run(
             lambda: read_source(source, normals, format, chosen.read_points, chosen.region()),
@@ -247,13 +250,14 @@ def _run(
     with stages("ingest"):
         samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
         scan, layers = survey(cloud), layers_of(samples, counts.normals)
+    options = options.for_scan(samples.frame.to_world(samples.points), bounds_of(samples))
     options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
     warnings = [] if layers is None else [layers.describe()]
     for sentence in [*reading.remarks(), *counts.remarks(), *warnings]:
         remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
-        sdf, solution = fit(samples, options.fit(), step, progress.advance)
+        sdf, solution = fit(samples, options.fit(), step, progress.advance, options.work_dir)
         residuals = Misfit.of(sdf, samples)
         unseen = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
     remark(solution.status)

@@ -123,16 +123,29 @@ class CoarseDistance:
         sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
         return known, sign * np.sqrt(distances**2 - disks**2), distances
 
-    def winding_number(self, x: Float, batch: int = 2048) -> Float:
+    def winding_number(self, x: Float) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
-        # sum_j d_j . (p_j - x) / |p_j - x|^3, with the squares expanded so that both factors are matrix products.
-        offset = np.einsum("jc,jc->j", self._dipoles, self._sources)
-        squares = np.einsum("jc,jc->j", self._sources, self._sources)
-        parts = [np.zeros(0)]
-        for start in range(0, len(x), batch):
-            q = x[start : start + batch]
-            square = np.einsum("qc,qc->q", q, q)[:, None] - 2 * (q @ self._sources.T) + squares
-            square = np.maximum(square, self._radii**2)
-            flux = offset - q @ self._dipoles.T
-            parts.append((flux / (square * np.sqrt(square))).sum(axis=1))
-        return np.concatenate(parts)
+        return winding_number(x, self._sources, self._dipoles, self._radii)
+
+
+def winding_number(x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = 2048) -> Float:
+    """Return the winding number w, of shape (Q,), that dipoles make at points x, of shape (Q, 3).
+
+    Parameters
+    ----------
+    sources : array of shape (J, 3), where the dipoles are
+    dipoles : array of shape (J, 3), each a normal times the area that it stands for, over 4 pi
+    radii : array of shape (J,), of the disks of those areas, within which a term is bounded
+    batch : points that are asked for at once
+    """
+    # sum_j d_j . (p_j - x) / |p_j - x|^3, with the squares expanded so that both factors are matrix products.
+    offset = np.einsum("jc,jc->j", dipoles, sources)
+    squares = np.einsum("jc,jc->j", sources, sources)
+    parts = [np.zeros(0)]
+    for start in range(0, len(x), batch):
+        q = x[start : start + batch]
+        square = np.einsum("qc,qc->q", q, q)[:, None] - 2 * (q @ sources.T) + squares
+        square = np.maximum(square, radii**2)
+        flux = offset - q @ dipoles.T
+        parts.append((flux / (square * np.sqrt(square))).sum(axis=1))
+    return np.concatenate(parts)

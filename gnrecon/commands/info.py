@@ -53,8 +53,9 @@ def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = No
 def _plan(cloud: PointCloud, reading: Reading, options: Options) -> tuple[dict[str, Any], Layers | None]:
     """What a run would do, as plain values, and the layers that it would find."""
     samples, counts = prepare(cloud, **options.ingest())
-    fit = options.fit()
-    expected = estimate(reading.points, len(samples), bounds_of(samples), options)
+    fit, bounds = options.fit(), bounds_of(samples)
+    options = options.for_scan(samples.frame.to_world(samples.points), bounds)
+    expected = estimate(reading.points, len(samples), bounds, options)
     plan = {
         "points": len(samples),
         "widths": None if fit.adaptive else list(fit.widths_for(len(samples))),

@@ -9,6 +9,7 @@ no cube holds x, d = 0. Coordinates are relative to the cube, so that single pre
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -85,13 +86,17 @@ class Detail:
         """Return the second derivatives of d, of shape (N, 3, 3), at x, of shape (N, 3)."""
         return self._blended(x, 2)[2]
 
+    @cached_property
+    def _numbers(self) -> dict[tuple[int, ...], int]:
+        """The row of each cube, by its key."""
+        return {tuple(key): number for number, key in enumerate(self.keys.tolist())}
+
     def _blended(self, x: Float, order: int) -> list[Float]:
         """Return d and its derivatives up to an order."""
         sums = [np.zeros((len(x), *(order_ * [3]))) for order_ in range(order + 1)]
         keys, members = self.partition.members(x)
-        numbers = {tuple(key): number for number, key in enumerate(self.keys.tolist())}
         for key, rows in zip(keys.tolist(), members, strict=True):
-            number = numbers.get(tuple(key))
+            number = self._numbers.get(tuple(key))
             if number is None:
                 continue
             for start in range(0, len(rows), ROWS):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from gnrecon.field.siren import Siren
 from gnrecon.fit.choose import Mask
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.detail import fit_detail
+from gnrecon.fit.large import LARGE, fit_large
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
@@ -32,16 +34,22 @@ _log = logging.getLogger(__name__)
 COARSE_POINTS, COARSE_UNITS = 5000, 1000
 
 HELD_SHARE, HELD_MOST = 6, 2000
-"""One point in so many is left out of the global field, up to so many."""
+"""One point in so many is left out of the global field; up to so many where the detail is not solved by blocks."""
 
 SHARE = 0.25
 """Share of the time after which the global field is there."""
 
 
 def fit_adaptive(
-    samples: Samples, options: FitOptions, rng: np.random.Generator, advance: Advance = unheard
+    samples: Samples,
+    options: FitOptions,
+    rng: np.random.Generator,
+    advance: Advance = unheard,
+    folder: str | Path | None = None,
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a global field and its detail; `advance` is told of the share that is done.
+
+    The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given.
 
     Normals that were estimated are turned around where a first field contradicts them.
 
@@ -53,7 +61,9 @@ def fit_adaptive(
         When a linear system cannot be solved.
     """
     order = rng.permutation(len(samples))
-    out = min(len(samples) // HELD_SHARE, HELD_MOST)
+    by_blocks = folder is not None or len(samples) >= LARGE
+    # Left-out points must lie near each other, so that those around a place tell of it alone.
+    out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
     held: Mask = np.zeros(len(samples), dtype=bool)
     held[order[:out]] = True
     rows = np.sort(order[out:][:COARSE_POINTS])
@@ -74,8 +84,12 @@ def fit_adaptive(
     linear = replace(options, widths=field.widths, steps=0)
     fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
+    rest = part(advance, SHARE, 1.0)
     try:
-        detail = fit_detail(sdf, samples, held, options.features, rng, options.device, part(advance, SHARE, 1.0))
+        if by_blocks:
+            detail = fit_large(sdf, samples, held, options, rng, folder, rest)
+        else:
+            detail = fit_detail(sdf, samples, held, options.features, rng, options.device, rest)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(fitted, status=status, interrupted=True)

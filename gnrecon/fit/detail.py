@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Samples
+from gnrecon.cloud import Float, Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
@@ -85,6 +85,18 @@ def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
     return Leftover(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
 
 
+def cube_length(belief: Belief, disks: Float, radius: float) -> float:
+    """Return the length of a cube: longer where its points lie farther apart.
+
+    Parameters
+    ----------
+    belief : of the whole scan
+    disks : array of shape (N,), radii of the disks that the cube's points stand for
+    radius : their median in the whole scan
+    """
+    return belief.length * min(max(float(np.median(disks) / radius), 1.0), LONGER)
+
+
 @dataclass(frozen=True)
 class _Cubes:
     """The cubes of a detail with the data that they are fitted to."""
@@ -114,7 +126,7 @@ class _Cubes:
             center = self.partition.center(key)
             rows = self.leftover.within(center, reach)
             if len(rows) >= LEAST_POINTS:
-                length = self._length(rows)
+                length = cube_length(self.belief, self.leftover.density.disks[rows], self.leftover.density.radius)
                 patch = self.leftover.patch(rows, center, volumes[number], self.device)
                 system = PatchSystem(patch, self.features, length, patch.size)
                 kept.append(key)
@@ -125,12 +137,6 @@ class _Cubes:
         _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
         noise = self.belief.position, self.belief.angle
         return Detail(self.partition, np.array(kept), np.array(lengths), self.features, solved, *noise)
-
-    def _length(self, rows: Int) -> float:
-        """Return the length of a cube: longer where its points lie farther apart."""
-        density = self.leftover.density
-        sparser = float(np.median(density.disks[rows]) / density.radius)
-        return self.belief.length * min(max(sparser, 1.0), LONGER)
 
     def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
         """Return samples of each cube that lie clear of the data, with what the coarse distance asks for there."""

@@ -28,6 +28,9 @@ SHARE = 0.5
 
 ATTEMPTS = 6
 
+ROWS = 16_384
+"""Points whose features are held at once: a cube that many scans have seen takes no more memory than others."""
+
 
 @dataclass(frozen=True)
 class Belief:
@@ -85,14 +88,10 @@ class PatchSystem:
 
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         self._scale = size * (2.0 / len(features)) ** 0.5
-        z = features.phase(patch.points, patch.center, length)
-        sines, cosines = z.sin(), z.cos()
         like, count = patch.value, len(features)
-        self._positions = gram([sines], count, like), sines.T @ patch.value
-        slopes = [cosines * (features.frequencies[:, axis] / length) for axis in range(3)]
-        wanted = patch.gradient.T
-        right = sum((rows.T @ target for rows, target in zip(slopes, wanted, strict=True)), torch.zeros(count).to(like))
-        self._angles = gram(slopes, count, like), right
+        parts = [_data_sums(patch, features, length, slice(n, n + ROWS)) for n in range(0, len(like), ROWS)]
+        positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
+        self._positions, self._angles = (positions, of_positions), (angles, of_angles)
         free = features.phase(patch.volume, patch.center, length).sin() / (SHARE * patch.distance[:, None])
         self._volume = gram([free], count, like), free.T @ (patch.wanted / (SHARE * patch.distance))
 
@@ -112,3 +111,18 @@ class PatchSystem:
                 return amplitudes
             damping = 10 * damping
         return torch.zeros_like(right)
+
+
+def _data_sums(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return matrix and right-hand side of some rows' positions, and those of their normals."""
+    z = features.phase(patch.points[rows], patch.center, length)
+    sines, cosines = z.sin(), z.cos()
+    like, count, wanted = patch.value, len(features), patch.gradient[rows].T
+    slopes = [cosines * (features.frequencies[:, axis] / length) for axis in range(3)]
+    right = sum((s.T @ target for s, target in zip(slopes, wanted, strict=True)), torch.zeros(count).to(like))
+    return gram([sines], count, like), sines.T @ patch.value[rows], gram(slopes, count, like), right
+
+
+def _summed(parts: tuple[Tensor, ...]) -> Tensor:
+    """Return the sum of tensors, of which there is at least one."""
+    return sum(parts[1:], start=parts[0])

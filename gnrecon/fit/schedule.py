@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
-from gnrecon.errors import FitError
+from gnrecon.errors import FitError, UsageError
 from gnrecon.field.siren import Siren
 from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.deep import fit_deep
@@ -31,6 +32,7 @@ def fit(
     options: FitOptions | None = None,
     callback: Callback | None = None,
     advance: Advance = unheard,
+    folder: str | Path | None = None,
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a sine network to the signed distance of oriented points.
 
@@ -42,16 +44,21 @@ def fit(
     options : choices of network, start and steps
     callback : called with the record of each step
     advance : told of the share that is done, of the start and of the most steps that may follow
+    folder : where the work of the default fit is kept, solved by blocks then, so that the same fit takes it up again
 
     Raises
     ------
+    UsageError
+        When a folder is given for one network, or holds anything but this fit's work.
     FitError
         When the field is not finite.
     """
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
     if options.adaptive:
-        sdf, fitted = fit_adaptive(samples, options, rng, advance)
+        sdf, fitted = fit_adaptive(samples, options, rng, advance, folder)
+    elif folder is not None:
+        raise UsageError("A work folder serves the default fit alone, not one network (--widths, --steps).")
     else:
         sdf, fitted = _fit_network(samples, options, rng, callback, advance)
     if not sdf.finite:

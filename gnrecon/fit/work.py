@@ -1,0 +1,168 @@
+"""The work folder of a large fit: all that its blocks are solved from, and what has been solved of them.
+
+Arrays lie in files of their own, so that every process maps them and reads only the stretches that its blocks need.
+The manifest comes last, with a fingerprint of everything that decides the result; a block's file comes by its name only
+when it is complete. So a run that was killed at any moment can be taken up again by the same run, and by no other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.atomic import atomic_write
+from gnrecon.errors import InputError, OutputError, UsageError
+from gnrecon.version import __version__
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+MANIFEST, FORMAT = "manifest.json", "gnrecon-work-1"
+_OWN = re.compile(r"(manifest\.json|\w+\.npy|block-\d+\.npz|\.[\w.-]+)")
+"""What a work folder may hold, what a killed run left half written included."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """A folder with a manifest."""
+
+    folder: Path
+
+    @classmethod
+    def begin(cls, folder: str | Path, arrays: Arrays, facts: Mapping[str, Any]) -> Work:
+        """Set a folder up, or take it up again where it holds the same work already.
+
+        Parameters
+        ----------
+        folder : is made where it is missing
+        arrays : by names of letters and digits
+        facts : plain values that decide the result, beside the arrays
+
+        Raises
+        ------
+        UsageError
+            When the folder holds the work of another run, or what is no work at all.
+        OutputError
+            When it cannot be written.
+        """
+        work, print_ = cls(Path(folder)), fingerprint(arrays, facts)
+        try:
+            work.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"The work folder {folder} cannot be made: {error.strerror or error}.") from error
+        require_work_folder(folder)
+        if work._belongs_to(print_):
+            return work
+        for name, values in arrays.items():
+            with atomic_write(work.folder / f"{name}.npy", overwrite=True) as temporary:
+                np.save(temporary, values)
+        with atomic_write(work.folder / MANIFEST) as temporary:
+            manifest = {"format": FORMAT, "gnrecon": __version__, "fingerprint": print_, "facts": dict(facts)}
+            temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+        return work
+
+    def _belongs_to(self, print_: str) -> bool:
+        """Whether the folder holds the work of a fingerprint; False where it holds none yet.
+
+        Raises
+        ------
+        UsageError
+            Where it holds that of another fingerprint.
+        """
+        if not (self.folder / MANIFEST).exists():
+            return False
+        if self.manifest.get("fingerprint") != print_:
+            raise UsageError(
+                f"The work folder {self.folder} belongs to another run (its scan, options or version differ); "
+                f"name a new or an empty folder."
+            )
+        return True
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """What the manifest says.
+
+        Raises
+        ------
+        InputError
+            When there is none, or it is damaged.
+        """
+        path = self.folder / MANIFEST
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path} cannot be read: {error}.") from error
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise InputError(f"{path} is not the manifest of a work folder of the format {FORMAT!r}.")
+        return found
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The plain values that the work began with."""
+        facts: dict[str, Any] = self.manifest["facts"]
+        return facts
+
+    def array(self, name: str) -> npt.NDArray[Any]:
+        """Return an array of the work, mapped from its file and not read before it is needed."""
+        return np.asarray(np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False))
+
+    def done(self, block: int) -> bool:
+        """Whether a block has been solved."""
+        return self._block(block).exists()
+
+    def keep(self, block: int, solved: Arrays) -> None:
+        """Keep what was solved of a block."""
+        with atomic_write(self._block(block), overwrite=True) as temporary:
+            np.savez(temporary, **solved)  # type: ignore[arg-type]  # its stubs take the arrays for `allow_pickle`
+
+    def solved(self, block: int) -> dict[str, npt.NDArray[Any]]:
+        """Return what was solved of a block.
+
+        Raises
+        ------
+        InputError
+            When its file is damaged.
+        """
+        try:
+            with np.load(self._block(block), allow_pickle=False) as file:
+                return {name: file[name] for name in file.files}
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"{self._block(block)} cannot be read ({error}); delete it to solve it again.") from error
+
+    def _block(self, block: int) -> Path:
+        return self.folder / f"block-{block:06d}.npz"
+
+
+def require_work_folder(folder: str | Path) -> None:
+    """Refuse a folder that holds anything but work; one that is not there yet is fine.
+
+    Raises
+    ------
+    UsageError
+        With the name of what it holds.
+    """
+    if not Path(folder).exists():
+        return
+    if not Path(folder).is_dir():
+        raise UsageError(f"{folder} is no folder, so that no work can be kept in it.")
+    foreign = sorted(path.name for path in Path(folder).iterdir() if not _OWN.fullmatch(path.name))
+    if foreign:
+        raise UsageError(f"{folder} is no work folder: it holds {foreign[0]!r}; name a new or an empty folder.")
+
+
+def fingerprint(arrays: Arrays, facts: Mapping[str, Any]) -> str:
+    """Return what tells this work from any other, as hexadecimal digits."""
+    digest = hashlib.sha256(json.dumps([FORMAT, __version__, facts], sort_keys=True).encode())
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {values.dtype.str} {values.shape}".encode())
+        digest.update(values.reshape(-1).view(np.uint8))
+    return digest.hexdigest()

@@ -1,0 +1,57 @@
+"""The winding number by a tree of dipoles, beside the plain sum over all points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnrecon.fit.dipoles import FEW, Dipoles
+from gnrecon.sampling import Density, winding_number
+
+COUNT = 6000
+
+
+def two_balls() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and disks of a ball and of a smaller one beside it."""
+    rng = np.random.default_rng(0)
+    normals = rng.standard_normal((COUNT, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    small = np.arange(COUNT) % 5 == 0
+    points = np.where(small[:, None], [1.5, 0.0, 0.0] + 0.4 * normals, normals)
+    return points, normals, Density(points).disks
+
+
+def test_it_is_the_plain_sum_clear_of_the_points() -> None:
+    points, normals, disks = two_balls()
+    tree = Dipoles.of(points, normals, disks)
+    rng = np.random.default_rng(1)
+    centers = rng.uniform([-1.2, -1.2, -1.2], [2.0, 1.2, 1.2], (40, 3))
+    inside = 0
+    for center in centers:
+        x = center + rng.uniform(-0.1, 0.1, (50, 3))
+        clear = np.linalg.norm(x[:, None] - points, axis=2).min(axis=1) > 3.5 * np.median(disks)
+        plain = winding_number(x[clear], points, normals * (disks**2 / 4)[:, None], disks)
+        found = tree.winding_number(x[clear], center, 0.1)
+        assert found == pytest.approx(plain, abs=0.05)
+        assert ((found > 0.5) == (plain > 0.5)).all()
+        inside += int((found > 0.5).sum())
+    assert inside > 100
+
+
+def test_every_point_counts_once_and_few_terms_are_left() -> None:
+    points, normals, disks = two_balls()
+    tree = Dipoles.of(points, normals, disks)
+    assert len(tree.levels[0].radii) <= FEW
+    for center in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 5.0, 5.0]):
+        places, moments, radii = tree.near(np.array(center), 0.05)
+        assert (radii**2).sum() == pytest.approx((disks**2).sum())
+        assert moments.sum(axis=0) == pytest.approx((normals * (disks**2 / 4)[:, None]).sum(axis=0), abs=1e-9)
+        assert len(places) < COUNT / 5
+
+
+def test_arrays_bring_it_back() -> None:
+    tree = Dipoles.of(*two_balls())
+    arrays = tree.arrays()
+    again = Dipoles.of_arrays(arrays.__getitem__, len(tree.levels))
+    x = np.array([[0.1, 0.2, 0.0], [3.0, 0.0, 0.0]])
+    assert again.winding_number(x, x[0], 0.0).tolist() == tree.winding_number(x, x[0], 0.0).tolist()
