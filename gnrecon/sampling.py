@@ -123,9 +123,9 @@ class CoarseDistance:
         sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
         return known, sign * np.sqrt(distances**2 - disks**2), distances
 
-    def winding_number(self, x: Float) -> Float:
+    def winding_number(self, x: Float, batch: int = 2048) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
-        return winding_number(x, self._sources, self._dipoles, self._radii)
+        return winding_number(x, self._sources, self._dipoles, self._radii, batch)
 
 
 def winding_number(x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = 2048) -> Float:

@@ -81,24 +81,27 @@ class Blocks:
     def of(cls, work: Work, device: str) -> Blocks:
         """Map the arrays of a work folder."""
         facts, array = work.facts, work.array
-        leftover = Leftover(*(array(name) for name in ("points", "normals", "value", "gradient")))
+        leftover = Leftover(array("points"), array("normals"), array("value"), array("gradient"))
         frequencies, phases, theta = (
             torch.tensor(np.array(array(name)), device=device) for name in ("frequencies", "phases", "theta")
         )
         return cls(
-            leftover,
-            array("disks"),
-            facts["radius"],
-            *(np.array(array(name)) for name in ("cells", "first", "keys", "ends")),
-            Dipoles.of_arrays(array, facts["levels"]),
-            Siren(tuple(facts["widths"])),
-            theta,
-            Box(*np.array(array("box"))),
-            Partition(np.array(array("origin")), facts["cell"]),
-            Features(frequencies, phases),
-            Belief(facts["length"], facts["position"], facts["angle"]),
-            facts["seed"],
-            device,
+            leftover=leftover,
+            disks=array("disks"),
+            radius=facts["radius"],
+            cells=array("cells"),
+            first=array("first"),
+            keys=array("keys"),
+            ends=array("ends"),
+            dipoles=Dipoles.of_arrays(array, facts["levels"]),
+            network=Siren(tuple(facts["widths"])),
+            theta=theta,
+            box=Box(*array("box")),
+            partition=Partition(array("origin"), facts["cell"]),
+            features=Features(frequencies, phases),
+            belief=Belief(facts["length"], facts["position"], facts["angle"]),
+            seed=facts["seed"],
+            device=device,
         )
 
     def solve(self, number: int) -> Arrays:

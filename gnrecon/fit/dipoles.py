@@ -75,11 +75,11 @@ class Dipoles:
         sums = np.column_stack([areas, areas[:, None] * points, areas[:, None] * normals / 4])[order]
         codes, first = codes[order], np.arange(len(points) + 1)
         codes, sums, first = _joined(codes, sums)
-        levels = [_level(codes, sums, first, origin, side)]
+        levels = [_level(sums, first, origin, side)]
         while len(codes) > FEW:
             codes, sums, first = _joined(codes >> np.uint64(3), sums)
             side *= 2
-            levels.append(_level(codes, sums, first, origin, side))
+            levels.append(_level(sums, first, origin, side))
         return cls(tuple(reversed(levels)))
 
     @classmethod
@@ -126,7 +126,7 @@ def _joined(codes: Codes, sums: Float) -> tuple[Codes, Float, Rows]:
     return codes[start], np.add.reduceat(sums, start, axis=0), np.append(start, len(codes))
 
 
-def _level(codes: Codes, sums: Float, first: Rows, origin: Float, side: float) -> Level:
+def _level(sums: Float, first: Rows, origin: Float, side: float) -> Level:
     areas = np.maximum(sums[:, 0], np.finfo(np.float64).tiny)
     places = sums[:, 1:4] / areas[:, None]
     # The lower corner follows from any point within, such as the mean.

@@ -90,11 +90,14 @@ def _started(folder: Path, count: int) -> Iterator[list[Process]]:
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "gnrecon.fit.worker", str(folder)]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    workers: list[Process] = []
+    pipe, workers = subprocess.PIPE, list[Process]()
     try:
         for _ in range(count):
-            workers.append(subprocess.Popen(command, env=environment, text=True, **pipes))
+            workers.append(
+                subprocess.Popen(
+                    command, env=environment, text=True, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL
+                )
+            )
         yield workers
     finally:
         for worker in workers:

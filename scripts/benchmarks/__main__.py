@@ -25,7 +25,9 @@ BENCHMARKS = {
     "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
     "learn": Benchmark("benchmarks.learn.main", "shape learning by three optimisers, and one step's time"),
     "transport": Benchmark("benchmarks.transport", "what the paper's neglected terms of moving surfaces change"),
-    "blocks": Benchmark("benchmarks.blocks.main", "scans of up to two million points, fitted by blocks: cost and seams"),
+    "blocks": Benchmark(
+        "benchmarks.blocks.main", "scans of up to two million points, fitted by blocks: cost and seams"
+    ),
     "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
     "orient": Benchmark("benchmarks.orient.main", "estimated normals, and their meshes, beside open3d's"),
     "refine": Benchmark("benchmarks.refine.main", "remeshing and fewer faces, beside the libraries' own"),

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 import torch
 
+from gnrecon.advance import unheard
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import Cancelled, FitError, MemoryLimitError, UsageError
 from gnrecon.field.detail import Detail
+from gnrecon.field.partition import Int
 from gnrecon.field.siren import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, block, large, workers
 from gnrecon.fit.detail import fit_detail
@@ -30,6 +32,11 @@ COUNT = 1500
 AXES = np.array([1.0, 0.6, 0.5])
 BELIEF = Belief(0.1, 1e-3, 0.05)
 FEATURES = 60
+
+
+def known(*_: object) -> Belief:
+    """Choose nothing: that is tested elsewhere."""
+    return BELIEF
 
 
 def ellipsoid() -> Samples:
@@ -60,7 +67,7 @@ def fitted(folder: Path | None = None, block_points: int = 200) -> tuple[NeuralS
 @pytest.fixture(autouse=True)
 def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Length and noise as they are: choosing them is tested elsewhere."""
-    monkeypatch.setattr(large, "choose", lambda *arguments: BELIEF)
+    monkeypatch.setattr(large, "choose", known)
     monkeypatch.setitem(QUALITIES, "draft", FEATURES)
 
 
@@ -68,7 +75,7 @@ def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
 def whole() -> Detail:
     """The detail of an undisturbed fit in one process."""
     with pytest.MonkeyPatch.context() as patch, threads(1):
-        patch.setattr(large, "choose", lambda *arguments: BELIEF)
+        patch.setattr(large, "choose", known)
         patch.setitem(QUALITIES, "draft", FEATURES)
         return fitted(block_points=200)[1]
 
@@ -98,7 +105,7 @@ def test_neither_blocks_nor_processes_change_a_digit(whole: Detail, tmp_path: Pa
 def test_it_is_the_smaller_scans_fit(whole: Detail, monkeypatch: pytest.MonkeyPatch) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    monkeypatch.setattr("gnrecon.fit.detail.choose", lambda *arguments: BELIEF)
+    monkeypatch.setattr("gnrecon.fit.detail.choose", known)
     single = fit_detail(sdf, samples, np.arange(COUNT) % 6 == 0, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
@@ -159,7 +166,7 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent), *sys.path]!r}\n"
         "import time, torch; from pathlib import Path\n"
         "from gnrecon.fit import block, large; import test_fit_large as own\n"
-        "torch.set_num_threads(1); large.choose = lambda *arguments: own.BELIEF; own.QUALITIES['draft'] = own.FEATURES\n"
+        "torch.set_num_threads(1); large.choose = own.known; own.QUALITIES['draft'] = own.FEATURES\n"
         "keep = own.Work.keep\n"
         "own.Work.keep = lambda *arguments: (keep(*arguments), time.sleep(0.2))\n"
         f"own.fitted(Path({str(tmp_path)!r}))\n"
@@ -182,13 +189,13 @@ def test_memory_holds_one_cube_and_its_neighbours(tmp_path: Path, monkeypatch: p
     held: list[int] = []
     around = block.Blocks._around
 
-    def counted(self: block.Blocks, key: np.ndarray) -> np.ndarray:
+    def counted(self: block.Blocks, key: Int) -> Int:
         rows = around(self, key)
         held.append(len(rows))
         return rows
 
     monkeypatch.setattr(block.Blocks, "_around", counted)
-    monkeypatch.setattr(large, "choose", lambda *arguments: Belief(0.04, 1e-3, 0.05))
+    monkeypatch.setattr(large, "choose", lambda *_: Belief(0.04, 1e-3, 0.05))
     with threads(1):
         _, detail = fitted(tmp_path)
     assert isinstance(Work(tmp_path).array("points").base, np.memmap)
@@ -229,4 +236,4 @@ def test_a_process_that_fails_ends_the_fit(
     monkeypatch.setattr(workers.sys, "executable", str(program))
     monkeypatch.setattr(workers, "_room", lambda: 2)
     with pytest.raises(error, match=sentence):
-        workers.solve_blocks(Work(tmp_path), [0, 1, 2], 2, "cpu", lambda share: None)
+        workers.solve_blocks(Work(tmp_path), [0, 1, 2], 2, "cpu", unheard)

@@ -42,7 +42,7 @@ def test_other_work_is_refused(tmp_path: Path, arrays: dict[str, np.ndarray], fa
 
 def test_a_folder_of_anything_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "holiday.jpg").write_text("beach")
-    with pytest.raises(UsageError, match="is no work folder: it holds 'holiday.jpg'"):
+    with pytest.raises(UsageError, match=r"is no work folder: it holds 'holiday\.jpg'"):
         Work.begin(tmp_path, ARRAYS, FACTS)
     assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
     with pytest.raises(UsageError, match="is no folder"):
