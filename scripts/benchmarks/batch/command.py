@@ -16,11 +16,15 @@ import gnrecon
 
 @dataclass(frozen=True)
 class Cost:
-    """What a command took: its exit code, seconds, and processor seconds of all its processes together."""
+    """What a command took: its exit code, seconds, and processor seconds of all its processes together.
+
+    `disturbed` says whether the moment for the deed came.
+    """
 
     exit_code: int
     seconds: float
     cpu_seconds: float
+    disturbed: bool = False
 
 
 def run(*words: str, at: Callable[[], bool] | None = None, deed: Callable[[int], None] | None = None) -> Cost:
@@ -39,12 +43,13 @@ def run(*words: str, at: Callable[[], bool] | None = None, deed: Callable[[int],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
+    disturbed = False
     while process.poll() is None:
-        if at is not None and deed is not None and at():
+        if at is not None and deed is not None and not disturbed and at():
             deed(process.pid)
-            at = None
+            disturbed = True
         time.sleep(0.05)
-    return Cost(process.returncode, time.perf_counter() - start, _children_cpu() - before)
+    return Cost(process.returncode, time.perf_counter() - start, _children_cpu() - before, disturbed)
 
 
 def _children_cpu() -> float:

@@ -53,7 +53,10 @@ def main(arguments: Sequence[str]) -> int:
     if chosen.json:
         write_text(chosen.json, json.dumps(report, indent=2) + "\n", overwrite=True)
     console.print(table(report))
-    return ExitCode.OK if all(sound(one, len(good)) for one in report["runs"].values()) else ExitCode.BATCH
+    sounds = [
+        sound(one, len(good)) and one["disturbed"] == (name != "undisturbed") for name, one in report["runs"].items()
+    ]
+    return ExitCode.OK if all(sounds) and report["speed"]["same_bytes"] else ExitCode.BATCH
 
 
 def sound(one: dict[str, Any], good: int) -> bool:
@@ -83,7 +86,7 @@ class _Bench:
         """Killed when half of the good scans are finished, and started again."""
         half = len(self._good) // 2
         with Witness(self._output("killed")) as witness:
-            run(
+            ended = run(
                 *self._words("killed"),
                 at=lambda: len(witness.finished()) >= half,
                 deed=lambda pid: os.kill(pid, signal.SIGKILL),
@@ -92,7 +95,8 @@ class _Bench:
             cost = run(*self._words("killed"))
         told = self._told("killed", cost, witness)
         unchanged = [one["name"] for one in _summary(self._output("killed")) if one["status"] == "unchanged"]
-        return told | {"finished_before": len(finished), "unchanged": len(unchanged)}
+        counts = {"finished_before": len(finished), "unchanged": len(unchanged)}
+        return told | counts | {"disturbed": ended.disturbed}
 
     def dask(self) -> dict[str, Any]:
         """On a cluster of local workers, one of which is killed when half of the good scans are finished."""
@@ -159,6 +163,7 @@ class _Bench:
         files = [path.name for path in sorted(self._output("undisturbed").glob("torus-*"))]
         return {
             "exit_code": cost.exit_code,
+            "disturbed": cost.disturbed,
             "seconds": cost.seconds,
             "meshes": sum(one["status"] != "failed" for one in scans),
             "causes": {one["name"]: one["cause"] for one in scans if one["status"] == "failed"},
@@ -189,7 +194,7 @@ def _overheads(output: Path) -> dict[str, float]:
 def table(report: dict[str, Any]) -> Table:
     """Return what the runs came to, and the speed."""
     shown = Table(caption=f"{report['jobs']} scans at a time, one thread each.")
-    for heading in ("run", "exit", "meshes", "causes named", "done twice", "same bytes", "seconds"):
+    for heading in ("run", "exit", "meshes", "causes", "twice", "same bytes", "seconds"):
         shown.add_column(heading, no_wrap=True)
     for name, one in report["runs"].items():
         named = sum(one["causes"].get(scan) == cause for scan, cause in BROKEN.items())
