@@ -18,7 +18,7 @@ import gnrecon
 class Cost:
     """What a command took: its exit code, seconds, and processor seconds of all its processes together.
 
-    `disturbed` says whether the moment for the deed came.
+    `disturbed` says whether the deed was done.
     """
 
     exit_code: int
@@ -27,13 +27,12 @@ class Cost:
     disturbed: bool = False
 
 
-def run(*words: str, at: Callable[[], bool] | None = None, deed: Callable[[int], None] | None = None) -> Cost:
+def run(*words: str, deed: Callable[[int], bool] | None = None) -> Cost:
     """Run ``gnrecon`` with some words to its end.
 
     Parameters
     ----------
-    at : asked now and then whether the moment has come
-    deed : done then, with the process's number
+    deed : tried now and then with the process's number, until it says that it is done
     """
     environment = os.environ | {"PYTHONPATH": str(Path(str(gnrecon.__file__)).parents[1])}
     before, start = _children_cpu(), time.perf_counter()
@@ -45,9 +44,7 @@ def run(*words: str, at: Callable[[], bool] | None = None, deed: Callable[[int],
     )
     disturbed = False
     while process.poll() is None:
-        if at is not None and deed is not None and not disturbed and at():
-            deed(process.pid)
-            disturbed = True
+        disturbed = disturbed or (deed is not None and deed(process.pid))
         time.sleep(0.05)
     return Cost(process.returncode, time.perf_counter() - start, _children_cpu() - before, disturbed)
 

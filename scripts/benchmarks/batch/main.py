@@ -86,11 +86,7 @@ class _Bench:
         """Killed when half of the good scans are finished, and started again."""
         half = len(self._good) // 2
         with Witness(self._output("killed")) as witness:
-            ended = run(
-                *self._words("killed"),
-                at=lambda: len(witness.finished()) >= half,
-                deed=lambda pid: os.kill(pid, signal.SIGKILL),
-            )
+            ended = run(*self._words("killed"), deed=lambda pid: len(witness.finished()) >= half and _kill([pid]))
             finished = witness.finished()
             cost = run(*self._words("killed"))
         told = self._told("killed", cost, witness)
@@ -106,8 +102,7 @@ class _Bench:
                 *self._words("dask"),
                 "--engine",
                 "dask",
-                at=lambda: len(witness.finished()) >= half and bool(self._workers(output)),
-                deed=lambda _: os.kill(self._workers(output)[0], signal.SIGKILL),
+                deed=lambda _: len(witness.finished()) >= half and _kill(self._workers(output)[:1]),
             )
         return self._told("dask", cost, witness)
 
@@ -175,6 +170,13 @@ class _Bench:
                 for file in files
             ),
         }
+
+
+def _kill(pids: Sequence[int]) -> bool:
+    """Kill processes; return whether there were any."""
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+    return bool(pids)
 
 
 def _summary(output: Path) -> list[dict[str, Any]]:
