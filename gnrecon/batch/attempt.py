@@ -25,6 +25,9 @@ from gnrecon.errors import ExitCode
 LOOK = 0.1
 """Seconds between two looks at a child."""
 
+_SELDOM = 10
+"""Looks between two searches for what a child has started."""
+
 _PATIENCE = 5.0
 
 
@@ -94,9 +97,9 @@ def _once(
     work: str,
 ) -> End:
     with start_child(threads, argument, log, environment, work) as child:
-        start, peak = time.monotonic(), 0.0
+        start, peak, watched = time.monotonic(), 0.0, Watched(child.pid)
         while (status := child.wait(LOOK)) is None:
-            memory, seconds = tree_memory_mb(child.pid), round(time.monotonic() - start, 3)
+            memory, seconds = watched.memory_mb(), round(time.monotonic() - start, 3)
             peak = max(peak, round(memory, 1))
             if stop.is_set():
                 return _killed(child, End(Cause.INTERRUPTED, ExitCode.INTERRUPTED, "Interrupted.", peak, seconds))
@@ -121,13 +124,26 @@ def _killed(child: Child, end: End) -> End:
     return end
 
 
-def tree_memory_mb(pid: int) -> float:
-    """Return the resident memory of a process and its descendants, in MB of 10^6 bytes; 0 of one that has ended."""
-    total = 0
-    for process in _tree(pid):
-        with suppress(psutil.Error):
-            total += process.memory_info().rss
-    return total / 1e6
+class Watched:
+    """A process whose memory is looked at again and again.
+
+    What it has started is looked for now and then only, because that takes a look at every process of the machine.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid, self._looks = pid, 0
+        self._tree: list[psutil.Process] = []
+
+    def memory_mb(self) -> float:
+        """Return the resident memory of it and its descendants, in MB of 10^6 bytes; 0 when it has ended."""
+        if self._looks % _SELDOM == 0:
+            self._tree = _tree(self._pid)
+        self._looks += 1
+        total = 0
+        for process in self._tree:
+            with suppress(psutil.Error):
+                total += process.memory_info().rss
+        return total / 1e6
 
 
 def _tree(pid: int) -> list[psutil.Process]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,9 @@ from markupsafe import Markup
 
 from gnrecon.batch.outcome import FILES, Cause
 from gnrecon.page import numbers, style_text
+
+COLORS = 64
+"""Of a thumbnail on the page."""
 
 WORDS = {
     Cause.INPUT: "the scan cannot be read or reconstructed",
@@ -74,9 +78,13 @@ def _link(path: str, folder: Path) -> str:
 
 
 def _picture(path: str) -> str | None:
-    """A picture as a data URI; None where it is not there."""
+    """A picture as a data URI, in few colours, because a page may hold thousands; None where it is not there."""
+    from PIL import Image
+
+    packed = io.BytesIO()
     try:
-        data = Path(path).read_bytes() if path else b""
+        with Image.open(path) as picture:
+            picture.convert("RGB").quantize(COLORS).save(packed, format="PNG", optimize=True)
     except OSError:
         return None
-    return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}" if data else None
+    return f"data:image/png;base64,{base64.b64encode(packed.getvalue()).decode('ascii')}"
