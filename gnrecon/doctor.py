@@ -84,6 +84,7 @@ def diagnose() -> list[Check]:
         check_python(),
         *(check_library(library) for library in LIBRARIES),
         *packages,
+        *check_plugins(),
         devices.result(),
         check_memory(),
         check_disk(Path.cwd()),
@@ -135,6 +136,19 @@ def check_package(distribution: str, module: str) -> Check:
     if version != "not installed" and missing:
         remedy = install_command(missing)
     return Check(distribution, False, f"{version}: {said}", remedy)
+
+
+def check_plugins() -> list[Check]:
+    """Return, for each reader, writer and residual that other packages bring, whether it can be loaded."""
+    from gnrecon.plugins import KINDS, installed
+
+    checks = []
+    for plugin in (plugin for group in KINDS for plugin in installed(group)):
+        code = f"from gnrecon.plugins import find; find({plugin.group!r}, {plugin.entry.name!r}).load()"
+        ok, said = run_python(code)
+        remedy = "" if ok else f"Mend or uninstall {plugin.package}."
+        checks.append(Check(f"{KINDS[plugin.group]} {plugin.entry.name}", ok, plugin.package if ok else said, remedy))
+    return checks
 
 
 def check_devices() -> Check:

@@ -33,7 +33,15 @@ class Plugin:
 
     def __str__(self) -> str:
         """Say what it is and which package brings it."""
-        return f"the {KINDS[self.group]} {self.entry.name!r} of {_package(self.entry)}"
+        return f"the {KINDS[self.group]} {self.entry.name!r} of {self.package}"
+
+    @property
+    def package(self) -> str:
+        """The package that it comes from, or its object where the metadata is too damaged to say."""
+        with suppress(Exception):
+            if self.entry.dist is not None:
+                return f"the package {self.entry.dist.name} {self.entry.dist.version}"
+        return self.entry.value
 
     def load(self) -> Any:
         """Return the object, importing its package.
@@ -100,18 +108,10 @@ def find(group: str, name: str) -> Plugin | None:
     found = [one for one in installed(group) if one.entry.name == name]
     if len(found) > 1:
         raise UsageError(
-            f"Several packages offer a {KINDS[group]} {name!r}: {' and '.join(_package(one.entry) for one in found)}; "
+            f"Several packages offer a {KINDS[group]} {name!r}: {' and '.join(one.package for one in found)}; "
             f"uninstall all but one of them."
         )
     return found[0] if found else None
-
-
-def _package(entry: EntryPoint) -> str:
-    """The package that an entry point comes from, or its object where the metadata is too damaged to say."""
-    with suppress(Exception):
-        if entry.dist is not None:
-            return f"the package {entry.dist.name} {entry.dist.version}"
-    return entry.value
 
 
 def _capital(plugin: Plugin) -> str:

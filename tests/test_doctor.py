@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import io
+import os
 import re
 import subprocess
 import sys
@@ -11,8 +12,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from other_packages import install, packages
 from rich.console import Console
 
+import gnrecon
 from gnrecon import doctor, system_packages
 from gnrecon.doctor import Check
 
@@ -74,6 +77,18 @@ def test_a_package_that_is_not_installed() -> None:
     assert not check.ok
     assert check.found.startswith("not installed")
     assert check.remedy.endswith("-m pip install --force-reinstall no-such-distribution")
+
+
+def test_what_other_packages_bring_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, "fine", "def read(path):\n    return None", readers={"fine": "read"})
+    install(tmp_path, "broken", "import no_such_library", writers={"bad": "write"})
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, (tmp_path, Path(gnrecon.__file__).parents[1]))))
+    with packages(tmp_path):
+        fine, broken = doctor.check_plugins()
+    assert fine == Check("reader fine", True, "the package fine 1.2")
+    assert (broken.name, broken.ok) == ("writer bad", False)
+    assert "cannot be loaded (ModuleNotFoundError: No module named 'no_such_library')" in broken.found
+    assert broken.remedy == "Mend or uninstall the package broken 1.2."
 
 
 def test_a_crash_in_native_code_is_survived_and_named() -> None:
