@@ -112,18 +112,22 @@ def missed(sdf: NeuralSDF, ball: Ball) -> float:
 
 
 def jump(sdf: NeuralSDF, vertices: Float) -> dict[str, float]:
-    """Return by how much value (in radii) and gradient differ across borders of cells near the surface, at most."""
+    """Return by how much value (in radii) and gradient jump at borders of cells near the surface, at most.
+
+    Of the value, what its slope says of the step is no jump.
+    """
     assert sdf.detail is not None
     rng, partition = np.random.default_rng(0), sdf.detail.partition
     u = (sdf.frame.to_unit(vertices[rng.integers(len(vertices), size=SAMPLES)]) - partition.origin) / partition.cell
-    rows, axis = np.arange(SAMPLES), rng.integers(3, size=SAMPLES)
-    u[rows, axis] = np.floor(u[rows, axis]) + rng.choice(BORDERS, SAMPLES)
+    rows, axis, border = np.arange(SAMPLES), rng.integers(3, size=SAMPLES), rng.choice(BORDERS, SAMPLES)
+    u[rows, axis] = np.round(u[rows, axis] - border) + border
     x, across = partition.origin + partition.cell * u, STEP * np.eye(3)[axis]
     (low, low_slope), (high, high_slope) = (
         sdf.sdf_and_gradient(sdf.frame.to_world(x + side)) for side in (-across, across)
     )
+    change = (high - low) / sdf.frame.scale - STEP * (low_slope + high_slope)[rows, axis]
     turn = np.linalg.norm(high_slope - low_slope, axis=1)
-    return {"value": float(np.abs(high - low).max() / sdf.frame.scale), "gradient": float(turn.max())}
+    return {"value": float(np.abs(change).max()), "gradient": float(turn.max())}
 
 
 def main(folder: Path) -> None:
