@@ -47,6 +47,8 @@ def _job(request: Request, found: Found, name: str, paired: Path | None) -> Job:
     values = request.settings.of(found.scan)
     reference = values.pop("reference", None) or paired
     timeout, memory = values.pop("timeout", None), values.pop("memory", None)
+    if values.get("work_dir"):  # a work folder is of one scan
+        values["work_dir"] = str(Path(values["work_dir"]) / name)
     options = Options.of(**{"threads": THREADS, **values}).as_dict()
     return Job(
         name,

@@ -67,10 +67,15 @@ def test_jobs_have_their_own_options_and_limits(request_of: Request) -> None:
     tables = (("left/*", {"resolution": 64, "threads": 4, "timeout": "2m", "memory": "1GB"}),)
     request = _with(request_of, settings=Settings({"seed": 5, "timeout": "1h"}, tables))
     jobs = {job.name: job for job in plan(request)}
-    assert [jobs["a"].options[name] for name in ("seed", "resolution", "threads")] == [5, 256, 1]
+    assert [jobs["a"].options[name] for name in ("seed", "resolution", "threads")] == [5, None, 1]
     assert [jobs["left/a"].options[name] for name in ("seed", "resolution", "threads")] == [5, 64, 4]
     assert (jobs["a"].limits, jobs["left/a"].limits) == (Limits(3600.0), Limits(120.0, 1000.0))
     assert "resolution = 64\n" in jobs["left/a"].config
+
+
+def test_each_scan_has_a_work_folder_of_its_own(request_of: Request) -> None:
+    jobs = plan(_with(request_of, settings=Settings({"work_dir": "work"})))
+    assert {job.options["work_dir"] for job in jobs} == {"work/a", "work/b", "work/left/a"}
 
 
 def _with(request: Request, **values: object) -> Request:
