@@ -150,6 +150,30 @@ Quality = Annotated[
         rich_help_panel=FIT,
     ),
 ]
+Smooth = Annotated[
+    str | None,
+    typer.Option(
+        metavar="strain=WEIGHT",
+        help="Let the surface be smooth: strain=1e-4 (all in radii) halves bumps 0.63 long, and removes shorter ones.",
+        rich_help_panel=FIT,
+    ),
+]
+Fill = Annotated[
+    str | None,
+    typer.Option(
+        metavar="minimal",
+        help="Close holes by minimal surfaces, as soap films do, instead of as the rest bends.",
+        rich_help_panel=FIT,
+    ),
+]
+Prior = Annotated[
+    str | None,
+    typer.Option(
+        metavar="developable",
+        help="Let the surface be developable between creases, as sheet metal is: bent in one direction at most.",
+        rich_help_panel=FIT,
+    ),
+]
 NormalResidual = Annotated[
     str,
     typer.Option(
@@ -327,6 +351,9 @@ def reconstruct_command(
     clusters: Clusters = "auto",
     smooth_scan: SmoothScan = None,
     orient: Orient = "auto",
+    smooth: Smooth = None,
+    fill: Fill = None,
+    prior: Prior = None,
     widths: Widths = None,
     steps: Steps = None,
     quality: Quality = "normal",
@@ -481,6 +508,9 @@ def batch_command(
     clusters: Clusters = "auto",
     smooth_scan: SmoothScan = None,
     orient: Orient = "auto",
+    smooth: Smooth = None,
+    fill: Fill = None,
+    prior: Prior = None,
     widths: Widths = None,
     steps: Steps = None,
     quality: Quality = "normal",
@@ -674,7 +704,10 @@ def learn_command(
     context: typer.Context,
     problem: Annotated[
         str,
-        typer.Argument(help="catenoid or enneper (minimal surfaces), cone (a developable one), or bracket (a part)."),
+        typer.Argument(
+            help="catenoid or enneper (minimal surfaces), cone (a developable one), bracket (a part), bunny or "
+            "rockerarm (the paper's scans), or the file of a scan."
+        ),
     ],
     output: Output,
     optimiser: Annotated[
@@ -696,6 +729,14 @@ def learn_command(
         int, typer.Option(help="Cells along the longest side of the box that is meshed.", rich_help_panel=MESH)
     ] = 192,
     curvature: Curvature = False,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder of bun_zipper.ply and rocker-arm.off.", rich_help_panel=POINTS),
+    ] = None,
+    share: Annotated[
+        float | None,
+        typer.Option(help="Of a scan: share of the points to learn from, such as 0.2.", rich_help_panel=POINTS),
+    ] = None,
     region: Annotated[
         Path | None,
         typer.Option(
@@ -731,6 +772,7 @@ def learn_command(
     """Learn a surface from constraints alone: the paper's data-free problems, or a part from its design."""
     from gnrecon.commands.learn import LearnOptions, run_learn
     from gnrecon.commands.part import DesignFiles
+    from gnrecon.commands.scanned import ScanFiles
 
     del debug
     options = LearnOptions(optimiser, budget, steps, seed, resolution, curvature, threads)
@@ -740,6 +782,7 @@ def learn_command(
             output,
             options,
             files=DesignFiles(region, interfaces, interfaces_frame, clip),
+            scan=ScanFiles(data, share),
             report=report,
             overwrite=overwrite,
             quiet=quiet,

@@ -88,6 +88,10 @@ class Options:
         ``"2mm"``, or in spacings of the points as in ``"3s"``; the mesh is then open. By default nothing is cut.
     remesh, adaptive, simplify, faces, feature_angle
         Of the mesh's refinement, see `gnrecon.export.RefineOptions`.
+    smooth, fill, prior : str, optional
+        What is asked of the surface besides lying near the points: ``"strain=1e-4"`` to be smooth, by the square of the
+        principal curvatures with that weight, all in radii; ``"minimal"`` to close holes as a soap film would;
+        ``"developable"`` to unroll into the plane, as sheet metal does. See `gnrecon.fit.regulariser`.
     widths, steps, quality, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
@@ -127,6 +131,9 @@ class Options:
     simplify: float | None = None
     faces: int | None = None
     feature_angle: float = RefineOptions.feature_angle
+    smooth: str | None = None
+    fill: str | None = None
+    prior: str | None = None
     widths: tuple[int, ...] | None = None
     steps: int | None = None
     quality: str = FitOptions.quality
@@ -272,6 +279,9 @@ class Options:
             optimiser=self.optimiser,
             solver=self.solver,
             search=self.search,
+            smooth=self.smooth,
+            fill=self.fill,
+            prior=self.prior,
             seed=self.seed,
             device=self.device,
         )

@@ -42,6 +42,12 @@ from gnrecon.options import Options
         ({"simplify": 0.0}, "tolerance to simplify to must be positive, not 0"),
         ({"faces": 2}, "number of faces must be at least 4, not 2"),
         ({"feature_angle": 120.0}, "feature angle must be from 5 to 90 degrees, not 120"),
+        ({"smooth": "strain"}, "option smooth takes strain=WEIGHT, such as strain=1e-4, not 'strain'"),
+        ({"smooth": "strain=-1"}, "weight of smooth must be a positive number, as in strain=1e-4, not '-1'"),
+        ({"smooth": "strain=much"}, "weight of smooth must be a positive number, as in strain=1e-4, not 'much'"),
+        ({"fill": "maximal"}, "option fill takes minimal=WEIGHT or minimal alone, .* not 'maximal'"),
+        ({"prior": "developable=inf"}, "weight of prior must be a positive number, .* not 'inf'"),
+        ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior belong to the default fit"),
         ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
     ],
 )

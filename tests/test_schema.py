@@ -36,6 +36,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "clusters": "on",
         "crop": "-2,-2,-2,2,2,2",
     },
+    "shaped": {"widths": None, "max_points": 300, "quality": "draft", "fill": "minimal", "smooth": "strain=1e-4"},
     "gauss-newton": {"steps": 2},
     "line": {"steps": 2, "search": "line", "solver": "qr"},
     "trimmed": {"steps": 0, "trim": "3s", "curvature": True},

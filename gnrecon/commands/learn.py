@@ -12,8 +12,10 @@ import numpy as np
 from rich.console import Console
 
 from gnrecon.atomic import atomic_write
+from gnrecon.cloud import Frame
 from gnrecon.commands.part import NAME, DesignFiles, part_mesh
-from gnrecon.design import DesignFacts, judge
+from gnrecon.commands.scanned import FILES, ScanFiles, is_scan, placed
+from gnrecon.design import Design, DesignFacts, judge
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import MeshFacts, curvatures, require_bordered, require_sound, verify, verify_file
 from gnrecon.files import require_files
@@ -25,6 +27,7 @@ from gnrecon.shapes import OPTIMISERS, PROBLEMS, Learned, Measurement, ShapeProb
 
 OPEN = "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
 CLOSED = "closed, oriented 2-manifold"
+NO_SCAN = ScanFiles()
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,7 @@ def run_learn(
     options: LearnOptions,
     *,
     files: DesignFiles,
+    scan: ScanFiles = NO_SCAN,
     report: Path | None = None,
     overwrite: bool = False,
     quiet: bool = False,
@@ -77,14 +81,18 @@ def run_learn(
     UsageError, FitError, MeshError, OutputError, MemoryLimitError
         Each says in one sentence what is wrong; nothing is written then.
     """
-    if name not in (*PROBLEMS, NAME):
-        raise UsageError(f"There is no problem {name!r}; the problems are {', '.join((*PROBLEMS, NAME))}.")
+    if name not in (*PROBLEMS, NAME) and not is_scan(name):
+        known = ", ".join((*PROBLEMS, NAME, *FILES))
+        raise UsageError(f"There is no problem {name!r}; the problems are {known}, and files of scans.")
+    if scan != NO_SCAN and not is_scan(name):
+        raise UsageError(f"A share of points, or a folder of them, is for scans, not for {name}.")
     if name != NAME and files != DesignFiles():
         raise UsageError(f"A design is for the problem {NAME} alone, not for {name}.")
     check_writable(output)
-    require_files(files.named(), [path for path in (output, report) if path is not None], overwrite)
+    sources = [*files.named(), *([scan.path(name)] if is_scan(name) else [])]
+    require_files(sources, [path for path in (output, report) if path is not None], overwrite)
     design = files.read() if name == NAME else None
-    problem = PROBLEMS[name]() if design is None else bracket(design, options.seed, files.clip)
+    problem, frame = _posed(name, design, files, scan, options.seed)
     console = Console(stderr=True, quiet=quiet)
     with limited(options.threads):
         learned = learn(
@@ -99,6 +107,7 @@ def run_learn(
         rng = np.random.default_rng(options.seed)
         if design is None:
             mesh = _mesh(learned, problem, options)
+            mesh = mesh if frame is None else placed(mesh, frame)
         else:
             mesh, notes = part_mesh(learned.field, design, options.resolution, options.curvature, rng)
     facts = require_sound(mesh) if design is not None or verify(mesh).closed else require_bordered(mesh)
@@ -110,6 +119,15 @@ def run_learn(
     for sentence in [*notes, learned.solution.status, told(learned.best), _summary(output, facts)]:
         _say(console, sentence)
     return ExitCode.INTERRUPTED if learned.solution.interrupted else ExitCode.OK
+
+
+def _posed(
+    name: str, design: Design | None, files: DesignFiles, scan: ScanFiles, seed: int
+) -> tuple[ShapeProblem, Frame | None]:
+    """Return a problem, and the frame of its file's coordinates where it has one that is not the part's own."""
+    if design is not None:
+        return bracket(design, seed, files.clip), None
+    return scan.problem(name, seed) if is_scan(name) else (PROBLEMS[name](), None)
 
 
 def told(found: Measurement) -> str:

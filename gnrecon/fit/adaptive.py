@@ -5,6 +5,7 @@ the field is linear in them (variable projection). The global field, of at most 
 features, gives sign, free space and the closing of holes; it is kept smooth, because what it learned of the noise no
 detail could take back. Some points are left out of it, on which length and noise of the detail are chosen (`choose`),
 so that clean scans are interpolated and noisy ones smoothed, without a setting. Then the detail is solved (`detail`).
+What is asked of the surface besides (`regulariser`) bends both, the global field before the detail.
 """
 
 from __future__ import annotations
@@ -17,17 +18,20 @@ import numpy as np
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
+from gnrecon.errors import UsageError
 from gnrecon.field.siren import Siren
 from gnrecon.fit.choose import Mask
 from gnrecon.fit.contradict import reconciled
-from gnrecon.fit.detail import fit_detail
+from gnrecon.fit.detail import ShapingFor, fit_detail
 from gnrecon.fit.large import LARGE, fit_large
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.shaped import Shaping, bend_global
 from gnrecon.fit.smoothness import global_length, smooth_spectrum
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Solution
+from gnrecon.sampling import Density
 
 _log = logging.getLogger(__name__)
 
@@ -57,11 +61,18 @@ def fit_adaptive(
 
     Raises
     ------
+    UsageError
+        When regularisers are asked for of a fit by blocks.
     FitError
         When a linear system cannot be solved.
     """
     order = rng.permutation(len(samples))
     by_blocks = folder is not None or len(samples) >= LARGE
+    if by_blocks and options.regularisers:
+        raise UsageError(
+            f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; thin the scan with "
+            f"--max-points."
+        )
     # Left-out points must lie near each other, so that those around a place tell of it alone.
     out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
     held: Mask = np.zeros(len(samples), dtype=bool)
@@ -81,15 +92,18 @@ def fit_adaptive(
         len(rows),
         out,
     )
-    linear = replace(options, widths=field.widths, steps=0)
+    linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
     fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
     sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
+    shape = None
+    if options.regularisers:
+        sdf, shape = _shaped(sdf, samples, scene, spectrum.length, options, rng)
     rest = part(advance, SHARE, 1.0)
     try:
         if by_blocks:
             detail = fit_large(sdf, samples, held, options, rng, folder, rest)
         else:
-            detail = fit_detail(sdf, samples, held, options.features, rng, options.device, rest)
+            detail = fit_detail(sdf, samples, held, options.features, rng, options.device, rest, shape)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(fitted, status=status, interrupted=True)
@@ -98,6 +112,21 @@ def fit_adaptive(
     status = (
         f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
         f"length {chosen['length']:.3g}, noise {chosen['position_noise']:.2g} in position and "
-        f"{chosen['angle_noise']:.2g} degrees in normals.{told}"
+        f"{chosen['angle_noise']:.2g} degrees in normals.{told}{_asked(options)}"
     )
     return replace(sdf, detail=detail), replace(fitted, status=status, method="Exact linear least squares.")
+
+
+def _asked(options: FitOptions) -> str:
+    """Return a sentence about what was asked of the surface besides, after a blank, or nothing."""
+    asked = ", ".join(f"{one.name} ({one.weight:g})" for one in options.regularisers)
+    return f" Asked of the surface besides, with its weight: {asked}." if asked else ""
+
+
+def _shaped(
+    sdf: NeuralSDF, samples: Samples, scene: Scene, length: float, options: FitOptions, rng: np.random.Generator
+) -> tuple[NeuralSDF, ShapingFor]:
+    """Return the global field bent to the regularisers, and how the detail is to heed them."""
+    density, wanted = Density(samples.points), options.regularisers
+    bent = bend_global(Shaping.of(wanted, sdf, density, length, rng), scene, options, rng)
+    return bent, lambda shorter: Shaping.of(wanted, bent, density, shorter, rng)

@@ -9,10 +9,12 @@ the data (`patch`) with a length and noise that the data itself chose (`choose`)
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float, Samples
@@ -22,9 +24,13 @@ from gnrecon.field.partition import Partition
 from gnrecon.fit.choose import Int, Leftover, Mask, Volume, choose
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.shaped import Shaping
 from gnrecon.sampling import CoarseDistance
 
 _log = logging.getLogger(__name__)
+
+ShapingFor = Callable[[float], Shaping]
+"""Gives what is asked of the surface for features of a length, in radii."""
 
 CELL = 5.0
 """Edge of a cube, in lengths."""
@@ -51,6 +57,7 @@ def fit_detail(
     rng: np.random.Generator,
     device: str,
     advance: Advance = unheard,
+    shape: ShapingFor | None = None,
 ) -> Detail:
     """Return what to add to a global field.
 
@@ -63,6 +70,7 @@ def fit_detail(
     rng : draws features and samples of the volume
     device : a torch device
     advance : told of the share that is done
+    shape : gives what is asked of the surface besides, for the length of the detail
     """
     leftover = left_over(sdf, samples)
     belief = choose(leftover, held, leftover.density.radius, rng, device)
@@ -75,7 +83,8 @@ def fit_detail(
     )
     advance(CHOSEN)
     coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
-    return _Cubes.of(leftover, belief, features, rng, device).detail(sdf, coarse, rng, advance)
+    shaping = None if shape is None else shape(belief.length)
+    return _Cubes.of(leftover, belief, features, rng, device, shaping).detail(sdf, coarse, rng, advance)
 
 
 def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
@@ -106,15 +115,24 @@ class _Cubes:
     features: Features
     partition: Partition
     device: str
+    shaping: Shaping | None
 
     @classmethod
-    def of(cls, leftover: Leftover, belief: Belief, count: int, rng: np.random.Generator, device: str) -> _Cubes:
+    def of(
+        cls,
+        leftover: Leftover,
+        belief: Belief,
+        count: int,
+        rng: np.random.Generator,
+        device: str,
+        shaping: Shaping | None,
+    ) -> _Cubes:
         like = torch.zeros(0, dtype=torch.float64, device=device)
         cell = CELL * belief.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(leftover.points.min(axis=0) - 0.137 * cell, cell)
         features = Features.draw(count, rng, like)
-        return cls(leftover, belief, features, partition, device)
+        return cls(leftover, belief, features, partition, device, shaping)
 
     def detail(self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: Advance) -> Detail:
         """Fit all cubes that hold data."""
@@ -131,12 +149,18 @@ class _Cubes:
                 system = PatchSystem(patch, self.features, length, patch.size)
                 kept.append(key)
                 lengths.append(length)
-                amplitudes.append(system.solve(self.belief.position, self.belief.angle))
+                amplitudes.append(self._solved(system, length, center))
             advance(CHOSEN + (1.0 - CHOSEN) * (number + 1) / len(keys))
         solved = torch.stack(amplitudes)
         _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
         noise = self.belief.position, self.belief.angle
         return Detail(self.partition, np.array(kept), np.array(lengths), self.features, solved, *noise)
+
+    def _solved(self, system: PatchSystem, length: float, center: Float) -> Tensor:
+        """Return the amplitudes of the cube about a centre, of shape (m,)."""
+        if self.shaping is None:
+            return system.solve(self.belief.position, self.belief.angle)
+        return self.shaping.bend_cube(self.features, length, center, self.partition.reach, self.belief, system)
 
     def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
         """Return samples of each cube that lie clear of the data, with what the coarse distance asks for there."""
@@ -148,6 +172,8 @@ class _Cubes:
         x, cube = x[inside], cube[inside]
         clear, signed, distance = coarse.at(x, CLEAR)
         x, cube = x[clear], cube[clear]
+        if self.shaping is not None:
+            signed = self.shaping.told(x, signed)
         wanted = signed - sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
         ends = np.searchsorted(cube, np.arange(1, len(keys)))
         parts = (np.split(values, ends) for values in (x, wanted, distance))

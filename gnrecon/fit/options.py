@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gnrecon.errors import UsageError
+from gnrecon.fit.regulariser import Regulariser, regularisers
 from gnrecon.linalg import SOLVERS
 from gnrecon.plugins import RESIDUALS, find, installed
 from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
@@ -57,6 +58,9 @@ class FitOptions:
         Seeds features and samples.
     device : str
         A torch device, ``"cpu"`` or ``"cuda"``.
+    smooth, fill, prior : str, optional
+        What is asked of the surface besides, as ``"strain=1e-4"``, ``"minimal"`` and ``"developable"``, see
+        `gnrecon.fit.regulariser`; not of one network.
 
     Raises
     ------
@@ -73,6 +77,9 @@ class FitOptions:
     search: str = "auto"
     seed: int = 0
     device: str = "cpu"
+    smooth: str | None = None
+    fill: str | None = None
+    prior: str | None = None
 
     def __post_init__(self) -> None:
         if self.widths is not None and (not self.widths or min(self.widths) < 1):
@@ -87,12 +94,22 @@ class FitOptions:
                 raise UsageError(f"The {name} must be one of {', '.join(known)}, not {getattr(self, name)!r}.")
         if self.search not in SEARCHES:
             raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
+        if self.regularisers and not self.adaptive:
+            raise UsageError(
+                "smooth, fill and prior belong to the default fit; they do not go with widths, steps, another "
+                "optimiser or another normal residual."
+            )
 
     @property
     def adaptive(self) -> bool:
         """Whether the data chooses network and detail, because nothing was asked that only one network can do."""
         one = self.widths is not None or self.steps is not None
         return not one and self.optimiser == "gn" and self.normals == "vector"
+
+    @property
+    def regularisers(self) -> tuple[Regulariser, ...]:
+        """What is asked of the surface besides."""
+        return regularisers(self.smooth, self.fill, self.prior)
 
     @property
     def features(self) -> int:

@@ -100,6 +100,19 @@ class PatchSystem:
 
         Where rounding makes the system indefinite, it is damped more.
         """
+        factor, right = self._factored(position, angle)
+        if factor is None:
+            return torch.zeros_like(right)
+        amplitudes: Tensor = self._scale * solve_factored(factor, right)
+        return amplitudes
+
+    def equations(self, position: float, angle: float) -> tuple[Tensor, Tensor] | None:
+        """Return L, of shape (m, m), and b, of shape (m,), of that system L L^T a = b; None where it is indefinite."""
+        factor, right = self._factored(position, angle)
+        return None if factor is None else (factor / self._scale, right / self._scale)
+
+    def _factored(self, position: float, angle: float) -> tuple[Tensor | None, Tensor]:
+        """Return the Cholesky factor and the right-hand side for amplitudes over their standard deviation."""
         data = self._positions[0] / position**2 + self._angles[0] / angle**2
         product = self._scale**2 * (data + self._volume[0])
         right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2 + self._volume[1])
@@ -107,10 +120,9 @@ class PatchSystem:
         for _ in range(ATTEMPTS):
             factor = damped_factor(product, damping)
             if factor is not None:
-                amplitudes: Tensor = self._scale * solve_factored(factor, right)
-                return amplitudes
+                return factor, right
             damping = 10 * damping
-        return torch.zeros_like(right)
+        return None, right
 
 
 def _data_sums(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -6,6 +6,7 @@ from gnrecon.levelset.connect import Joints, Region, joints
 from gnrecon.levelset.critical import refined
 from gnrecon.levelset.crossings import Crossings, find_crossings
 from gnrecon.levelset.known import catenoid, cone, enneper
+from gnrecon.levelset.known_surface import KnownSurface
 from gnrecon.levelset.level_set import LevelSet, Value, ValueAndGradient
 from gnrecon.levelset.newton import Projection, nearest, project
 from gnrecon.levelset.parametric import ParametricSurface
@@ -18,6 +19,7 @@ __all__ = [
     "ChamferDivergence",
     "Crossings",
     "Joints",
+    "KnownSurface",
     "LevelSet",
     "ParametricSurface",
     "Projection",

@@ -25,9 +25,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.levelset.known_surface import KnownSurface
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.newton import nearest
-from gnrecon.levelset.parametric import ParametricSurface
 from gnrecon.levelset.sample import SurfaceSample, sample_surface
 
 _COUNT = 4000
@@ -49,7 +49,7 @@ class ChamferDivergence:
 
 
 def chamfer_divergence(
-    level_set: LevelSet, known: ParametricSurface, rng: np.random.Generator, count: int = _COUNT
+    level_set: LevelSet, known: KnownSurface, rng: np.random.Generator, count: int = _COUNT
 ) -> ChamferDivergence:
     """Measure a level set against a known surface within its box, each by `count` points of the other.
 
@@ -81,7 +81,7 @@ def distances_to(level_set: LevelSet, queries: Tensor, sample: SurfaceSample) ->
     return least
 
 
-def _to_known(sample: SurfaceSample, known: ParametricSurface, count: int) -> float:
+def _to_known(sample: SurfaceSample, known: KnownSurface, count: int) -> float:
     # The sample is ordered along a curve through space, so that every n-th point is as even a sample.
     points = sample.points[:: max(1, len(sample) // count)]
     feet, inside = known.nearest(points)

@@ -9,6 +9,7 @@ from gnrecon.shapes.measure import Measurement
 from gnrecon.shapes.minimal import catenoid, enneper, minimal_surface
 from gnrecon.shapes.part import bracket
 from gnrecon.shapes.problem import ShapeProblem, circle, cube, plane_through, z_cylinder, z_plane
+from gnrecon.shapes.scanned import ScannedSurface, scanned
 from gnrecon.shapes.term import Drawn, Moment, Term, at_points, fading, in_box, on_surface, rising
 
 PROBLEMS: dict[str, Callable[[], ShapeProblem]] = {"catenoid": catenoid, "enneper": enneper, "cone": cone}
@@ -22,6 +23,7 @@ __all__ = [
     "LearnedField",
     "Measurement",
     "Moment",
+    "ScannedSurface",
     "ShapeProblem",
     "Term",
     "at_points",
@@ -40,6 +42,7 @@ __all__ = [
     "on_surface",
     "plane_through",
     "rising",
+    "scanned",
     "z_cylinder",
     "z_plane",
 ]

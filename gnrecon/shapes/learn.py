@@ -19,19 +19,18 @@ import numpy as np
 from torch import Tensor
 
 from gnrecon.errors import FitError, UsageError
-from gnrecon.linalg import identity
-from gnrecon.optim import LBFGS, Adam, GainRatioDamping, GaussNewton, Optimiser, Problem, Solution, StopRule
+from gnrecon.optim import LBFGS, Adam, GaussNewton, Optimiser, Problem, Search, Solution, StopRule
 from gnrecon.shapes.learned import LearnedField
 from gnrecon.shapes.measure import Measurement, measure
 from gnrecon.shapes.pretrain import pretrained
 from gnrecon.shapes.problem import ShapeProblem
 
-OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
-    "gn": lambda rate: GaussNewton(GainRatioDamping(initial_damping=1.0, metric=identity)),  # noqa: ARG005
-    "lbfgs": lambda rate: LBFGS(),  # noqa: ARG005 (one signature for all)
-    "adam": Adam,
+OPTIMISERS: dict[str, Callable[[Search, float], Optimiser]] = {
+    "gn": lambda search, rate: GaussNewton(search),  # noqa: ARG005 (one signature for all)
+    "lbfgs": lambda search, rate: LBFGS(),  # noqa: ARG005
+    "adam": lambda search, rate: Adam(rate),  # noqa: ARG005
 }
-"""Makes each optimiser by its name, with the problem's learning rate for Adam."""
+"""Makes each optimiser by its name, with the problem's step control for Gauss-Newton and a learning rate for Adam."""
 
 MOST_STEPS = 10**6
 FIRST, GROWTH = 5.0, 1.5
@@ -135,7 +134,9 @@ def learn(
     run = _Run(problem, rng, seed, budget is None, heard)
     theta = pretrained(problem, seed, rng)
     run.note(0, theta)
-    return _finished(run, theta, _solved(run, theta, OPTIMISERS[optimiser](learning_rate), budget, steps))
+    return _finished(
+        run, theta, _solved(run, theta, OPTIMISERS[optimiser](problem.search, learning_rate), budget, steps)
+    )
 
 
 def _solved(run: _Run, theta: Tensor, method: Optimiser, budget: float | None, steps: int | None) -> Solution:

@@ -11,13 +11,18 @@ from torch import Tensor
 
 from gnrecon.cloud import Float
 from gnrecon.field import TANH, Network
-from gnrecon.levelset import LevelSet, ParametricSurface
+from gnrecon.levelset import KnownSurface, LevelSet
+from gnrecon.linalg import identity
+from gnrecon.optim import GainRatioDamping, Search
 from gnrecon.sampling import Box
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
 from gnrecon.shapes.term import Drawn, Moment, Term
 
 PAPERS = Network((32, 32), TANH)
 """The network of the paper's minimal and developable surfaces."""
+
+CAUTIOUS = GainRatioDamping(initial_damping=1.0, metric=identity)
+"""Step control that does not tear a surface in its first steps."""
 
 Start = Callable[[Tensor], Tensor]
 """From points, of shape (N, 3), to values, of shape (N,): about a distance to a surface much like the wanted one."""
@@ -36,6 +41,7 @@ class ShapeProblem:
     network : Network
     known : the solution, where it is known, to measure against
     shown : the part of the box that is meshed, by default all of it
+    search : step control of Gauss-Newton
     """
 
     name: str
@@ -43,8 +49,9 @@ class ShapeProblem:
     box: Box
     start: Start
     network: Network = PAPERS
-    known: ParametricSurface | None = None
+    known: KnownSurface | None = None
     shown: Box | None = None
+    search: Search = CAUTIOUS
 
     def level_set(self, theta: Tensor) -> LevelSet:
         """Return the zero level of the network with parameters theta, of shape (p,)."""

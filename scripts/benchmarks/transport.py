@@ -98,7 +98,11 @@ def run(problem: ShapeProblem, start: Tensor, steps: int, seed: int) -> list[Ten
         seen.append(theta.clone())
         return problem.freeze(number, theta, rng)
 
-    last = OPTIMISERS["gn"](0.0).run(problem_at, start, StopRule(steps, tolerance=0.0, patience=steps + 1)).theta
+    last = (
+        OPTIMISERS["gn"](problem.search, 0.0)
+        .run(problem_at, start, StopRule(steps, tolerance=0.0, patience=steps + 1))
+        .theta
+    )
     return [*seen, last]
 
 

@@ -10,7 +10,7 @@ from command_line import CommandLine
 
 from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
-from gnrecon.io import read_mesh
+from gnrecon.io import read_cloud, read_mesh
 
 
 @pytest.fixture
@@ -53,6 +53,8 @@ def test_a_few_steps_of_the_catenoid(gnrecon: CommandLine, tmp_path: Path) -> No
         (("cone", "--steps", "0"), "steps"),
         (("cone", "--resolution", "2"), "resolution"),
         (("cone", "--threads", "0"), "threads"),
+        (("cone", "--share", "0.2"), "is for scans, not for cone"),
+        (("bunny", "--share", "1.5"), "above 0 and at most 1"),
     ],
 )
 def test_what_makes_no_sense_is_refused(
@@ -67,3 +69,29 @@ def test_an_existing_mesh_is_kept(gnrecon: CommandLine, tmp_path: Path) -> None:
     kept.write_text("mine")
     gnrecon.refuses(ExitCode.OUTPUT, "exists already", "learn", "cone", "-o", kept)
     assert kept.read_text() == "mine"
+
+
+def test_the_papers_scans_are_told_where_they_are_missing(gnrecon: CommandLine, tmp_path: Path) -> None:
+    folder, mesh = tmp_path / "data", tmp_path / "mesh.ply"
+    folder.mkdir()
+    gnrecon.refuses(ExitCode.INPUT, "--data names the folder that holds bun_zipper.ply", "learn", "bunny", "-o", mesh)
+    words = ("learn", "rockerarm", "--data", folder, "-o", mesh)
+    gnrecon.refuses(ExitCode.INPUT, "does not hold rocker-arm.off", *words)
+    assert not mesh.exists()
+
+
+def test_a_scan_of_ones_own_comes_back_in_its_own_coordinates(
+    gnrecon: CommandLine, tmp_path: Path, repository: Path
+) -> None:
+    mesh, report = tmp_path / "mesh.ply", tmp_path / "r.json"
+    scan = repository / "sample_data" / "bracket_sparse.ply"
+    words = ("-o", mesh, "--report", report, "--steps", 1, "--share", 0.5, "--resolution", 24)
+    done = gnrecon("learn", scan, *words)
+    assert done.returncode == 0, done.stderr
+    written = json.loads(report.read_text())
+    assert written["network"] == {"widths": [32, 32, 32], "activation": "sine", "parameters": 2273}
+    assert written["chamfer"] < 0.3
+    lower, upper = (getattr(read_cloud(scan).points, end)(axis=0) for end in ("min", "max"))
+    middle = read_mesh(mesh).vertices.mean(axis=0)
+    assert (middle > lower).all()
+    assert (middle < upper).all()

@@ -1,0 +1,193 @@
+"""Sine features, solved for data already, bent to what regularisers ask of the surface that they make.
+
+The data, the volume and the prior are linear in the amplitudes a, so that all of their rows together are as good as the
+few of one triangular matrix, |L^T a - y|^2 up to a constant. The residuals of curvature are not linear, and ask for a
+few steps of Gauss-Newton, each at points of the surface as it is then; the best of these surfaces is taken.
+
+With phases z_j = w_j . x + p_j a feature has the gradient cos z_j w_j and the second derivatives -sin z_j w_j w_j^T,
+and so a residual linearised to dr = c df + v . d(grad f) + M : d(Hess f) the row
+
+    c sin z_j + (v . w_j) cos z_j - (w_j . M w_j) sin z_j.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gnrecon.field.features import Features
+from gnrecon.linalg import identity
+from gnrecon.linalg.jacobian import DenseJacobian
+from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
+from gnrecon.optim.problem import loss_of
+from gnrecon.residuals import Linearised, SecondOrder
+
+TOLERANCE, IN_VAIN = 0.01, 2
+"""The bending ends after so many steps in a row that have not lowered the surface's own loss by such a share."""
+
+FOLLOWED = 3
+"""Newton steps that bring points onto the surface."""
+
+Jet = tuple[Tensor, Tensor, Tensor]
+"""Value (N,), gradient (N, 3) and second derivatives (N, 3, 3)."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """A residual of curvature that is asked of points of the surface.
+
+    Parameters
+    ----------
+    residual : SecondOrder
+    points : of shape (N, 3), near the surface, onto which they are brought
+    scale : factor of each point's rows, of shape (N, 1)
+    robust : size of the residual from which on it hardly counts, or None
+    """
+
+    residual: SecondOrder
+    points: Tensor
+    scale: Tensor
+    robust: float | None = None
+
+    def weighed(self, jet: Jet) -> Wish:
+        """Return the wish with what its residuals count, at the points' jet, in its scale."""
+        if self.robust is None:
+            return self
+        square = self.residual(*jet).residual.square().sum(1, keepdim=True)
+        # The tangent of r^2 / (1 + r^2) is a multiple of r^2: iteratively reweighted least squares.
+        return replace(self, scale=self.scale / (1 + square / self.robust**2))
+
+
+@dataclass(frozen=True)
+class Sines:
+    """Sine features about a centre, on top of a known function.
+
+    Parameters
+    ----------
+    features : Features
+    center : of shape (3,)
+    length : of the features
+    reach : how far a point may go in one step onto the surface
+    base : gives the known function's jet at points, of shape (N, 3); None where there is none
+    """
+
+    features: Features
+    center: Tensor
+    length: float
+    reach: float
+    base: Callable[[Tensor], Jet] | None = None
+
+    def known(self, x: Tensor) -> Jet:
+        """Return the jet of the known function at x, of shape (N, 3)."""
+        if self.base is not None:
+            return self.base(x)
+        return x.new_zeros(len(x)), x.new_zeros(len(x), 3), x.new_zeros(len(x), 3, 3)
+
+    def jet(self, amplitudes: Tensor, x: Tensor, known: Jet) -> Jet:
+        """Return the jet of both together; `known` is that of the known function there."""
+        own = self.features.sums(amplitudes, x, self.center, self.length, 2)
+        return known[0] + own[0], known[1] + own[1], known[2] + own[2]
+
+    def rows(self, x: Tensor, linear: Linearised, scale: Tensor) -> Tensor:
+        """Return the rows of residuals, of shape (m N, p), residual by residual."""
+        z = self.features.phase(x, self.center, self.length)
+        sines, cosines, waves = z.sin(), z.cos(), self.features.frequencies / self.length
+        squares = (waves[:, :, None] * waves[:, None, :]).reshape(-1, 9)
+        made = []
+        for column in range(linear.residual.shape[1]):
+            row = torch.zeros_like(sines)
+            if linear.by_value is not None:
+                row += linear.by_value[:, column, None] * sines
+            if linear.by_gradient is not None:
+                row += (linear.by_gradient[:, column] @ waves.T) * cosines
+            if linear.by_hessian is not None:
+                row -= (linear.by_hessian[:, column].reshape(-1, 9) @ squares.T) * sines
+            made.append(scale * row)
+        return torch.cat(made)
+
+    def on_surface(self, amplitudes: Tensor, x: Tensor) -> Tensor:
+        """Return points, of shape (N, 3), moved along the gradient onto the zero level, as far as it is near."""
+        for _ in range(FOLLOWED):
+            value, gradient, _ = self.jet(amplitudes, x, self.known(x))
+            step = value[:, None] * gradient / gradient.square().sum(1, keepdim=True).clamp_min(1e-6)
+            far = torch.linalg.vector_norm(step, dim=1, keepdim=True).clamp_min(self.reach)
+            x = x - step * (self.reach / far)
+        return x
+
+
+@dataclass(frozen=True)
+class BendProblem:
+    """The least-squares problem of one step: L^T a = y, and the wishes at their points, of which none moves.
+
+    Parameters
+    ----------
+    sines : Sines
+    factor, target : L, of shape (p, p), and y, of shape (p,)
+    wishes : with points on the surface, and what is robust of them in their scales
+    theta : amplitudes where it was posed
+    known : jets of the known function at each wish's points
+    """
+
+    sines: Sines
+    factor: Tensor
+    target: Tensor
+    wishes: Sequence[Wish]
+    theta: Tensor
+    known: Sequence[Jet]
+
+    @classmethod
+    def at(cls, sines: Sines, factor: Tensor, target: Tensor, wishes: Sequence[Wish], theta: Tensor) -> BendProblem:
+        """Pose the problem of the surface that the amplitudes theta make."""
+        placed = [replace(wish, points=sines.on_surface(theta, wish.points)) for wish in wishes]
+        known = [sines.known(wish.points) for wish in placed]
+        weighed = [wish.weighed(sines.jet(theta, wish.points, jet)) for wish, jet in zip(placed, known, strict=True)]
+        return cls(sines, factor, target, weighed, theta, known)
+
+    def free(self) -> Tensor:
+        """Return the amplitudes where it was posed."""
+        return self.theta
+
+    def whole(self, free: Tensor) -> Tensor:
+        """Return the amplitudes."""
+        return free
+
+    def residual(self, free: Tensor) -> Tensor:
+        """Return r, of shape (M,)."""
+        parts = [self.factor.T @ free - self.target]
+        parts += [(wish.scale * linear.residual).T.flatten() for wish, linear in self._asked(free)]
+        return torch.cat(parts)
+
+    def linearise(self, free: Tensor) -> tuple[DenseJacobian, Tensor]:
+        """Return J, of shape (M, p), and r."""
+        rows = [self.sines.rows(wish.points, linear, wish.scale) for wish, linear in self._asked(free)]
+        return DenseJacobian(torch.cat([self.factor.T, *rows])), self.residual(free)
+
+    def _asked(self, free: Tensor) -> Iterator[tuple[Wish, Linearised]]:
+        for wish, known in zip(self.wishes, self.known, strict=True):
+            yield wish, wish.residual(*self.sines.jet(free, wish.points, known))
+
+
+def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], amplitudes: Tensor, steps: int) -> Tensor:
+    """Return amplitudes, of shape (p,), that heed the wishes beside the linear part.
+
+    Parameters
+    ----------
+    sines : Sines
+    factor, right : L and b of the linear part's normal equations L L^T a = b
+    wishes : what is asked of the surface
+    amplitudes : to begin with, of shape (p,)
+    steps : of Gauss-Newton, at most
+    """
+    target = torch.linalg.solve_triangular(factor, right[:, None], upper=False)[:, 0]
+
+    def posed(number: int, theta: Tensor) -> BendProblem:
+        del number
+        return BendProblem.at(sines, factor, target, wishes, theta)
+
+    # A step knows nothing of how the surface moves away from its points; what counts is how it is where it has gone.
+    method = GaussNewton(GainRatioDamping(initial_damping=1e-9, metric=identity))
+    stop = StopRule(steps, TOLERANCE, patience=steps + 1, held_out_patience=IN_VAIN)
+    return method.run(posed, amplitudes, stop, held_out=lambda theta: loss_of(posed(0, theta), theta)).theta

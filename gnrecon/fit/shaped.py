@@ -1,0 +1,157 @@
+"""A global field and the cubes of its detail, bent to what the regularisers ask for (`regulariser`, `bend`).
+
+Where a hole is to be filled by a film of its own, the coarse distances there say something else: their sign is that of
+the winding number, another film's, and their size the distance to the hole's rim. So samples of the volume that are
+nearer to the film than to any scanned point are told the distance to the film instead, as it is then: that keeps the
+field's sign and slope beside it, and hardly holds it, because these rows weigh little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.cloud import Float
+from gnrecon.errors import FitError
+from gnrecon.field.features import Features
+from gnrecon.fit.bend import Jet, Sines, Wish, bent
+from gnrecon.fit.choose import Mask
+from gnrecon.fit.loss import data_terms, distance_term
+from gnrecon.fit.options import FitOptions
+from gnrecon.fit.patch import Belief, PatchSystem
+from gnrecon.fit.problem import FieldProblem
+from gnrecon.fit.regulariser import Regulariser
+from gnrecon.fit.scene import Scene
+from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.sheet import Sheet
+from gnrecon.fit.start import FINAL_POINTS, RIDGE
+from gnrecon.fit.terms import Term
+from gnrecon.linalg.cholesky import damped_factor
+from gnrecon.sampling import Density
+
+GLOBAL_STEPS, CUBE_STEPS = 8, 3
+"""Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""
+
+FOLLOW = 0.05, 0.5
+"""How far points may go in one step to follow the global field's surface, in radii, and a cube's, in its lengths."""
+
+PER_LENGTH = 2.0
+"""Points of the surface along one length of the features."""
+
+ATTEMPTS = 8
+
+
+@dataclass(frozen=True)
+class Shaping:
+    """What is asked of a field's surface, and where.
+
+    Parameters
+    ----------
+    wanted : the regularisers
+    sheet : points of the surface, at which they are asked for
+    sdf : the global field
+    density : of the scanned points
+    """
+
+    wanted: Sequence[Regulariser]
+    sheet: Sheet
+    sdf: NeuralSDF
+    density: Density
+
+    @classmethod
+    def of(
+        cls, wanted: Sequence[Regulariser], sdf: NeuralSDF, density: Density, length: float, rng: np.random.Generator
+    ) -> Shaping:
+        """Draw points of the surface for features of a length, in radii."""
+        return cls(wanted, Sheet.of(sdf, density, length / PER_LENGTH, rng), sdf, density)
+
+    def told(self, x: Float, signed: Float) -> Float:
+        """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
+        if not any(one.holes for one in self.wanted):
+            return signed
+        return self.sheet.told(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
+
+    def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
+        """Return what is asked of the surface at some of its points.
+
+        Parameters
+        ----------
+        rows : mask of the sheet's points
+        scale : of each point's residuals, for a weight of one
+        like : tensor whose device is used
+        """
+        found = []
+        for one in self.wanted:
+            share = self.sheet.far * rows if one.holes else 1.0 * rows
+            asked = np.flatnonzero(share)
+            if len(asked):
+                points, weights = (torch.as_tensor(part[asked]).to(like) for part in (self.sheet.points, share))
+                scales = scale * (one.weight * weights[:, None]).sqrt()
+                found.append(Wish(one.residual, points, scales, one.crease))
+        return found
+
+    def bend_cube(
+        self, features: Features, length: float, center: Float, reach: float, belief: Belief, system: PatchSystem
+    ) -> Tensor:
+        """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
+        amplitudes = system.solve(belief.position, belief.angle)
+        equations = system.equations(belief.position, belief.angle)
+        rows = np.asarray((np.abs(self.sheet.points - center) < reach).all(axis=1))
+        scale = (len(self.density.points) / len(self.sheet)) ** 0.5 / belief.position
+        wishes = self.wishes(rows, scale, amplitudes)
+        if equations is None or not wishes:
+            return amplitudes
+        whole, known = as_sines(self.sdf)
+
+        def base(x: Tensor) -> Jet:
+            return whole.jet(known, x, whole.known(x))
+
+        sines = Sines(features, torch.as_tensor(center).to(amplitudes), length, FOLLOW[1] * length, base)
+        return bent(sines, *equations, wishes, amplitudes, CUBE_STEPS)
+
+
+def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.random.Generator) -> NeuralSDF:
+    """Return the global field with output weights that heed the regularisers.
+
+    Raises
+    ------
+    FitError
+        When the data's system cannot be factored.
+    """
+    sdf, sheet = shaping.sdf, shaping.sheet
+    x, distance = scene.volume(scene.volume_count, rng)
+    volume = scene.tensor(x), scene.tensor(shaping.told(x, distance))
+    terms = [*data_terms(scene, options, rng, FINAL_POINTS), distance_term(scene, *volume)]
+    wishes = shaping.wishes(np.ones(len(sheet), dtype=bool), max(len(sheet), 1) ** -0.5, scene.points)
+    sines, amplitudes = as_sines(sdf)
+    problem, factor, right = _linear_part(sdf, terms, amplitudes)
+    return replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, GLOBAL_STEPS)))
+
+
+def _linear_part(sdf: NeuralSDF, terms: Sequence[Term], amplitudes: Tensor) -> tuple[FieldProblem, Tensor, Tensor]:
+    """Return the last layer's problem, and L and b of its normal equations L L^T a = b."""
+    none = torch.zeros(0, dtype=torch.long, device=amplitudes.device)
+    problem = FieldProblem(sdf.field, terms, sdf.theta, (none, None))
+    jacobian, residual = problem.linearise(problem.free())
+    product, ridge = jacobian.gram(), RIDGE / max(len(term) for term in terms)
+    right = jacobian.tmv(jacobian.mv(amplitudes) - residual)
+    for _ in range(ATTEMPTS):
+        factor = damped_factor(product, torch.full_like(right, ridge))
+        if factor is not None:
+            # The ridge holds the amplitudes where they are, as damping does.
+            return problem, factor, right + ridge * amplitudes
+        ridge *= 10
+    raise FitError("The surface could not be shaped: the data's system holds values that are not finite.")
+
+
+def as_sines(sdf: NeuralSDF) -> tuple[Sines, Tensor]:
+    """Return a network of one layer as sine features, of which one more is its bias, and their amplitudes."""
+    (weights, bias), (out, constant) = sdf.field.layout.layers(sdf.theta)
+    frequencies = torch.cat([weights, weights.new_zeros(1, 3)])
+    phases = torch.cat([bias, bias.new_full((1,), torch.pi / 2)])
+    sines = Sines(Features(frequencies, phases), weights.new_zeros(3), 1.0, FOLLOW[0])
+    return sines, torch.cat([out[0], constant])

@@ -1,0 +1,68 @@
+"""The paper's figures from finished experiments: loss and Chamfer over time, and surfaces coloured by curvature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.export import render
+from gnrecon.io import read_mesh
+from gnrecon.mesh import Mesh
+from reproduction.experiments import Experiment
+
+NAMES = {"gn": "Gauss-Newton", "lbfgs": "L-BFGS", "adam": "Adam"}
+CURVATURES = {"cone": "gauss_curvature"}
+"""Of which curvature a surface is coloured; of the others it is the mean one."""
+
+SHOWN = 98.0
+"""Percentile of the absolute curvature at which the colours end."""
+
+LOW, MIDDLE, HIGH = (33, 102, 172), (247, 247, 247), (178, 24, 43)
+
+
+def draw_convergence(done: Sequence[Experiment], path: Path) -> None:
+    """Write a PNG file of loss and Chamfer divergence over time, a column for each problem."""
+    from matplotlib.figure import Figure
+
+    problems = list(dict.fromkeys(one.problem for one in done))
+    figure = Figure(figsize=(4.2 * len(problems), 7), layout="constrained")
+    axes = figure.subplots(2, len(problems), squeeze=False)
+    for column, problem in enumerate(problems):
+        for one in (one for one in done if one.problem == problem):
+            figures = one.figures()
+            for row, quantity in enumerate(("loss", "chamfer")):
+                _curve(axes[row, column], figures, quantity, NAMES[one.optimiser])
+        axes[0, column].set_title(problem)
+        axes[1, column].set_xlabel("seconds")
+    for row, label in enumerate(("loss", "Chamfer divergence")):
+        axes[row, 0].set_ylabel(label)
+    axes[0, 0].legend()
+    figure.savefig(path, dpi=110)
+
+
+def _curve(axes: Any, figures: dict[str, Any], quantity: str, label: str) -> None:
+    # What was not finite, as where the surface was lost, is null in the report, and a gap here.
+    values = [np.nan if value is None else value for value in figures[f"{quantity}_history"]]
+    axes.plot(figures["seconds_history"], values, label=label, marker=".")
+    axes.set_yscale("log")
+    axes.grid(alpha=0.3)
+
+
+def draw_surface(one: Experiment, path: Path) -> None:
+    """Write a PNG file of a learned surface, coloured by its curvature: blue below zero, red above."""
+    mesh = read_mesh(one.mesh)
+    values = np.asarray(mesh.attributes[CURVATURES.get(one.problem, "mean_curvature")], dtype=np.float64)
+    render(coloured(mesh, values), path, size=(700, 560))
+
+
+def coloured(mesh: Mesh, values: npt.NDArray[np.float64]) -> Mesh:
+    """Return a mesh with colours of values of shape (V,), white at zero."""
+    most = max(float(np.nanpercentile(np.abs(values), SHOWN)), np.finfo(np.float64).tiny)
+    share = np.clip(np.nan_to_num(values) / most, -1, 1)[:, None]
+    ends = np.where(share < 0, LOW, HIGH)
+    colors = np.rint(np.array(MIDDLE) * (1 - np.abs(share)) + ends * np.abs(share))
+    return mesh.with_attributes({"colors": colors.astype(np.uint8)})

@@ -1,0 +1,110 @@
+"""Features bent to residuals of curvature: exact rows, and surfaces that become what was asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gnrecon.errors import UsageError
+from gnrecon.field.features import Features
+from gnrecon.fit.bend import BendProblem, Sines, Wish, bent
+from gnrecon.fit.regulariser import CREASE, FILL, regularisers
+from gnrecon.residuals import SecondOrder, gauss_curvature, interface, mean_curvature, surface_strain
+
+RESIDUALS = [mean_curvature, gauss_curvature, surface_strain]
+
+
+def sphere(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The jet of (|x|^2 - 1) / 2."""
+    return (x.square().sum(1) - 1) / 2, x, torch.eye(3).to(x).expand(len(x), 3, 3)
+
+
+def sines(rng: np.random.Generator, count: int = 80) -> Sines:
+    like = torch.zeros(0, dtype=torch.float64)
+    return Sines(Features.draw(count, rng, like), torch.tensor([0.1, 0.0, 0.9]).double(), 0.5, 0.2, sphere)
+
+
+def cap(rng: np.random.Generator, count: int = 150) -> Tensor:
+    """Points near the top of the unit sphere."""
+    flat = rng.uniform(-0.4, 0.4, (count, 2))
+    return torch.as_tensor(np.column_stack([flat, np.sqrt(1 - (flat**2).sum(1)) + rng.uniform(-0.05, 0.05, count)]))
+
+
+@pytest.mark.parametrize("residual", RESIDUALS, ids=lambda one: one.name)
+def test_rows_are_the_derivatives(residual: SecondOrder, rng: np.random.Generator) -> None:
+    """By the loss, because strain's entries depend on a frame that may spin, and only their squares' sum does not."""
+    field, points = sines(rng, 9), cap(rng, 7)
+    amplitudes, change = torch.as_tensor(rng.normal(size=(2, 9)) * 0.05)
+    scale = torch.as_tensor(rng.uniform(0.5, 2, (7, 1)))
+
+    def at(a: Tensor) -> Tensor:
+        return (scale * residual(*field.jet(a, points, sphere(points))).residual).T.flatten()
+
+    rows = field.rows(points, residual(*field.jet(amplitudes, points, sphere(points))), scale)
+    ahead, behind = at(amplitudes + 1e-6 * change), at(amplitudes - 1e-6 * change)
+    difference = (ahead.square().sum() - behind.square().sum()) / 4e-6
+    torch.testing.assert_close(at(amplitudes) @ (rows @ change), difference, rtol=1e-6, atol=1e-8)
+
+
+def test_points_arrive_on_the_surface(rng: np.random.Generator) -> None:
+    field, points = sines(rng), cap(rng)
+    amplitudes = 0.01 * torch.as_tensor(rng.normal(size=80))
+    there = field.on_surface(amplitudes, points)
+    assert field.jet(amplitudes, points, sphere(points))[0].abs().max() > 0.03
+    assert field.jet(amplitudes, there, sphere(there))[0].abs().max() < 1e-6
+    assert (there - points).norm(dim=1).max() < 0.2
+
+
+def curvature_left(residual: SecondOrder, weight: float, rng: np.random.Generator) -> tuple[float, float]:
+    """The residual's root mean square on a sphere's top, before and after features are bent to it.
+
+    Data holds the surface around the top, where it is a sphere.
+    """
+    field, points = sines(rng), cap(rng)
+    none = torch.zeros(80, dtype=torch.float64)
+    rim = points[points[:, :2].norm(dim=1) > 0.35]
+    rim = torch.nn.functional.normalize(rim, dim=1)
+    rows = field.rows(rim, interface(*sphere(rim)[:2], None), torch.full((len(rim), 1), len(rim) ** -0.5).double())
+    factor = torch.linalg.cholesky(rows.T @ rows + 1e-4 * torch.eye(80).double())
+    wish = Wish(residual, points, torch.full((150, 1), (weight / 150) ** 0.5, dtype=torch.float64))
+    found = bent(field, factor, none, [wish], none, 8)
+
+    def left(a: Tensor) -> float:
+        there = field.on_surface(a, points)
+        return float(residual(*field.jet(a, there, sphere(there))).residual.square().sum(1).mean().sqrt())
+
+    return left(none), left(found)
+
+
+@pytest.mark.parametrize("residual", RESIDUALS, ids=lambda one: one.name)
+def test_a_cap_becomes_what_is_asked_for(residual: SecondOrder, rng: np.random.Generator) -> None:
+    before, after = curvature_left(residual, 0.01, rng)
+    assert before == pytest.approx({"mean curvature": 2, "Gauss curvature": 1}.get(residual.name, 2**0.5), rel=0.05)
+    assert after < 0.6 * before
+
+
+def test_a_weight_of_nearly_nothing_changes_nearly_nothing(rng: np.random.Generator) -> None:
+    before, after = curvature_left(mean_curvature, 1e-12, rng)
+    assert after == pytest.approx(before, rel=1e-3)
+
+
+def test_creases_hardly_count(rng: np.random.Generator) -> None:
+    """The tangent of r^2 / (1 + r^2) at r = 10 is a multiple of r^2 that weighs 1 / 101^2."""
+    field, points = sines(rng), cap(rng, 5)
+    none = torch.zeros(80, dtype=torch.float64)
+    wish = Wish(mean_curvature, points, torch.ones(5, 1).double(), robust=0.2)
+    problem = BendProblem.at(field, torch.eye(80).double(), none, [wish], none)
+    # On the unit sphere k1 + k2 is 2, which is ten times 0.2.
+    torch.testing.assert_close(problem.residual(none)[80:], torch.full((5,), 2 / 101).double(), rtol=1e-4, atol=0)
+
+
+def test_what_is_asked_for_is_read() -> None:
+    smooth, fill, prior = regularisers("strain=2e-5", "minimal", "developable=0.5")
+    assert (smooth.residual, smooth.weight, smooth.holes, smooth.crease) == (surface_strain, 2e-5, False, None)
+    assert (fill.residual, fill.weight, fill.holes) == (mean_curvature, FILL, True)
+    assert (prior.residual, prior.weight, prior.holes, prior.crease) == (gauss_curvature, 0.5, False, CREASE)
+    assert regularisers(None, None, None) == ()
+    with pytest.raises(UsageError, match="strain=WEIGHT"):
+        regularisers("bending=1", None, None)

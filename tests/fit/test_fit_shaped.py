@@ -1,0 +1,115 @@
+"""Fits of holed scans of which more is asked than to lie near the points: each does what it says, and costs little."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from holed_can import RADIUS, can, distance
+
+from gnrecon.cloud import Frame, PointCloud, Samples
+from gnrecon.export import curvatures
+from gnrecon.fit import FitOptions, NeuralSDF, adaptive, fit
+from gnrecon.fit.sheet import Sheet, _joined
+from gnrecon.ingest import prepare
+from gnrecon.sampling import Density
+
+Float = npt.NDArray[np.float64]
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small shapes need few features."""
+    monkeypatch.setattr(adaptive, "COARSE_UNITS", 400)
+
+
+def fitted(cloud: PointCloud, **asked: str) -> NeuralSDF:
+    return fit(prepare(cloud)[0], FitOptions(quality="draft", **asked))[0]
+
+
+def surface(sdf: NeuralSDF, cloud: PointCloud) -> Float:
+    """Points of the surface, in file units."""
+    sheet = Sheet.of(sdf, Density(sdf.frame.to_unit(cloud.points)), 0.05, np.random.default_rng(3))
+    return sdf.frame.to_world(sheet.points)
+
+
+def bends(sdf: NeuralSDF, x: Float) -> tuple[Float, Float]:
+    """|k1 + k2| and |k1 k2|, of shape (N,) each."""
+    mean, gauss = curvatures(sdf.gradient(x), sdf.hessian(x))
+    return np.abs(2 * mean), np.abs(gauss)
+
+
+def ball(count: int, ripple: float = 0.0) -> PointCloud:
+    """A unit ball, with ripples of wavelength 0.6 or without."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    ring = np.sqrt(1 - z**2)
+    points = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    return PointCloud(points * (1 + ripple * np.sin(10 * points).prod(axis=1))[:, None], points)
+
+
+def test_a_minimal_film_has_little_mean_curvature() -> None:
+    whole = ball(800)
+    kept = np.linalg.norm(whole.points - [0, 0, 1], axis=1) > 0.6
+    cloud = PointCloud(whole.points[kept], whole.normals[kept])  # type: ignore[index]
+    plain, film = fitted(cloud), fitted(cloud, fill="minimal")
+    left = []
+    for sdf in (plain, film):
+        x = surface(sdf, cloud)
+        middle = x[(np.linalg.norm(x[:, :2], axis=1) < 0.25) & (x[:, 2] > 0.5)]
+        assert len(middle) > 20
+        left.append(float(np.median(bends(sdf, middle)[0])))
+    assert left[0] > 0.8
+    assert left[1] < 0.4 * left[0]
+    assert np.abs(film.sdf(cloud.points)).mean() < 3e-3
+
+
+def test_a_developable_can_is_whole_again() -> None:
+    cloud = can(0.12, 0.45)
+    off = []
+    for sdf in (fitted(cloud), fitted(cloud, prior="developable")):
+        x = surface(sdf, cloud)
+        hole = x[np.linalg.norm(x - [RADIUS, 0, 0], axis=1) < 0.3]
+        assert len(hole) > 20
+        off.append(float(np.sqrt(np.mean(distance(hole) ** 2))))
+    assert off[0] > 0.01
+    assert off[1] < 0.4 * off[0]
+
+
+def test_strain_smooths_and_more_of_it_more() -> None:
+    cloud = ball(900, ripple=0.02)
+    strains, distances = [], []
+    for sdf in (fitted(cloud), fitted(cloud, smooth="strain=1e-5"), fitted(cloud, smooth="strain=1e-3")):
+        mean, gauss = bends(sdf, surface(sdf, cloud))
+        strains.append(float(np.mean(mean**2) - 2 * np.mean(gauss)))
+        distances.append(float(np.abs(sdf.sdf(cloud.points)).mean()))
+    assert strains[2] < strains[1] < 0.95 * strains[0]
+    assert distances[0] < distances[1] < distances[2] < 0.01
+
+
+def test_the_same_again_is_the_same() -> None:
+    cloud = can(0.2, 0.45)
+    one, other = (fitted(cloud, fill="minimal", prior="developable", smooth="strain=1e-5") for _ in range(2))
+    assert one.theta.equal(other.theta)
+    assert one.detail is not None
+    assert other.detail is not None
+    assert one.detail.amplitudes.equal(other.detail.amplitudes)
+
+
+def test_sheets_without_data_are_no_part_of_the_shape() -> None:
+    near = np.column_stack([np.arange(9.0), np.zeros((9, 2))])
+    aside, further = near + np.array([0.0, 5, 0]), np.array([[9.5, 0, 0], [10.5, 0, 0]])
+    points = np.concatenate([near, aside, further])
+    scanned = np.arange(len(points)) < 3
+    assert np.flatnonzero(_joined(points, scanned, 1.6)).tolist() == [*range(9), 18, 19]
+
+
+def test_a_sheet_knows_what_is_far() -> None:
+    samples = Samples(ball(600).points, ball(600).points, Frame(np.zeros(3), 1.0))
+    top = samples.points[:, 2] < 0.6
+    density = Density(samples.points[top])
+    sheet = Sheet(samples.points, (samples.points[:, 2] > 0.95).astype(float))
+    x = np.array([[0, 0, 1.2], [0, 0, 0.7], [0, 0, -1.3]])
+    told = sheet.told(x, np.full(3, 9.0), np.array([0.1, -0.1, 0.1]), density)
+    assert told == pytest.approx([0.2, -0.3, 9.0], abs=0.02)
+    assert Sheet(samples.points, np.zeros(600)).told(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(9.0)

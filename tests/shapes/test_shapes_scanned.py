@@ -1,0 +1,49 @@
+"""A scan as a problem of shape learning: it is learned, and measured against its own points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gnrecon.cloud import Frame, Samples
+from gnrecon.shapes import ScannedSurface, learn, scanned
+from gnrecon.shapes.term import LAST
+
+
+def ball(count: int = 300) -> Samples:
+    """Points of an ellipsoid's surface, with its normals."""
+    x = np.random.default_rng(2).standard_normal((count, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    axes = np.array([0.9, 0.7, 0.6])
+    normals = x / axes
+    return Samples(x * axes, normals / np.linalg.norm(normals, axis=1, keepdims=True), Frame(np.zeros(3), 1.0))
+
+
+def test_a_scan_is_learned() -> None:
+    learned = learn(scanned(ball()), budget=None, steps=4)
+    start, best = learned.history[0], learned.best
+    assert set(best.shares) == {"interface", "normal"}
+    assert best.loss < 0.05 * start.loss
+    assert best.chamfer is not None
+    assert best.chamfer < 0.02
+    middle = learned.field.sdf(np.array([[0.0, 0, 0], [1.0, 0, 0]]))
+    assert middle[0] < 0 < middle[1]
+
+
+def test_the_eikonal_weight_falls_and_is_not_reported() -> None:
+    eikonal = next(term for term in scanned(ball(30)).terms if term.name == "eikonal")
+    weights = [eikonal.weight_at(step) for step in (1, 2, 5, 50)]
+    assert weights == sorted(weights, reverse=True)
+    assert weights[-1] == pytest.approx(1e-4)
+    assert eikonal.weight_at(LAST) == 0
+
+
+def test_points_as_a_surface() -> None:
+    surface = ScannedSurface(torch.arange(30).double().reshape(10, 3))
+    points, shares = surface.sample(4)
+    assert points.tolist() == surface.points[::3].tolist()
+    assert shares.sum() == pytest.approx(1)
+    feet, inside = surface.nearest(surface.points[[7, 2]] + 0.1)
+    assert feet.tolist() == surface.points[[7, 2]].tolist()
+    assert inside.all()
