@@ -60,9 +60,9 @@ def main() -> int:
 
 def draw_holed(path: Path, asked: Sequence[dict[str, Any]]) -> None:
     """Draw a can with a hole as it comes out when other things are asked of its surface, and print their figures."""
-    cloud, panel, shown = can(0.1, 0.45), (SIZE[0] // 4, SIZE[1]), []
+    cloud, panel, shown = can(0.12, 0.45), (SIZE[0] // 4, SIZE[1]), []
     for options in asked:
-        mesh = gnrecon.reconstruct(cloud, quality="draft", resolution=96, curvature=True, **options).mesh
+        mesh = gnrecon.reconstruct(cloud, quality="draft", resolution=72, curvature=True, **options).mesh
         shown.append(gnrecon.render(mesh, size=panel, views=[(65.0, 12.0)], up="z"))
         print(options, described(mesh))
     Image.fromarray(np.concatenate(shown, axis=1)).save(path)

@@ -42,6 +42,9 @@ FOLLOW = 0.05, 0.5
 PER_LENGTH = 2.0
 """Points of the surface along one length of the features."""
 
+ROUNDS = 2
+"""Times that the global field is bent, each with more samples where the last one has the wrong sign."""
+
 ATTEMPTS = 8
 
 
@@ -122,14 +125,27 @@ def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.ran
     FitError
         When the data's system cannot be factored.
     """
-    sdf, sheet = shaping.sdf, shaping.sheet
-    x, distance = scene.volume(scene.volume_count, rng)
-    volume = scene.tensor(x), scene.tensor(shaping.told(x, distance))
-    terms = [*data_terms(scene, options, rng, FINAL_POINTS), distance_term(scene, *volume)]
-    wishes = shaping.wishes(np.ones(len(sheet), dtype=bool), max(len(sheet), 1) ** -0.5, scene.points)
-    sines, amplitudes = as_sines(sdf)
-    problem, factor, right = _linear_part(sdf, terms, amplitudes)
-    return replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, GLOBAL_STEPS)))
+    sdf, like = shaping.sdf, scene.points
+    wishes = shaping.wishes(np.ones(len(shaping.sheet), dtype=bool), max(len(shaping.sheet), 1) ** -0.5, like)
+    x, wanted = _volume(shaping, scene, scene.volume_count, rng)
+    for left in reversed(range(ROUNDS)):
+        volume = scene.tensor(x), scene.tensor(wanted)
+        terms = [*data_terms(scene, options, rng, FINAL_POINTS), distance_term(scene, *volume)]
+        sines, amplitudes = as_sines(sdf)
+        problem, factor, right = _linear_part(sdf, terms, amplitudes)
+        sdf = replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, GLOBAL_STEPS)))
+        if left:
+            # Where the sign has become wrong, more samples bring it back, as at the fit's start.
+            trial, expected = _volume(shaping, scene, 3 * scene.volume_count, rng)
+            wrong = np.flatnonzero(sdf.sdf(sdf.frame.to_world(trial)) * expected <= 0)[: scene.volume_count // 2]
+            x, wanted = np.concatenate([x, trial[wrong]]), np.concatenate([wanted, expected[wrong]])
+    return sdf
+
+
+def _volume(shaping: Shaping, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Return points of the volume, of shape (Q, 3), and what their signed distances should be, of shape (Q,)."""
+    x, distance = scene.volume(count, rng)
+    return x, shaping.told(x, distance)
 
 
 def _linear_part(sdf: NeuralSDF, terms: Sequence[Term], amplitudes: Tensor) -> tuple[FieldProblem, Tensor, Tensor]:
