@@ -70,8 +70,8 @@ def fit_adaptive(
     by_blocks = folder is not None or len(samples) >= LARGE
     if by_blocks and options.regularisers:
         raise UsageError(
-            f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; thin the scan with "
-            f"--max-points."
+            f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; "
+            "thin the scan with --max-points."
         )
     # Left-out points must lie near each other, so that those around a place tell of it alone.
     out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
