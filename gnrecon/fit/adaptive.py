@@ -10,7 +10,6 @@ What is asked of the surface besides (`regulariser`) bends both, the global fiel
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,23 +18,20 @@ import numpy as np
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.errors import UsageError
-from gnrecon.field.siren import Siren
-from gnrecon.fit.choose import Mask
+from gnrecon.fit.choose import Int, Mask
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.detail import ShapingFor, fit_detail
+from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.large import LARGE, fit_large
 from gnrecon.fit.options import FitOptions
-from gnrecon.fit.scene import Scene
+from gnrecon.fit.outlying import outlying
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping, bend_global
-from gnrecon.fit.smoothness import global_length, smooth_spectrum
-from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Solution
 from gnrecon.sampling import Density
 
-_log = logging.getLogger(__name__)
-
-COARSE_POINTS, COARSE_UNITS = 5000, 1000
+COARSE_POINTS = 5000
+"""Most points that the global field sees."""
 
 HELD_SHARE, HELD_MOST = 6, 2000
 """One point in so many is left out of the global field; up to so many where the detail is not solved by blocks."""
@@ -55,7 +51,8 @@ def fit_adaptive(
 
     The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given.
 
-    Normals that were estimated are turned around where a first field contradicts them.
+    Normals that were estimated are turned around where a first field contradicts them, and points that lie off the
+    surface of their neighbours are left out.
 
     An interrupt (Ctrl-C) while the detail is solved leaves the global field.
 
@@ -77,27 +74,21 @@ def fit_adaptive(
     out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
     held: Mask = np.zeros(len(samples), dtype=bool)
     held[order[:out]] = True
-    rows = np.sort(order[out:][:COARSE_POINTS])
-    turned = 0.0
+    rows: Int = np.sort(order[out:][:COARSE_POINTS])
+    turned, left_out = 0.0, 0
     if samples.estimated:
         samples, turned = reconciled(samples, rows, options)
-    seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
-    scene = Scene.of(seen, options.device, rng)
-    field = Siren((COARSE_UNITS,))
-    spectrum = smooth_spectrum(global_length(samples, held, scene, rng.spawn(1)[0]), scene)
-    _log.info(
-        "The global field has %d features of length %.3g radii, and sees %d points; %d are left out.",
-        COARSE_UNITS,
-        spectrum.length,
-        len(rows),
-        out,
-    )
-    linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
-    fitted = fit_wide(field, scene, linear, rng, None, part(advance, 0.0, SHARE), spectrum)
-    sdf = NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict())
+    first = fit_global(samples, held, rows, options, rng, part(advance, 0.0, SHARE / 2))
+    if not by_blocks:  # of so many points, distances alone tell the outliers
+        off = outlying(first.sdf.sdf(samples.frame.to_world(samples.points)), Density(samples.points))
+        left_out = int(off.sum())
+        if left_out:
+            samples, held, rows = _without(off, samples, held, rows)
+            first = fit_global(samples, held, rows, options, rng, part(advance, SHARE / 2, SHARE))
+    sdf = first.sdf
     shape = None
     if options.regularisers:
-        sdf, shape = _shaped(sdf, samples, scene, spectrum.length, options, rng)
+        sdf, shape = _shaped(first, samples, options, rng)
     rest = part(advance, SHARE, 1.0)
     try:
         if by_blocks:
@@ -106,15 +97,16 @@ def fit_adaptive(
             detail = fit_detail(sdf, samples, held, options.features, rng, options.device, rest, shape)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
-        return sdf, replace(fitted, status=status, interrupted=True)
+        return sdf, replace(first.solution, status=status, interrupted=True)
     chosen = detail.as_dict(samples.frame.scale)
     told = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
+    told += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
     status = (
         f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
         f"length {chosen['length']:.3g}, noise {chosen['position_noise']:.2g} in position and "
         f"{chosen['angle_noise']:.2g} degrees in normals.{told}{_asked(options)}"
     )
-    return replace(sdf, detail=detail), replace(fitted, status=status, method="Exact linear least squares.")
+    return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
 
 
 def _asked(options: FitOptions) -> str:
@@ -123,10 +115,19 @@ def _asked(options: FitOptions) -> str:
     return f" Asked of the surface besides, with its weight: {asked}." if asked else ""
 
 
+def _without(off: Mask, samples: Samples, held: Mask, rows: Int) -> tuple[Samples, Mask, Int]:
+    """Return what is left without some samples: the others, which of them are held out, and the rows of those seen."""
+    kept = ~off
+    seen = np.zeros(len(samples), dtype=bool)
+    seen[rows] = True
+    rest = replace(samples, points=samples.points[kept], normals=samples.normals[kept])
+    return rest, held[kept], np.flatnonzero(seen[kept])
+
+
 def _shaped(
-    sdf: NeuralSDF, samples: Samples, scene: Scene, length: float, options: FitOptions, rng: np.random.Generator
+    first: GlobalField, samples: Samples, options: FitOptions, rng: np.random.Generator
 ) -> tuple[NeuralSDF, ShapingFor]:
     """Return the global field bent to the regularisers, and how the detail is to heed them."""
     density, wanted = Density(samples.points), options.regularisers
-    bent = bend_global(Shaping.of(wanted, sdf, density, length, rng), scene, options, rng)
+    bent = bend_global(Shaping.of(wanted, first.sdf, density, first.length, rng), first.scene, options, rng)
     return bent, lambda shorter: Shaping.of(wanted, bent, density, shorter, rng)

@@ -3,7 +3,8 @@
 In the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
 
     interface   f = 0                  at the points        1
-    normal      grad f = n             at the points        max(0.4 h, 0.012)^2, an angle as a height over that length
+    normal      grad f = n             at the points        max(r h, 0.012)^2, an angle as a height over that length;
+                                                            r is the scene's reach, 0.4 where nothing chose it
     distance    f = coarse distance    in the box           max(1e-4 M / N, 4e-4), M samples and N points
     eikonal     |grad f| = 1           near the surface     (0.05 h)^2
                                        and in the box
@@ -18,12 +19,12 @@ import torch
 from torch import Tensor
 
 from gnrecon.fit.options import FitOptions, normal_residual
-from gnrecon.fit.scene import Scene
+from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.terms import Term
 from gnrecon.residuals.first_order import eikonal, interface, signed_distance
 from gnrecon.sampling import near_surface
 
-NORMAL_REACH, LEAST_REACH = 0.4, 0.012
+LEAST_REACH = 0.012
 EIKONAL_REACH = 0.05
 DISTANCE_ROW, DISTANCE_WEIGHT = 1e-4, 4e-4
 EIKONAL_COUNT = 3000
@@ -73,16 +74,16 @@ def data_terms(
     if len(points) > most:
         rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
         points, normals = points[rows], normals[rows]
-    beside = normal_weight(scene.coarse.spacing)
+    beside = normal_weight(scene.coarse.spacing, scene.reach)
     return [
         Term("interface", interface, points, None, weight),
         Term("normal", normal_residual(options.normals), points, normals, weight * beside),
     ]
 
 
-def normal_weight(spacing: float) -> float:
+def normal_weight(spacing: float, reach: float = REACH) -> float:
     """Return the weight of normals beside that of the interface, for data of a spacing in radii."""
-    return max(NORMAL_REACH * spacing, LEAST_REACH) ** 2
+    return max(reach * spacing, LEAST_REACH) ** 2
 
 
 def distance_term(scene: Scene, x: Tensor, distance: Tensor) -> Term:

@@ -19,9 +19,16 @@ SHELL = 4.0
 """Standard deviation of the samples near the data, in spacings."""
 
 
+REACH = 0.4
+"""Length over which an angle of a normal counts as a height, in spacings."""
+
+
 @dataclass(frozen=True)
 class Scene:
-    """Data points and normals, of shape (N, 3), on the device; the rest in numpy, for sampling."""
+    """Data points and normals, of shape (N, 3), on the device; the rest in numpy, for sampling.
+
+    `reach` says what the normals are worth beside the points: see `REACH`.
+    """
 
     points: Tensor
     normals: Tensor
@@ -29,6 +36,7 @@ class Scene:
     coarse: CoarseDistance
     box: Box
     volume_count: int = VOLUME_COUNT
+    reach: float = REACH
 
     @classmethod
     def of(cls, samples: Samples, device: str, rng: np.random.Generator) -> Scene:

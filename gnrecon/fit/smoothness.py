@@ -1,12 +1,15 @@
-"""How smooth a scan's shape is as a whole: the length of the global field's features, chosen by left-out points.
+"""How smooth a scan's shape is as a whole, and what its normals are worth, chosen by left-out points.
 
 A blob, a pipe or a plate has few degrees of freedom, and a field of long features averages the noise of many points and
-closes wide holes well; a gear or a foam needs short ones. Small fields of each length are fitted to some of the points,
-as a cube's correction is (`patch`), and the longest one counts that predicts the points that are left out as well as
-the best.
+closes wide holes well; a gear or a foam needs short ones. Exact normals tell more of a smooth shape than noisy points
+do; of coarse or scattered ones it is the other way round. Small fields of each length and weight of the normals are
+fitted to some of the points, as a cube's correction is (`patch`), and the longest one counts that predicts the points
+that are left out as well as the best, with the weight at which it does.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,11 +18,14 @@ from gnrecon.cloud import Samples
 from gnrecon.field.features import DEGREES_OF_FREEDOM, Features
 from gnrecon.fit.choose import Mask
 from gnrecon.fit.patch import Patch, PatchSystem
-from gnrecon.fit.scene import Scene
+from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.start import Spectrum
 
 LENGTHS = (0.25, 0.5, 1.0)
 """Lengths to choose from, in radii."""
+
+REACHES = (REACH, 1.2, 3.0, 8.0, 20.0)
+"""Weights of the normals to choose from: the lengths, in spacings, over which an angle counts as a height."""
 
 SPACINGS = 4.0
 """Least length of a global field's features, in spacings of the points that it sees: shorter ones oscillate."""
@@ -28,11 +34,19 @@ ALIKE = 0.01
 """Share by which a longer one may predict worse than the best."""
 
 FEATURES, POINTS, VOLUME = 600, 2000, 2000
-POSITION, ANGLE = 0.1, 0.1
-"""Noise that is assumed: of positions, in spacings, and of normals, in radians."""
+POSITION = 0.1
+"""Noise of positions that is assumed, in spacings; that of normals, in radians, is this over the reach."""
 
 SIZE = 1.0
 """Standard deviation of the field, in radii."""
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """Length of the global field's features, in radii, and reach of its normals, in spacings."""
+
+    length: float
+    reach: float
 
 
 def smooth_spectrum(length: float, scene: Scene) -> Spectrum:
@@ -43,8 +57,8 @@ def smooth_spectrum(length: float, scene: Scene) -> Spectrum:
     return Spectrum(max(length, SPACINGS * scene.coarse.spacing), DEGREES_OF_FREEDOM)
 
 
-def global_length(samples: Samples, held: Mask, scene: Scene, rng: np.random.Generator) -> float:
-    """Return the length of features that a global field of the scan needs, in radii.
+def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random.Generator) -> Smoothness:
+    """Return the length of features that a global field of the scan needs, and how far its normals reach.
 
     Parameters
     ----------
@@ -53,6 +67,8 @@ def global_length(samples: Samples, held: Mask, scene: Scene, rng: np.random.Gen
     scene : Scene
     rng : draws features and samples
     """
+    if not held.any():
+        return Smoothness(LENGTHS[0], REACH)
     seen = rng.permutation(len(scene.samples))[:POINTS]
     x, distance = scene.volume(VOLUME, rng)
     points, normals = scene.points[seen], scene.normals[seen]
@@ -62,10 +78,17 @@ def global_length(samples: Samples, held: Mask, scene: Scene, rng: np.random.Gen
     features = Features.draw(FEATURES, rng, points)
     out = np.flatnonzero(held)[:POINTS]
     left, turned = scene.tensor(samples.points[out]), scene.tensor(samples.normals[out])
-    scores = []
+    # Estimated ones are means of their neighbours', which smooth fields predict too well.
+    reaches = REACHES[:1] if samples.estimated else REACHES
+    best = []
     for length in LENGTHS:
-        amplitudes = PatchSystem(patch, features, length, SIZE).solve(POSITION * scene.coarse.spacing, ANGLE)
-        value, gradient = features.sums(amplitudes, left, center, length, 1)
-        angle = (gradient - turned).norm(dim=1).mean()
-        scores.append(float(value.abs().mean() + scene.coarse.spacing * angle))
-    return max(length for length, score in zip(LENGTHS, scores, strict=True) if score <= (1 + ALIKE) * min(scores))
+        system, scores = PatchSystem(patch, features, length, SIZE), []
+        for reach in reaches:
+            amplitudes = system.solve(POSITION * scene.coarse.spacing, POSITION / reach)
+            value, gradient = features.sums(amplitudes, left, center, length, 1)
+            angle = (gradient - turned).norm(dim=1).mean()
+            scores.append((float(value.abs().mean() + scene.coarse.spacing * angle), reach))
+        best.append((length, *min(scores)))
+    least = min(score for _, score, _ in best)
+    length, _, reach = max(tried for tried in best if tried[1] <= (1 + ALIKE) * least)
+    return Smoothness(length, reach)

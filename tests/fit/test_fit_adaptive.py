@@ -228,3 +228,42 @@ def test_an_interrupt_leaves_the_global_field(monkeypatch: pytest.MonkeyPatch) -
     assert solution.interrupted
     assert sdf.detail is None
     assert "Interrupted" in solution.status
+
+
+def test_points_near_the_surface_but_off_it_are_left_out() -> None:
+    rng = np.random.default_rng(5)
+    clean = torus(1200, rng)
+    points = clean.points.copy()
+    points[:12] += rng.choice([-0.1, 0.1], (12, 1)) * clean.normals[:12]
+    sdf, solution = fit(Samples(points, clean.normals, FRAME), FitOptions())
+    assert "Left out 12 points that lie off the surface" in solution.status
+    truth = torus(500, np.random.default_rng(6))
+    assert np.abs(sdf.sdf(FRAME.to_world(truth.points))).mean() < 1e-3 * FRAME.scale
+
+
+def test_free_space_keeps_its_sign_where_normals_would_spoil_it() -> None:
+    """Of a shape with more detail than the global field can hold, exact normals may not weigh as much as they would."""
+    rng = np.random.default_rng(7)
+    x = rng.uniform(-1, 1, (60_000, 3))
+    waves = 7.0
+
+    def gyroid(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s, c = np.sin(waves * x), np.cos(waves * x)
+        turned = [1, 2, 0]
+        gradient = waves * (c * c[:, turned] - s[:, [2, 0, 1]] * s)
+        return (s * c[:, turned]).sum(axis=1), gradient
+
+    x = x[np.linalg.norm(x, axis=1) < 0.9]
+    value, gradient = gyroid(x)
+    near = np.abs(value) < 0.1
+    x, value, gradient = x[near][:2000], value[near][:2000], gradient[near][:2000]
+    for _ in range(3):
+        x = x - (value / np.einsum("ij,ij->i", gradient, gradient))[:, None] * gradient
+        value, gradient = gyroid(x)
+    normals = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    sdf, _ = fit(Samples(x, normals, FRAME), FitOptions(quality="draft"))
+    inside = rng.uniform(-0.5, 0.5, (4000, 3))
+    value, gradient = gyroid(inside)
+    clear = np.abs(value) > 0.3 * np.linalg.norm(gradient, axis=1) / waves
+    agree = np.sign(sdf.sdf(FRAME.to_world(inside[clear]))) == np.sign(value[clear])
+    assert agree.mean() > 0.98

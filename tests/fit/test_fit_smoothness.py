@@ -1,4 +1,4 @@
-"""The length of the global field: long for shapes with few degrees of freedom, short for those with many."""
+"""The global field: its length long for shapes of few degrees of freedom, its normals worth what they are exact."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from gnrecon.cloud import Float, Frame, Samples
 from gnrecon.fit.scene import Scene
-from gnrecon.fit.smoothness import LENGTHS, global_length
+from gnrecon.fit.smoothness import LENGTHS, REACHES, Smoothness, global_smoothness
 
 FRAME = Frame(np.zeros(3), 1.0)
 
@@ -35,24 +35,32 @@ def rippled(ripples: float, height: float, noise: float) -> Samples:
     return Samples(x + noise * rng.standard_normal((1500, 1)) * normals, normals, FRAME)
 
 
-def chosen(samples: Samples) -> float:
+def chosen(samples: Samples) -> Smoothness:
     held = np.zeros(len(samples), dtype=bool)
     held[::6] = True
     seen = Samples(samples.points[~held], samples.normals[~held], FRAME)
     scene = Scene.of(seen, "cpu", np.random.default_rng(1))
-    return global_length(samples, held, scene, np.random.default_rng(2))
+    return global_smoothness(samples, held, scene, np.random.default_rng(2))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_ball_needs_long_features(noise: float) -> None:
-    assert chosen(rippled(1.0, 0.0, noise)) > LENGTHS[0]
+    assert chosen(rippled(1.0, 0.0, noise)).length > LENGTHS[0]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
 def test_ripples_need_short_features(noise: float) -> None:
-    assert chosen(rippled(9.0, 0.05, noise)) == LENGTHS[0]
+    assert chosen(rippled(9.0, 0.05, noise)).length == LENGTHS[0]
 
 
 def test_equal_seeds_choose_alike() -> None:
     samples = rippled(4.0, 0.05, 0.003)
     assert chosen(samples) == chosen(samples)
+
+
+def test_exact_normals_of_a_smooth_shape_reach_farther_than_scattered_ones() -> None:
+    exact = rippled(1.0, 0.0, 0.01)
+    turned = exact.normals + 0.5 * np.random.default_rng(3).standard_normal(exact.normals.shape)
+    scattered = Samples(exact.points, turned / np.linalg.norm(turned, axis=1, keepdims=True), FRAME)
+    assert chosen(exact).reach == REACHES[-1]
+    assert chosen(scattered).reach < REACHES[-1]
