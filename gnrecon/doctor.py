@@ -39,6 +39,7 @@ PACKAGES = {
     "safetensors": "safetensors",
     "scikit-image": "skimage",
     "scipy": "scipy",
+    "tomli-w": "tomli_w",
     "torch": "torch",
     "trimesh": "trimesh",
     "typer": "typer",

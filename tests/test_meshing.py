@@ -84,7 +84,8 @@ def test_senseless_lengths_are_refused(values: dict[str, float]) -> None:
 def test_a_resolution_and_an_edge_length_exclude_each_other() -> None:
     with pytest.raises(UsageError, match="only one of the two"):
         Options(resolution=128, edge_length=0.5)
-    assert Options().resolution == 256
+    box = np.array([[0.0, 0, 0], [1, 1, 1]])
+    assert Options().cells(box) == Options().for_scan(np.zeros((9, 3)), box).resolution == 256
     assert Options(edge_length=0.5).resolution is None
     with pytest.raises(UsageError, match="possible"):
         Options(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))

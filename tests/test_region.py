@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scan_files import gnrecon, sphere, write_scan
 
+from gnrecon.batch.request import Request
 from gnrecon.cli import main
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import UsageError
@@ -97,16 +98,16 @@ def test_the_command_line_crops(tmp_path: Path) -> None:
 
 
 def test_a_batch_passes_boxes_and_planes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    passed: list[str] = []
-    monkeypatch.setattr("gnrecon.batch.run_batch", lambda *given, **_: passed.extend(given[3]) or 0)
+    requests: list[Request] = []
+    monkeypatch.setattr("gnrecon.batch.runner.run_batch", lambda request: requests.append(request) or 0)
     boxes = ("--crop", "-1,-1,-1,1,1,1", "--crop", "2,2,2,3,3,3", "--clip-plane", "-1,0,0,2")
     with pytest.raises(SystemExit) as ended:
         main(["batch", str(tmp_path), "-o", str(tmp_path), *boxes, "--smooth-scan", "8s", "--clusters", "off"])
     assert ended.value.code == 0
-    text = " ".join(passed)
-    assert " ".join(boxes) in text
-    assert "--smooth-scan 8s" in text
-    assert "--clusters off" in text
+    passed = requests[0].settings.of(tmp_path / "scan.ply")
+    assert list(passed["crop"]) == ["-1,-1,-1,1,1,1", "2,2,2,3,3,3"]
+    assert list(passed["clip_plane"]) == ["-1,0,0,2"]
+    assert (passed["smooth_scan"], passed["clusters"]) == ("8s", "off")
 
 
 @pytest.mark.parametrize(

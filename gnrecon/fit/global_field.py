@@ -74,7 +74,8 @@ def fit_global(
         sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
         return sdf, solution, wrong_sign(sdf, scene, rng.spawn(1)[0])
 
-    reach = smoothness.reach
+    # Where more is asked of the surface in holes than the data says, normals may not carry it out of the box.
+    reach = REACH if options.regularisers else smoothness.reach
     sdf, solution, wrong = fitted(reach, part(advance, 0.0, 0.5))
     if reach > REACH and wrong > FEW:
         plain, plainly, ghosts = fitted(REACH, part(advance, 0.5, 1.0))

@@ -37,6 +37,9 @@ FEATURES, POINTS, VOLUME = 600, 2000, 2000
 POSITION = 0.1
 """Noise of positions that is assumed, in spacings; that of normals, in radians, is this over the reach."""
 
+LEAST_HELD = 5
+"""Left-out points that have a say."""
+
 SIZE = 1.0
 """Standard deviation of the field, in radii."""
 
@@ -67,7 +70,7 @@ def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random
     scene : Scene
     rng : draws features and samples
     """
-    if not held.any():
+    if held.sum() < LEAST_HELD:
         return Smoothness(LENGTHS[0], REACH)
     seen = rng.permutation(len(scene.samples))[:POINTS]
     x, distance = scene.volume(VOLUME, rng)

@@ -58,7 +58,7 @@ def test_a_design_region_may_ask_for_more_than_zero() -> None:
 def test_every_residual_is_tested() -> None:
     # Those with second derivatives are in test_residuals_second_order.
     second = {name for name in residuals.__all__ if isinstance(getattr(residuals, name), residuals.SecondOrder)}
-    makers = {"Linearised", "Residual", "SecondOrder", "clipped_strain", "from_formula"}
+    makers = {"Linearised", "Residual", "SecondOrder", "clipped_strain", "from_formula", "named"}
     assert set(residuals.__all__) - makers - second == set(FORMULAS)
 
 
