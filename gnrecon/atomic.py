@@ -43,9 +43,9 @@ def atomic_write(
         yield temporary
         if verify is not None:
             verify(temporary)
-        _sync(temporary)
+        sync(temporary)
         _rename(temporary, target, overwrite)
-        _sync(target.parent)
+        sync(target.parent)
     except GnreconError:
         raise
     except OSError as error:
@@ -92,7 +92,8 @@ def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
         temporary.replace(target)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Wait until what was written to a file, or the names in a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -7,7 +7,6 @@ hashed and recorded, and then receive their names, so that whatever kills an att
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import shutil
 import tempfile
@@ -18,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gnrecon.atomic import sync
 from gnrecon.batch.attempt import End, attempt
 from gnrecon.batch.children import WORK
 from gnrecon.batch.identity import file_hash, hash_if_there, identity_of
@@ -171,16 +171,8 @@ def _adopt(job: Job, folder: Path, identity: dict[str, Any], end: End) -> Outcom
     )
     record.write(job.record())
     record.place(job.output)
-    _sync(job.output)
+    sync(job.output)
     return _told(job, Status.MADE, facts)
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _told(job: Job, status: Status, told: Mapping[str, Any]) -> Outcome:
