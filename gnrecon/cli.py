@@ -219,7 +219,7 @@ WorkDir = Annotated[
 Resolution = Annotated[
     int | None,
     typer.Option(
-        help="Cells along the longest side of the box; at least 16, by default 256, of large scans up to 1,024.",
+        help="Cells along the longest side of the box; at least 16, by default 128 to 1,024 by the points' spacing.",
         rich_help_panel=MESH,
     ),
 ]

@@ -17,6 +17,7 @@ from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
 from gnrecon.export import SignedDistance, extract, project, refine, remove_stray, repair
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
+from gnrecon.export.protocol import sdf_and_gradient
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 
@@ -24,6 +25,9 @@ _log = logging.getLogger(__name__)
 
 SAFE = 0.95
 """Share of the wanted chord error at which a mesh is fine enough: projected as a whole, it may differ a little."""
+
+MOST_SHIFTED, MOST_TILTED = 0.2, 1e-3
+"""Errors of single precision that are put up with: in cells, and of gradients, as a share of themselves."""
 
 StageTimer = Callable[[str], AbstractContextManager[None]]
 """Gives the context in which a stage of a name runs, such as `gnrecon.report.Stages`."""
@@ -96,9 +100,7 @@ def mesh_field(
     with stages("extract"):
         mesh, fast, cells, dropped = _extracted(field, options, data, box, advance)
     with stages("project"):
-        # The first step need not be exact, only the last.
-        mesh = project(mesh, fast, steps=1, advance=part(advance, 0.0, 0.3))
-        mesh = project(mesh, field, steps=1, advance=part(advance, 0.3, 1.0))
+        mesh = project(mesh, field, steps=2, rough=None if fast is field else fast, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []
     if options.refine().anything:
@@ -144,12 +146,16 @@ def _said(fineness: Fineness, options: Options) -> list[str]:
 
 
 def _coarse(field: MeshedField, data: Float, resolution: int) -> SignedDistance:
-    """Return the field in single precision where that places vertices well within a cell; projection makes them exact.
+    """Return the field in single precision where vertices and normals come out well enough by it; projection by the
+    field's own values makes the vertices exact.
 
-    Features of high frequency with large weights cancel, so the error is measured and not assumed.
+    Features of high frequency with large weights cancel, so the errors are measured and not assumed.
     """
     some = data[:: max(1, len(data) // 2000)]
     single = field.single()
-    error = np.abs(single.sdf(some) - field.sdf(some)).max()
+    value, gradient = sdf_and_gradient(field, some)
+    rough, slanted = sdf_and_gradient(single, some)
     cell = np.ptp(field.bounds, axis=0).max() / resolution
-    return single if error < 0.2 * cell else field
+    shifted = np.abs(rough - value).max() / cell
+    tilted = (np.linalg.norm(slanted - gradient, axis=1) / np.linalg.norm(gradient, axis=1)).max()
+    return single if shifted < MOST_SHIFTED and tilted < MOST_TILTED else field

@@ -21,11 +21,11 @@ from gnrecon.io import MOST_POINTS
 from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.region import Region
 
-RESOLUTION, MOST_CELLS = 256, 1024
-"""Cells where nothing else was asked for, and the most of them that a large scan gets by itself."""
+RESOLUTION, FEWEST_CELLS, MOST_CELLS = 256, 128, 1024
+"""Cells where nothing else is known; the fewest that a sparse scan and the most that a large one gets by itself."""
 
-CELL_SPACINGS = 1.5
-"""Edge of a cell, in spacings of a large scan's points: about one vertex for each of them."""
+CELL_SPACINGS, SPARSE_CELL_SPACINGS = 1.5, 1 / 3
+"""Edge of a cell, in spacings of a large scan's points: about one vertex for each of them; and of a sparse one's."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,9 @@ class Options:
     uncertainty : bool
         Whether vertices carry ``sigma``, the standard deviation of their position along the normal, see `Uncertainty`.
     resolution : int, optional
-        Cells of the extraction along the longest side of the shape's box; unless there is an edge length 256, and of
-        200,000 points or more as many up to 1,024 as make a cell one and a half spacings of the points.
+        Cells of the extraction along the longest side of the shape's box. Unless there is an edge length, as many as
+        make a cell a third of the points' spacing, but from 128 to 256; of 200,000 points or more, one and a half
+        spacings, from 256 to 1,024 cells.
     edge_length : float, file units, optional
         Mean length of the mesh's edges, from which the number of cells follows.
     max_error : float, file units, optional
@@ -263,11 +264,11 @@ class Options:
         """
         if self.resolution is not None or self.edge_length is not None:
             return self
-        cells = RESOLUTION
-        if len(points) >= LARGE:
-            longest = float(np.ptp(bounds, axis=0).max())
-            cells = math.ceil(longest / (CELL_SPACINGS * neighbour_spacing(points)))
-        return replace(self, resolution=min(max(cells, RESOLUTION), MOST_CELLS))
+        longest = float(np.ptp(bounds, axis=0).max())
+        dense = len(points) >= LARGE
+        edge = (CELL_SPACINGS if dense else SPARSE_CELL_SPACINGS) * neighbour_spacing(points)
+        least, most = (RESOLUTION, MOST_CELLS) if dense else (FEWEST_CELLS, RESOLUTION)
+        return replace(self, resolution=math.ceil(min(max(longest / edge, least), most)) if edge > 0 else most)
 
     def fit(self) -> FitOptions:
         """Return the options of the fit."""

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from gnrecon.cloud import Float
 
@@ -25,6 +26,9 @@ Mask = npt.NDArray[np.bool_]
 
 _SOURCES = 4000
 _NEIGHBOURS = 8
+
+_TOGETHER = 128
+"""Points whose winding numbers are summed at once: their terms stay in the processor's cache."""
 
 KNOWN = 2.0
 """How far from the points a distance is known at least, in radii of the disk that the nearest one stands for."""
@@ -123,12 +127,12 @@ class CoarseDistance:
         sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
         return known, sign * np.sqrt(distances**2 - disks**2), distances
 
-    def winding_number(self, x: Float, batch: int = 2048) -> Float:
+    def winding_number(self, x: Float, batch: int = _TOGETHER) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
         return winding_number(x, self._sources, self._dipoles, self._radii, batch)
 
 
-def winding_number(x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = 2048) -> Float:
+def winding_number(x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = _TOGETHER) -> Float:
     """Return the winding number w, of shape (Q,), that dipoles make at points x, of shape (Q, 3).
 
     Parameters
@@ -139,13 +143,16 @@ def winding_number(x: Float, sources: Float, dipoles: Float, radii: Float, batch
     batch : points that are asked for at once
     """
     # sum_j d_j . (p_j - x) / |p_j - x|^3, with the squares expanded so that both factors are matrix products.
-    offset = np.einsum("jc,jc->j", dipoles, sources)
-    squares = np.einsum("jc,jc->j", sources, sources)
-    parts = [np.zeros(0)]
+    offset = torch.as_tensor(np.einsum("jc,jc->j", dipoles, sources))
+    squares = torch.as_tensor(np.einsum("jc,jc->j", sources, sources))
+    least = torch.as_tensor(np.square(radii))
+    to_sources, to_dipoles = (torch.as_tensor(np.ascontiguousarray(rows.T)) for rows in (sources, dipoles))
+    found = np.empty(len(x))
     for start in range(0, len(x), batch):
-        q = x[start : start + batch]
-        square = np.einsum("qc,qc->q", q, q)[:, None] - 2 * (q @ sources.T) + squares
-        square = np.maximum(square, radii**2)
-        flux = offset - q @ dipoles.T
-        parts.append((flux / (square * np.sqrt(square))).sum(axis=1))
-    return np.concatenate(parts)
+        rows = slice(start, start + batch)
+        q = torch.as_tensor(x[rows])
+        square = torch.addmm(squares, q, to_sources, alpha=-2).add_(q.square().sum(dim=1, keepdim=True))
+        near = torch.maximum(square, least, out=square).rsqrt_()
+        flux = torch.addmm(offset, q, to_dipoles, alpha=-1).mul_(near).mul_(near).mul_(near)
+        found[rows] = flux.sum(dim=1).numpy()
+    return found

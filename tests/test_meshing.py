@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -18,6 +19,7 @@ from gnrecon import meshing
 from gnrecon.errors import UsageError
 from gnrecon.export import SignedDistance
 from gnrecon.export.fineness import chord_error
+from gnrecon.ingest.spacing import neighbour_spacing
 from gnrecon.meshing import mesh_field
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
@@ -85,10 +87,34 @@ def test_a_resolution_and_an_edge_length_exclude_each_other() -> None:
     with pytest.raises(UsageError, match="only one of the two"):
         Options(resolution=128, edge_length=0.5)
     box = np.array([[0.0, 0, 0], [1, 1, 1]])
-    assert Options().cells(box) == Options().for_scan(np.zeros((9, 3)), box).resolution == 256
-    assert Options(edge_length=0.5).resolution is None
+    assert Options().cells(box) == 256
+    assert Options(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
     with pytest.raises(UsageError, match="possible"):
         Options(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))
+
+
+@pytest.mark.parametrize(("shift", "tilt", "kept"), [(0.0, 0.0, True), (0.3, 0.0, False), (0.0, 0.01, False)])
+def test_single_precision_serves_where_values_and_gradients_agree(shift: float, tilt: float, kept: bool) -> None:
+    class Double(Precise):
+        def single(self) -> SignedDistance:
+            return Field(lambda x: torus()(x) + shift * cell + tilt / 40 * np.sin(40 * x[:, 0]))
+
+    cell = 2.2 / 50
+    field, data = Double(torus()), np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3))
+    assert (meshing._coarse(field, data, 50) is not field) == kept
+
+
+def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
+    box, plane = np.array([[0.0, 0, 0], [1, 1, 0.2]]), np.stack(np.meshgrid(range(60), range(60), [0.0]), -1)
+    points = plane.reshape(-1, 3) / 60
+    spacing = neighbour_spacing(points)
+    assert Options().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
+    assert 128 < math.ceil(3.0 / spacing) < 256
+    assert Options().for_scan(points[::7], box).resolution == 128
+    assert Options().for_scan(points[:5], box).resolution == 128
+    assert Options().for_scan(points, 3 * box).resolution == 256
+    assert Options().for_scan(np.zeros((9, 3)), box).resolution == 256
+    assert Options(resolution=50).for_scan(points, box).resolution == 50
 
 
 def test_an_impossible_edge_length_is_refused_before_the_fit() -> None:

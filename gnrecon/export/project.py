@@ -34,6 +34,7 @@ def project(
     *,
     steps: int = 3,
     limit: float | None = None,
+    rough: SignedDistance | None = None,
     batch: int = 65536,
     advance: Advance = unheard,
 ) -> Mesh:
@@ -49,6 +50,9 @@ def project(
         Newton steps; two bring a smooth field to rounding.
     limit : float, file units, optional
         Longest way that a vertex may go; by default half the median edge, which is less than half a cell.
+    rough : SignedDistance, optional
+        The same field, cheaper and a little less exact. It then makes all steps but the last and gives the gradients;
+        the last step goes along them by the field's own values.
     batch : int
         Most points to ask the field for at once.
     advance : callable
@@ -75,7 +79,7 @@ def project(
     gradient = np.empty_like(moved)
     for start in range(0, len(moved), batch):
         rows = slice(start, start + batch)
-        moved[rows], value[rows], gradient[rows] = newton(mesh.vertices[rows], field, steps, limit)
+        moved[rows], value[rows], gradient[rows] = newton(mesh.vertices[rows], field, steps, limit, rough)
         advance(min(start + batch, len(moved)) / len(moved))
     back = _undo_turned(mesh, moved)
     moved[back] = mesh.vertices[back]
@@ -98,26 +102,44 @@ def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     return lengths.reshape(-1)
 
 
-def newton(start: Float, field: SignedDistance, steps: int, limit: float) -> tuple[Float, Float, Float]:
-    """Points of shape (N, 3) after Newton steps no farther than `limit` from `start`, with value and gradient there."""
+def newton(
+    start: Float, field: SignedDistance, steps: int, limit: float, rough: SignedDistance | None = None
+) -> tuple[Float, Float, Float]:
+    """Points of shape (N, 3) after Newton steps no farther than `limit` from `start`, with value and gradient there.
+
+    With a rough field, see `project`, the gradient is its own, before the last step.
+    """
     points = start.copy()
-    value, gradient = sdf_and_gradient(field, points)
-    low, high = field.bounds
-    for _ in range(steps):
-        slopes = np.linalg.norm(gradient, axis=1)
-        # From one side of the limit to the other is twice the limit; where the field is flat there is no step.
-        rows = np.flatnonzero((np.abs(value) > CLOSE * limit * slopes) & (np.abs(value) <= 2 * limit * slopes))
-        trial = points[rows] - (value[rows] / slopes[rows])[:, None] * (gradient[rows] / slopes[rows][:, None])
-        near = np.linalg.norm(trial - start[rows], axis=1) <= limit
-        near &= ((trial >= low) & (trial <= high)).all(axis=1)
-        rows, trial = rows[near], trial[near]
+    value, gradient = sdf_and_gradient(rough or field, points)
+    for left in reversed(range(steps)):
+        anew = rough is None or left > 0
+        if not anew:
+            value = field.sdf(points)
+        rows, trial = _steps(points, value, gradient, start, limit, field.bounds)
         if not len(rows):
-            break
-        trial_value, trial_gradient = sdf_and_gradient(field, trial)
+            continue
+        if anew:
+            trial_value, trial_gradient = sdf_and_gradient(rough or field, trial)
+        else:
+            trial_value, trial_gradient = field.sdf(trial), gradient[rows]
         better = np.abs(trial_value) < np.abs(value[rows])
         rows = rows[better]
         points[rows], value[rows], gradient[rows] = trial[better], trial_value[better], trial_gradient[better]
     return points, value, gradient
+
+
+def _steps(
+    points: Float, value: Float, gradient: Float, start: Float, limit: float, bounds: Float
+) -> tuple[npt.NDArray[np.int64], Float]:
+    """Rows that may take a Newton step, of shape (S,), and where it leads them, of shape (S, 3)."""
+    low, high = bounds
+    slopes = np.linalg.norm(gradient, axis=1)
+    # From one side of the limit to the other is twice the limit; where the field is flat there is no step.
+    rows = np.flatnonzero((np.abs(value) > CLOSE * limit * slopes) & (np.abs(value) <= 2 * limit * slopes))
+    trial = points[rows] - (value[rows] / slopes[rows])[:, None] * (gradient[rows] / slopes[rows][:, None])
+    near = np.linalg.norm(trial - start[rows], axis=1) <= limit
+    near &= ((trial >= low) & (trial <= high)).all(axis=1)
+    return rows[near], trial[near]
 
 
 def _undo_turned(mesh: Mesh, moved: Float) -> Mask:

@@ -37,7 +37,7 @@ class Partition:
 
     origin: Float
     cell: float
-    overlap: float = 0.5
+    overlap: float = 0.3
 
     @property
     def reach(self) -> float:

@@ -97,7 +97,7 @@ class Blocks:
             network=Siren(tuple(facts["widths"])),
             theta=theta,
             box=Box(*array("box")),
-            partition=Partition(array("origin"), facts["cell"]),
+            partition=Partition(array("origin"), facts["cell"], facts["overlap"]),
             features=Features(frequencies, phases),
             belief=Belief(facts["length"], facts["position"], facts["angle"]),
             seed=facts["seed"],

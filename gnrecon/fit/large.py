@@ -131,6 +131,7 @@ def _tasks(
         "widths": list(sdf.field.widths),
         "levels": len(dipoles.levels),
         "cell": partition.cell,
+        "overlap": partition.overlap,
         "radius": density.radius,
         "length": belief.length,
         "position": belief.position,

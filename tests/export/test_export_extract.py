@@ -91,6 +91,21 @@ def test_projection_beats_interpolation_and_gives_the_exact_normals() -> None:
     assert np.allclose(fine.normals, radial / np.linalg.norm(radial, axis=1, keepdims=True), atol=1e-6)
 
 
+def test_a_rough_field_gives_all_but_the_last_step_and_its_values() -> None:
+    class Valued(Field):
+        def gradient(self, points: np.ndarray) -> np.ndarray:
+            raise AssertionError(f"values alone are asked of the exact field, not gradients at {len(points)} points")
+
+    waves = sines(3, frequency=9.0)
+    exact, rough = Valued(sphere(0.8), frame=UTM), Field(lambda x: sphere(0.8)(x) + 1e-4 * waves(x), frame=UTM)
+    start = extract(rough, resolution=32)
+    fine = project(start, exact, steps=2, rough=rough)
+    assert np.abs(exact.sdf(project(start, rough).vertices)).max() > 1e-5 * UTM.scale
+    assert np.abs(exact.sdf(fine.vertices)).max() < 1e-7 * UTM.scale
+    radial = UTM.to_unit(fine.vertices)
+    assert np.allclose(fine.normals, radial / np.linalg.norm(radial, axis=1, keepdims=True), atol=5e-3)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_projection_turns_no_face_over(seed: int) -> None:
     field = Field(sines(seed, frequency=9.0))

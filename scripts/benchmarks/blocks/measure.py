@@ -24,9 +24,6 @@ from gnrecon.io import write_cloud
 SAMPLES, STEP = 20_000, 1e-8
 """Places on the surface that are looked at, and how far on either side of a border, in radii."""
 
-BORDERS = (0.0, 0.25, 0.75)
-"""Where cells end, and where neighbours' weights begin and end, in cells."""
-
 INTERVAL = 0.5
 
 
@@ -118,8 +115,10 @@ def jump(sdf: NeuralSDF, vertices: Float) -> dict[str, float]:
     """
     assert sdf.detail is not None
     rng, partition = np.random.default_rng(0), sdf.detail.partition
+    # Where cells end, and where neighbours' weights begin and end, in cells.
+    borders = (0.0, partition.overlap / 2, 1.0 - partition.overlap / 2)
     u = (sdf.frame.to_unit(vertices[rng.integers(len(vertices), size=SAMPLES)]) - partition.origin) / partition.cell
-    rows, axis, border = np.arange(SAMPLES), rng.integers(3, size=SAMPLES), rng.choice(BORDERS, SAMPLES)
+    rows, axis, border = np.arange(SAMPLES), rng.integers(3, size=SAMPLES), rng.choice(borders, SAMPLES)
     u[rows, axis] = np.round(u[rows, axis] - border) + border
     x, across = partition.origin + partition.cell * u, STEP * np.eye(3)[axis]
     (low, low_slope), (high, high_slope) = (
