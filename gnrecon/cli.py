@@ -216,6 +216,15 @@ WorkDir = Annotated[
         rich_help_panel=FIT,
     ),
 ]
+BlockScheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="A Dask cluster whose workers solve the blocks of --work-dir, such as tcp://host:8786.",
+        rich_help_panel=FIT,
+    ),
+]
 Resolution = Annotated[
     int | None,
     typer.Option(
@@ -365,6 +374,7 @@ def reconstruct_command(
     device: Device = "cpu",
     threads: Threads = None,
     work_dir: WorkDir = None,
+    block_scheduler: BlockScheduler = None,
     resolution: Resolution = None,
     edge_length: EdgeLength = None,
     max_error: MaxError = None,

@@ -100,6 +100,9 @@ class Options:
     work_dir : str, optional
         Folder in which the work of the fit is kept, so that a run that was killed is taken up again by the same one.
         The fit is then solved by blocks, as that of 200,000 points or more always is; see `gnrecon.fit.large`.
+    block_scheduler : str, optional
+        Address of a Dask scheduler, such as ``"tcp://host:8786"``, whose workers solve the blocks; they must see the
+        work folder by the same path.
 
     Raises
     ------
@@ -146,6 +149,7 @@ class Options:
     device: str = "cpu"
     threads: int | None = None
     work_dir: str | None = None
+    block_scheduler: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("crop", "clip_plane"):
@@ -176,6 +180,8 @@ class Options:
         require_orientation(self.orient)
         if self.work_dir is not None and not self.fit().adaptive:
             raise UsageError("A work folder serves the default fit alone, not one network (--widths, --steps).")
+        if self.block_scheduler is not None and self.work_dir is None:
+            raise UsageError("A scheduler's workers need a work folder that all of them see (--work-dir).")
         self.fit()
         self.refine()
 

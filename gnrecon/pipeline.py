@@ -257,7 +257,7 @@ def _run(
         remark(sentence)
     with stages("fit"):
         total = options.fit().steps_for(len(samples))
-        sdf, solution = fit(samples, options.fit(), step, progress.advance, options.work_dir)
+        sdf, solution = fit(samples, options.fit(), step, progress.advance, options.work_dir, options.block_scheduler)
         residuals = Misfit.of(sdf, samples)
         unseen = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
     remark(solution.status)

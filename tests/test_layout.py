@@ -31,6 +31,7 @@ ROWS = [
         "logs",
         "plugins",
         "region",
+        "scheduler",
     },
     {"linalg"},
     {"optim"},

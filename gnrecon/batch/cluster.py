@@ -21,12 +21,11 @@ from gnrecon.batch.children import WORK
 from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import Job, running_folder
 from gnrecon.batch.outcome import Cause, Outcome, Status
-from gnrecon.errors import ExitCode, UsageError
+from gnrecon.errors import ExitCode
+from gnrecon.scheduler import connected, require_distributed
 
 RETRIES = 2
 """How often Dask begins a task again that raised an error, as a worker without the libraries would."""
-
-_PATIENCE = "20s"
 
 
 def run_on_cluster(
@@ -55,7 +54,7 @@ def run_on_cluster(
     UsageError
         When Dask is not installed, or the scheduler does not answer.
     """
-    distributed = _distributed()
+    distributed = require_distributed()
     with _client(distributed, address, count) as client, client.as_current(), _sign(jobs[0].output) as sign:
         futures = {}
         for job in jobs:
@@ -95,22 +94,10 @@ class Abandoned:
         return self._seen and not there
 
 
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError:
-        raise UsageError("Dask is not installed; add it by: pip install 'gnrecon[cluster]'.") from None
-    return distributed
-
-
 @contextmanager
 def _client(distributed: Any, address: str | None, count: int) -> Iterator[Any]:
     if address is not None:
-        try:
-            client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise UsageError(f"No scheduler answers at {address} ({error}).") from error
-        with client:
+        with connected(address) as client:
             yield client
         return
     # The limits of memory are the jobs' own; a dashboard is for those who have a cluster of their own.

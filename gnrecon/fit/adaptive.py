@@ -46,10 +46,12 @@ def fit_adaptive(
     rng: np.random.Generator,
     advance: Advance = unheard,
     folder: str | Path | None = None,
+    scheduler: str | None = None,
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a global field and its detail; `advance` is told of the share that is done.
 
-    The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given.
+    The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given; then a
+    Dask cluster can solve them, too.
 
     Normals that were estimated are turned around where a first field contradicts them, and points that lie off the
     surface of their neighbours are left out.
@@ -92,7 +94,7 @@ def fit_adaptive(
     rest = part(advance, SHARE, 1.0)
     try:
         if by_blocks:
-            detail = fit_large(sdf, samples, held, options, rng, folder, rest)
+            detail = fit_large(sdf, samples, held, options, rng, folder, rest, scheduler)
         else:
             detail = fit_detail(sdf, samples, held, options.features, rng, options.device, rest, shape)
     except KeyboardInterrupt:

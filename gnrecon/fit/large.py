@@ -30,6 +30,7 @@ from gnrecon.fit.dipoles import Dipoles
 from gnrecon.fit.octree import morton, octree_blocks
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.patch import Belief
+from gnrecon.fit.scheduled import solve_scheduled
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.work import Work
 from gnrecon.fit.workers import solve_blocks
@@ -52,6 +53,7 @@ def fit_large(
     rng: np.random.Generator,
     folder: str | Path | None = None,
     advance: Advance = unheard,
+    scheduler: str | None = None,
     block_points: int = BLOCK_POINTS,
 ) -> Detail:
     """Return what to add to a global field.
@@ -65,12 +67,13 @@ def fit_large(
     rng : draws the features
     folder : where the work is kept, so that the same fit takes it up again; by default a temporary one
     advance : told of the share that is done
+    scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks; by default processes do
     block_points : most points of a block
 
     Raises
     ------
     UsageError
-        When the folder holds anything else.
+        When the folder holds anything else, or no scheduler answers.
     FitError, MemoryLimitError
         When a block cannot be solved.
     """
@@ -86,8 +89,11 @@ def fit_large(
         work = Work.begin(place, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
         missing = [number for number in range(count) if not work.done(number)]
-        # As many as torch has threads, which is what was asked for, or the machine's cores.
-        solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, CHOSEN, 1.0))
+        if scheduler is not None:
+            solve_scheduled(work, missing, scheduler, part(advance, CHOSEN, 1.0))
+        else:
+            # As many as torch has threads, which is what was asked for, or the machine's cores.
+            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, CHOSEN, 1.0))
         return _gathered(work, count, arrays["keys"], partition, features, belief)
 
 

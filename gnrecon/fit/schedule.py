@@ -33,6 +33,7 @@ def fit(
     callback: Callback | None = None,
     advance: Advance = unheard,
     folder: str | Path | None = None,
+    scheduler: str | None = None,
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a sine network to the signed distance of oriented points.
 
@@ -45,18 +46,19 @@ def fit(
     callback : called with the record of each step
     advance : told of the share that is done, of the start and of the most steps that may follow
     folder : where the work of the default fit is kept, solved by blocks then, so that the same fit takes it up again
+    scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks
 
     Raises
     ------
     UsageError
-        When a folder is given for one network, or holds anything but this fit's work.
+        When a folder is given for one network, or holds anything but this fit's work, or no scheduler answers.
     FitError
         When the field is not finite.
     """
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
     if options.adaptive:
-        sdf, fitted = fit_adaptive(samples, options, rng, advance, folder)
+        sdf, fitted = fit_adaptive(samples, options, rng, advance, folder, scheduler)
     elif folder is not None:
         raise UsageError("A work folder serves the default fit alone, not one network (--widths, --steps).")
     else:

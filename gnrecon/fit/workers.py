@@ -15,11 +15,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import torch
-
 from gnrecon.advance import Advance
 from gnrecon.errors import FitError, MemoryLimitError
 from gnrecon.fit.block import solve_block
+from gnrecon.fit.threads import one_thread
 from gnrecon.fit.work import Work
 from gnrecon.fit.worker import DONE
 
@@ -51,21 +50,10 @@ def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str,
     if processes > 1 and device == "cpu":
         _solve_beside(work.folder, blocks, processes, advance)
         return
-    with _one_thread():
+    with one_thread():
         for number, block in enumerate(blocks, 1):
             solve_block(work.folder, block, device)
             advance(number / len(blocks))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute with one thread, as the processes do, because sums by several differ in their last digits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _room() -> int:

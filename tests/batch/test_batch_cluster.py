@@ -71,7 +71,7 @@ def _is_child(process: psutil.Process, folder: Path) -> bool:
 
 
 def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gnrecon.batch.cluster._PATIENCE", "1s")
+    monkeypatch.setattr("gnrecon.scheduler.PATIENCE", "1s")
     outcomes: list[Outcome] = []
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         with pytest.raises(UsageError, match=f"No scheduler answers at {re.escape(address)}"):

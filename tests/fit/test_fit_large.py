@@ -15,17 +15,18 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.advance import unheard
+from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import Cancelled, FitError, MemoryLimitError, UsageError
 from gnrecon.field.detail import Detail
 from gnrecon.field.partition import Int
 from gnrecon.field.siren import Siren
-from gnrecon.fit import FitOptions, NeuralSDF, block, large, workers
-from gnrecon.fit.detail import fit_detail
+from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
+from gnrecon.fit.detail import CHOSEN, fit_detail
 from gnrecon.fit.options import QUALITIES
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.work import Work
+from gnrecon.options import Options
 from gnrecon.sampling import Box
 
 COUNT = 1500
@@ -56,12 +57,14 @@ def constant_field(samples: Samples) -> NeuralSDF:
     return NeuralSDF(field, theta, samples.frame, Box.around(samples.points, 0.1))
 
 
-def fitted(folder: Path | None = None, block_points: int = 200) -> tuple[NeuralSDF, Detail]:
+def fitted(
+    folder: Path | None = None, block_points: int = 200, scheduler: str | None = None, advance: Advance = unheard
+) -> tuple[NeuralSDF, Detail]:
     samples = ellipsoid()
     sdf, rng = constant_field(samples), np.random.default_rng(0)
     held = np.arange(COUNT) % 6 == 0
     options = FitOptions(quality="draft")
-    return sdf, large.fit_large(sdf, samples, held, options, rng, folder, block_points=block_points)
+    return sdf, large.fit_large(sdf, samples, held, options, rng, folder, advance, scheduler, block_points)
 
 
 @pytest.fixture(autouse=True)
@@ -102,6 +105,42 @@ def test_neither_blocks_nor_processes_change_a_digit(whole: Detail, tmp_path: Pa
     assert same(whole, parts)
 
 
+# Dask's own threads and sockets go when they please.
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_cluster_that_loses_a_worker_changes_no_digit(
+    whole: Detail, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import LocalCluster
+
+    killed, folder, options = [], tmp_path / "work", {"dashboard_address": None, "silence_logs": 50}
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **options) as cluster:
+
+        def kill(share: float) -> None:
+            if not killed and share > CHOSEN:
+                killed.append(cluster.workers[0].pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        _, parts = fitted(folder, 150, cluster.scheduler_address, kill)
+        assert killed
+        assert same(whole, parts)
+        # What is there is not solved again, and what cannot be solved is said.
+        monkeypatch.setattr(scheduled, "RETRIES", 0)
+        assert same(whole, fitted(folder, 150, cluster.scheduler_address)[1])
+        (folder / "block-000000.npz").unlink()
+        (folder / "normals.npy").unlink()
+        with pytest.raises(FitError, match=r"The cluster could not solve a block: .*normals\.npy"):
+            scheduled.solve_scheduled(Work(folder), [0], cluster.scheduler_address, unheard)
+
+
+def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="need a work folder"):
+        Options(block_scheduler="tcp://127.0.0.1:9")
+    assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
+    monkeypatch.setattr("gnrecon.scheduler.PATIENCE", "1s")
+    with pytest.raises(UsageError, match=r"No scheduler answers at tcp://127\.0\.0\.1:9"):
+        scheduled.solve_scheduled(Work(tmp_path), [0], "tcp://127.0.0.1:9", unheard)
+
+
 def test_it_is_the_smaller_scans_fit(whole: Detail, monkeypatch: pytest.MonkeyPatch) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
@@ -122,7 +161,9 @@ def test_there_is_no_seam(whole: Detail) -> None:
     u = (ellipsoid().points - partition.origin) / partition.cell
     rows, axis = np.arange(COUNT), rng.integers(3, size=COUNT)
     # Onto the nearest face of a cell, or to where a neighbour's weight begins or ends.
-    u[rows, axis] = np.floor(u[rows, axis]) + rng.choice([0.0, 0.25, 0.75], COUNT)
+    u[rows, axis] = np.floor(u[rows, axis]) + rng.choice(
+        [0.0, partition.overlap / 2, 1.0 - partition.overlap / 2], COUNT
+    )
     step = 1e-7 * np.eye(3)[axis]
     x = partition.origin + partition.cell * u
     (low, low_slope), (high, high_slope) = (detail.value_and_gradient(x + side) for side in (-step, step))
