@@ -30,6 +30,9 @@ _TURNS = 6
 _SEPARATION = 5.0
 """Offset over what remains: 2.7 for a normal distribution that is cut in two, 3.5 for a uniform one."""
 
+_LEAST_OFFSET = 0.05
+"""In spacings; what a quadric leaves over of an exact scan may look like two layers, far nearer to each other."""
+
 _BALANCE = 0.2  # least share of a layer
 _APART = 0.5  # of the layers' middles in the plane, in units of their spread
 _BETWEEN = 0.1  # share of points that face the other way
@@ -124,7 +127,7 @@ def _offset(local: Float, facing: Float) -> float | None:
         return None
     upper, quadric, offset, remaining = _twice(same)
     balance = min(upper.mean(), 1 - upper.mean())
-    if balance < _BALANCE or offset < _SEPARATION * remaining or not _mixed(same[:, :2], upper):
+    if offset < _LEAST_OFFSET or balance < _BALANCE or offset < _SEPARATION * remaining or not _mixed(same[:, :2], upper):
         return None
     back = local[inside & (facing < -_FACING)]
     heights = back[:, 2] - _columns(back) @ quadric

@@ -48,6 +48,13 @@ def test_noise_is_no_layer(shape: Shape, noise: float, rng: np.random.Generator)
     assert find_layers(points + noise * rng.normal(size=(6000, 1)) * normals, normals) is None
 
 
+def test_what_a_quadric_leaves_over_of_an_exact_scan_is_no_layer() -> None:
+    """Here 5 % of the places look like two layers 0.001 spacings apart."""
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    assert find_layers(points, points) is None
+
+
 def test_thin_walls_are_no_layers(rng: np.random.Generator) -> None:
     assert find_layers(*thin_shell(8000, rng, wall=0.06)) is None
 
