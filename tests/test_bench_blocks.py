@@ -36,12 +36,15 @@ def test_the_benchmark_measures(tmp_path: Path, capsys: pytest.CaptureFixture[st
     report, picture = tmp_path / "blocks.json", tmp_path / "blocks.png"
     words = ["--counts", "1500", "--quality", "draft", "--resolution", "24"]
     assert blocks([*words, "--json", str(report), "--picture", str(picture)]) == ExitCode.OK
-    (run,) = json.loads(report.read_text())["runs"]
-    assert run["jump"]["value"] < 1e-5
-    assert run["to_truth"]["mean"] < 1.0
-    assert run["missed"] < 0.2
-    assert run["memory_mb"]["together"] >= run["memory_mb"]["own"] > 200
-    assert run["guarantee"] == "closed, oriented 2-manifold"
+    whole, run = json.loads(report.read_text())["runs"]
+    assert (whole["blocks"], run["blocks"]) == (False, True)
+    assert whole["missed"] != run["missed"]
+    for one in (whole, run):
+        assert one["jump"]["value"] < 1e-5
+        assert one["to_truth"]["mean"] < 1.0
+        assert one["missed"] < 0.2
+        assert one["memory_mb"]["together"] >= one["memory_mb"]["own"] > 200
+        assert one["guarantee"] == "closed, oriented 2-manifold"
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert "processor seconds for 100,000 points" in capsys.readouterr().out
 

@@ -127,7 +127,8 @@ def _offset(local: Float, facing: Float) -> float | None:
         return None
     upper, quadric, offset, remaining = _twice(same)
     balance = min(upper.mean(), 1 - upper.mean())
-    if offset < _LEAST_OFFSET or balance < _BALANCE or offset < _SEPARATION * remaining or not _mixed(same[:, :2], upper):
+    least = max(_LEAST_OFFSET, _SEPARATION * remaining)
+    if offset < least or balance < _BALANCE or not _mixed(same[:, :2], upper):
         return None
     back = local[inside & (facing < -_FACING)]
     heights = back[:, 2] - _columns(back) @ quadric

@@ -1,4 +1,7 @@
-"""Reconstructions of growing scans by blocks: time and memory for the points, seams, and distance from the truth."""
+"""Reconstructions of growing scans by blocks: time and memory for the points, seams, and distance from the truth.
+
+Scans that are small enough to be fitted in one piece by themselves are measured so, too, beside their blocks.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,11 @@ from benchmarks.engine.plot import require_matplotlib
 from benchmarks.provenance import provenance
 from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode, OutputError, UsageError
+from gnrecon.fit.large import LARGE
 
 COUNTS = (100_000, 300_000, 1_000_000, 2_000_000)
 THREADS = 2
+IN_ONE = "in one piece"
 _ROWS = (
     (("seconds_per_100k",), "processor seconds for 100,000 points", "{:.0f}"),
     (("cpu_seconds",), "processor seconds, all processes", "{:.0f}"),
@@ -61,13 +66,15 @@ def main(arguments: Sequence[str]) -> int:
     report: dict[str, Any] = provenance("blocks", arguments) | {"runs": []}
     console = Console(highlight=False)
     for count in sorted(chosen.counts):
-        console.print(f"bench: {count:,} points", style="dim")
-        report["runs"].append({"points": count} | _one(count, chosen))
+        for blocks in (False, True) if count < LARGE else (True,):
+            console.print(f"bench: {count:,} points{'' if blocks else f', {IN_ONE}'}", style="dim")
+            report["runs"].append({"points": count, "blocks": blocks} | _one(count, blocks, chosen))
     if chosen.json:
         write_text(chosen.json, json.dumps(report, indent=2) + "\n", overwrite=True)
     measured = [run for run in report["runs"] if "error" not in run]
-    if chosen.picture and measured:
-        draw(measured, chosen.picture)
+    by_blocks = [run for run in measured if run["blocks"]]
+    if chosen.picture and by_blocks:
+        draw(by_blocks, chosen.picture)
     console.print(table(report["runs"]))
     return ExitCode.OK if len(measured) == len(report["runs"]) else ExitCode.BATCH
 
@@ -75,9 +82,9 @@ def main(arguments: Sequence[str]) -> int:
 def table(runs: Sequence[dict[str, Any]]) -> Table:
     """Return the figures, a column a scan."""
     shown = Table(caption="A process of its own each, and what that starts; memory counts shared pages once.")
-    shown.add_column("")
+    shown.add_column("", no_wrap=True)
     for run in runs:
-        shown.add_column(f"{run['points']:,}", justify="right")
+        shown.add_column(f"{run['points']:,}{'' if run['blocks'] else f'\n{IN_ONE}'}", justify="right")
     for keys, label, form in _ROWS:
         shown.add_row(label, *(_cell(run, keys, form) for run in runs))
     return shown
@@ -93,12 +100,12 @@ def _cell(run: dict[str, Any], keys: tuple[str, ...], form: str) -> str:
     return form.format(found)
 
 
-def _one(count: int, chosen: argparse.Namespace) -> dict[str, Any]:
+def _one(count: int, blocks: bool, chosen: argparse.Namespace) -> dict[str, Any]:
     with TemporaryDirectory(prefix="gnrecon-bench-") as temporary:
         options = {"quality": chosen.quality, "threads": THREADS} | (
             {} if chosen.resolution is None else {"resolution": chosen.resolution}
         )
-        job = {"points": count, "options": options}
+        job = {"points": count, "blocks": blocks, "options": options}
         figures = run_program("benchmarks.blocks.measure", job, 1, Path(temporary) / "job")
     if "cpu_seconds" in figures:
         figures["seconds_per_100k"] = figures["cpu_seconds"] / count * 1e5

@@ -1,6 +1,6 @@
 """One reconstruction of a ball in a process of its own: ``python -m benchmarks.blocks.measure FOLDER``.
 
-The folder holds job.json (points, options); it receives the scan, the work folder, mesh.ply and figures.json.
+The folder holds job.json (points, blocks, options); it receives the scan, the work folder, mesh.ply and figures.json.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ def _pss(process: psutil.Process) -> float:
         return 0.0
 
 
-def measure(folder: Path, points: int, options: dict[str, Any]) -> dict[str, Any]:
-    """Reconstruct the scan of so many points and return the figures."""
+def measure(folder: Path, points: int, blocks: bool, options: dict[str, Any]) -> dict[str, Any]:
+    """Reconstruct the scan of so many points, by blocks or as its size has it, and return the figures."""
     ball, scan = Ball(points), folder / "scan.ply"
     write_cloud(ball.scan(), scan, overwrite=True)
     start, before = time.perf_counter(), _processor_seconds()
     with TreeMemory() as memory:
-        result = reconstruct(scan, work_dir=str(folder / "work"), **options)
+        result = reconstruct(scan, work_dir=str(folder / "work") if blocks else None, **options)
         result.save(folder / "mesh.ply", overwrite=True)
     seconds, cpu = time.perf_counter() - start, _processor_seconds() - before
     result.sdf.save(folder / "field.gnr", overwrite=True)
@@ -132,7 +132,7 @@ def jump(sdf: NeuralSDF, vertices: Float) -> dict[str, float]:
 def main(folder: Path) -> None:
     """Measure the job in a folder."""
     job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
-    figures = measure(folder, job["points"], job["options"])
+    figures = measure(folder, job["points"], job["blocks"], job["options"])
     (folder / "figures.json").write_text(json.dumps(figures, indent=2), encoding="utf-8")
 
 
