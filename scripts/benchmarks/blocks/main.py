@@ -84,7 +84,8 @@ def table(runs: Sequence[dict[str, Any]]) -> Table:
     shown = Table(caption="A process of its own each, and what that starts; memory counts shared pages once.")
     shown.add_column("", no_wrap=True)
     for run in runs:
-        shown.add_column(f"{run['points']:,}{'' if run['blocks'] else f'\n{IN_ONE}'}", justify="right")
+        heading = f"{run['points']:,}"
+        shown.add_column(heading if run["blocks"] else f"{heading}\n{IN_ONE}", justify="right")
     for keys, label, form in _ROWS:
         shown.add_row(label, *(_cell(run, keys, form) for run in runs))
     return shown
