@@ -43,7 +43,7 @@ LEAST_NOISE = 1e-3
 FIRST = 2
 """Number of the length that is tried first."""
 
-PATCHES, HELD_NEAR = 10, 20
+PATCHES, HELD_NEAR = 20, 20
 """Patches, and how many left-out points each of them predicts."""
 
 SPARSE = 20_000
@@ -51,7 +51,7 @@ SPARSE = 20_000
 where many scans do not quite match, distances alone are least for a field that winds through all of them."""
 
 MOST_POINTS = 2500
-FEATURES = 700
+FEATURES = 300
 LEAST_SLOPE = 0.05
 BEYOND = 1.5
 """How far a patch's data reaches beyond what it predicts, in lengths."""

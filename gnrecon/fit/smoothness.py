@@ -16,7 +16,7 @@ import torch
 
 from gnrecon.cloud import Samples
 from gnrecon.field.features import DEGREES_OF_FREEDOM, Features
-from gnrecon.fit.choose import Mask
+from gnrecon.fit.choose import SPARSE, Mask
 from gnrecon.fit.patch import Patch, PatchSystem
 from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.start import Spectrum
@@ -82,7 +82,7 @@ def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random
     out = np.flatnonzero(held)[:POINTS]
     left, turned = scene.tensor(samples.points[out]), scene.tensor(samples.normals[out])
     # Estimated ones are means of their neighbours', which smooth fields predict too well.
-    reaches = REACHES[:1] if samples.estimated else REACHES
+    reaches = REACHES[:1] if samples.estimated and len(samples) <= SPARSE else REACHES
     best = []
     for length in LENGTHS:
         system, scores = PatchSystem(patch, features, length, SIZE), []

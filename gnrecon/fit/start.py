@@ -33,6 +33,9 @@ from gnrecon.linalg.metric import identity
 
 RIDGE = 1e-8
 ROUNDS = 3
+WRONG_WEIGHT = 5
+"""How much more a sample counts that an earlier round gave the wrong sign: without it, horns grow on sparse scans."""
+
 ATTEMPTS = 6
 
 OMEGA = 4.0
@@ -97,6 +100,7 @@ def wide_start(
             trial, expected = scene.volume(3 * scene.volume_count, rng)
             value = field.value(theta, scene.tensor(trial)).cpu().numpy()
             wrong = np.flatnonzero(value * np.sign(expected) <= 0)[: scene.volume_count // 2]
+            wrong = np.repeat(wrong, WRONG_WEIGHT)
             x, distance = np.concatenate([x, trial[wrong]]), np.concatenate([distance, expected[wrong]])
     return theta
 

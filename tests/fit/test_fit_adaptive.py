@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import InputError
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, adaptive, fit
-from gnrecon.fit.choose import LENGTHS, Leftover, _smoothest, choose
+from gnrecon.fit.choose import ANGLES, LENGTHS, POSITIONS, Leftover, _smoothest, choose
 from gnrecon.fit.detail import left_over
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
@@ -176,11 +176,10 @@ def test_estimated_normals_do_not_smooth_ripples_away() -> None:
     radius = np.linalg.norm(samples.points, axis=1)
     smooth = radius - 0.8, samples.points / radius[:, None]
     held = rng.random(len(samples)) < 0.15
-    heeding, free = (
-        choose(Leftover(samples.points, normals, *smooth, estimated), held, 0.03, np.random.default_rng(1))
-        for estimated in (False, True)
-    )
-    assert free.angle > heeding.angle or free.position < heeding.position
+    free = choose(Leftover(samples.points, normals, *smooth, True), held, 0.03, np.random.default_rng(1))
+    # The points are believed, and the normals are not.
+    assert free.angle == max(ANGLES)
+    assert free.position == pytest.approx(min(POSITIONS) * 0.03)
 
 
 def test_scans_that_do_not_match_are_not_wound_through() -> None:
