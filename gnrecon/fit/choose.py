@@ -43,15 +43,18 @@ LEAST_NOISE = 1e-3
 FIRST = 2
 """Number of the length that is tried first."""
 
-PATCHES, HELD_NEAR = 20, 20
-"""Patches, and how many left-out points each of them predicts."""
+PATCHES, DENSE_PATCHES, HELD_NEAR = 10, 20, 20
+"""Patches, those of a dense scan, and how many left-out points each of them predicts."""
+
+DENSE = 8000
+"""Points beyond which patches are more, of fewer features; those of smaller scans would share what they predict."""
 
 SPARSE = 20_000
 """Points up to which estimated normals are not heeded; those of denser scans are means over little of the surface, and
 where many scans do not quite match, distances alone are least for a field that winds through all of them."""
 
 MOST_POINTS = 2500
-FEATURES = 300
+FEATURES, DENSE_FEATURES = 700, 300
 LEAST_SLOPE = 0.05
 BEYOND = 1.5
 """How far a patch's data reaches beyond what it predicts, in lengths."""
@@ -171,11 +174,12 @@ class _Trials:
     @classmethod
     def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> _Trials:
         out = np.flatnonzero(held)
-        chosen = rng.choice(len(leftover), min(PATCHES, len(leftover)), replace=False)
+        patches, count = (DENSE_PATCHES, DENSE_FEATURES) if len(leftover) > DENSE else (PATCHES, FEATURES)
+        chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(HELD_NEAR, len(out)) + 1))
         near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
-        features = Features.draw(FEATURES, rng, torch.zeros(0, dtype=torch.float64, device=device))
+        features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = leftover.points[chosen]
         return cls(leftover, radius, features, centers, list(out[near]), held, device)
 
