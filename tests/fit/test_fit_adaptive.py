@@ -176,7 +176,11 @@ def test_estimated_normals_do_not_smooth_ripples_away() -> None:
     radius = np.linalg.norm(samples.points, axis=1)
     smooth = radius - 0.8, samples.points / radius[:, None]
     held = rng.random(len(samples)) < 0.15
-    free = choose(Leftover(samples.points, normals, *smooth, True), held, 0.03, np.random.default_rng(1))
+    heeding, free = (
+        choose(Leftover(samples.points, normals, *smooth, estimated), held, 0.03, np.random.default_rng(1))
+        for estimated in (False, True)
+    )
+    assert free.angle > heeding.angle or free.position < heeding.position
     # The points are believed, and the normals are not.
     assert free.angle == max(ANGLES)
     assert free.position == pytest.approx(min(POSITIONS) * 0.03)
