@@ -8,20 +8,19 @@ installed at that moment: nothing is registered, and nothing is kept.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from gnrecon.errors import GnreconError, UsageError
+from gnrecon.foreign import guarded, told
 
 READERS, WRITERS, RESIDUALS = "gnrecon.readers", "gnrecon.writers", "gnrecon.residuals"
 KINDS = {READERS: "reader", WRITERS: "writer", RESIDUALS: "residual"}
 """Groups of entry points, and what each holds."""
 
 _log = logging.getLogger(__name__)
-_LONGEST = 200
 
 
 @dataclass(frozen=True)
@@ -56,34 +55,21 @@ class Plugin:
         except MemoryError:
             raise
         except (Exception, SystemExit) as error:
-            raise UsageError(f"{_capital(self)} cannot be loaded ({_told(error)}).") from error
+            raise UsageError(f"{_capital(self)} cannot be loaded ({told(error)}).") from error
         if not callable(found):
             raise UsageError(f"{_capital(self)} is {type(found).__name__!r}, which cannot be called.")
         _log.info("Loaded %s.", self)
         return found
 
-    @contextmanager
-    def guarded(self, kind: type[GnreconError]) -> Iterator[None]:
-        """Run a block of the package's own code; whatever goes wrong in it is one sentence.
-
-        Failures of gnrecon's own kinds, want of memory, and what the system says of a file come through as they are.
+    def guarded(self, kind: type[GnreconError]) -> AbstractContextManager[None]:
+        """Guard a block of the package's own code; whatever goes wrong in it is one sentence.
 
         Raises
         ------
         GnreconError
-            Of the given kind, when the block fails in any other way.
+            Of the given kind, when the block fails by its own fault; see `gnrecon.foreign.guarded`.
         """
-        try:
-            yield
-        except (GnreconError, MemoryError):
-            raise
-        except OSError as error:
-            if error.errno is not None:
-                raise
-            raise kind(f"{self.subject} failed ({_told(error)}).") from error
-        except (Exception, SystemExit) as error:
-            _log.info("%s failed.", _capital(self), exc_info=True)
-            raise kind(f"{self.subject} failed ({_told(error)}).") from error
+        return guarded(kind, lambda error: f"{self.subject} failed ({told(error)}).")
 
     @property
     def subject(self) -> str:
@@ -116,8 +102,3 @@ def find(group: str, name: str) -> Plugin | None:
 
 def _capital(plugin: Plugin) -> str:
     return str(plugin).replace("the", "The", 1)
-
-
-def _told(error: BaseException) -> str:
-    said = " ".join(str(error).split())[:_LONGEST]
-    return f"{type(error).__name__}{': ' if said else ''}{said}"

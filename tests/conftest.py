@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before torch, numpy or open3d is imported, because they read this once: tests must not crowd a shared machine.
@@ -14,6 +15,8 @@ os.environ.setdefault("MKL_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
 import hypothesis
 import numpy as np
 import pytest
+from other_packages import acme_scan, install_acme, packages
+from scan_files import torus
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -41,3 +44,19 @@ def shared_data() -> Path:
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """A random generator seeded by the test's name: every test has its own numbers, and the same ones each time."""
     return np.random.default_rng(zlib.crc32(request.node.nodeid.encode()))
+
+
+@pytest.fixture
+def acme_site(tmp_path: Path) -> Iterator[Path]:
+    """A folder of installed packages, with one that reads and writes."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    with packages(folder):
+        install_acme(folder)
+        yield folder
+
+
+@pytest.fixture
+def acme_ring(tmp_path: Path) -> Path:
+    """A scan in a format of that package."""
+    return acme_scan(tmp_path / "ring.acme", *torus(1200, np.random.default_rng(3)))

@@ -18,6 +18,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # From the ground up; a room imports from lower rows and from itself, never from its neighbours in the row.
 ROWS = [
     {"errors", "version", "system_packages"},
+    {"foreign"},
     {
         "cloud",
         "mesh",
@@ -50,6 +51,7 @@ ROWS = [
     {"run"},
     {"commands"},
     {"batch", "doctor"},
+    {"arguments"},
     {"cli"},
     {"__main__", "__init__"},
 ]

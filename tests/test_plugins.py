@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from other_packages import ACME, acme_scan, install, install_acme, packages
+from other_packages import ACME, install, packages
 from scan_files import torus
 
 from gnrecon.cloud import Frame, Samples
@@ -24,48 +24,33 @@ from gnrecon.residuals import SecondOrder, eikonal, interface, mean_curvature, n
 TETRA = Mesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Path]:
-    """A folder of installed packages, with one that reads and writes."""
-    folder = tmp_path / "site"
-    folder.mkdir()
-    with packages(folder):
-        install_acme(folder)
-        yield folder
-
-
-@pytest.fixture
-def scan(tmp_path: Path) -> Path:
-    return acme_scan(tmp_path / "ring.acme", *torus(1200, np.random.default_rng(3)))
-
-
-@pytest.mark.usefixtures("site")
-def test_a_reader_is_found_and_its_cloud_comes_back(scan: Path) -> None:
+@pytest.mark.usefixtures("acme_site")
+def test_a_reader_is_found_and_its_cloud_comes_back(acme_ring: Path) -> None:
     assert "acme" not in sys.modules
     points, normals = torus(1200, np.random.default_rng(3))
-    for path in (scan, scan.with_suffix(".acme.gz")):
-        path.write_bytes(gzip.compress(scan.read_bytes()) if path.suffix == ".gz" else scan.read_bytes())
+    for path in (acme_ring, acme_ring.with_suffix(".acme.gz")):
+        path.write_bytes(gzip.compress(acme_ring.read_bytes()) if path.suffix == ".gz" else acme_ring.read_bytes())
         cloud = read_cloud(path)
         np.testing.assert_array_equal(cloud.points, points)
         np.testing.assert_array_equal(cloud.normals, normals)
         np.testing.assert_array_equal(cloud.attributes["heat"], points[:, 2])
-    scan.rename(scan.with_suffix(".bin"))
-    assert len(read_cloud(scan.with_suffix(".bin"), format="acme")) == 1200
+    acme_ring.rename(acme_ring.with_suffix(".bin"))
+    assert len(read_cloud(acme_ring.with_suffix(".bin"), format="acme")) == 1200
 
 
-@pytest.mark.usefixtures("site")
-def test_a_scan_of_another_package_is_reconstructed_as_any_other(scan: Path) -> None:
+@pytest.mark.usefixtures("acme_site")
+def test_a_scan_of_another_package_is_reconstructed_as_any_other(acme_ring: Path) -> None:
     few = {"widths": (200,), "steps": 0, "resolution": 24}
-    found = reconstruct(scan, **few)
+    found = reconstruct(acme_ring, **few)
     plain = reconstruct(*torus(1200, np.random.default_rng(3)), **few)
     np.testing.assert_array_equal(found.mesh.vertices, plain.mesh.vertices)
     assert "heat" in found.mesh.attributes
-    path = scan.with_name("mesh.acmesh")
+    path = acme_ring.with_name("mesh.acmesh")
     assert found.save(path) == []
     np.testing.assert_array_equal(read_mesh(path).vertices, found.mesh.vertices)
 
 
-@pytest.mark.usefixtures("site")
+@pytest.mark.usefixtures("acme_site")
 def test_what_is_built_in_stays(tmp_path: Path) -> None:
     write_mesh(TETRA, tmp_path / "ball.ply")
     assert len(read_mesh(tmp_path / "ball.ply").faces) == len(TETRA.faces)
@@ -142,13 +127,13 @@ def test_a_broken_writer_leaves_no_file(tmp_path: Path, name: str) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
 
 
-def test_several_packages_for_one_name_are_refused(site: Path, scan: Path) -> None:
-    install(site, "rival", ACME, readers={"acme": "read"}, residuals={"thin": "read"})
+def test_several_packages_for_one_name_are_refused(acme_site: Path, acme_ring: Path) -> None:
+    install(acme_site, "rival", ACME, readers={"acme": "read"}, residuals={"thin": "read"})
     with pytest.raises(UsageError, match=r"offer a reader 'acme': the package (acme|rival) 1.2 and the package (r|a)"):
-        read_cloud(scan)
+        read_cloud(acme_ring)
 
 
-@pytest.mark.usefixtures("site")
+@pytest.mark.usefixtures("acme_site")
 def test_what_is_installed_is_named_where_nothing_fits(tmp_path: Path) -> None:
     (tmp_path / "scan.docx").write_text("0 0 0\n")
     with pytest.raises(InputError, match=r"'.docx' is not supported; expected one of ply.*, conf, acme, acmesh, lossy"):

@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import CommandLine, ball
-from other_packages import acme_scan, install, install_acme, packages
-from scan_files import torus
+from other_packages import install, packages
 
 from gnrecon.errors import ExitCode
 from gnrecon.io import write_mesh
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Path]:
-    """A folder of installed packages, with one that reads and writes."""
-    folder = tmp_path / "site"
-    folder.mkdir()
-    with packages(folder):
-        install_acme(folder)
-        yield folder
-
-
-@pytest.fixture
-def scan(tmp_path: Path) -> Path:
-    return acme_scan(tmp_path / "ring.acme", *torus(1200, np.random.default_rng(3)))
 
 
 @pytest.fixture
@@ -35,7 +17,7 @@ def here(capfd: pytest.CaptureFixture[str]) -> CommandLine:
     return CommandLine(capfd)
 
 
-@pytest.mark.usefixtures("site")
+@pytest.mark.usefixtures("acme_site")
 def test_a_written_file_is_read_back_where_a_reader_exists(tmp_path: Path, here: CommandLine) -> None:
     write_mesh(ball(), tmp_path / "ball.obj")
     assert here("convert", tmp_path / "ball.obj", tmp_path / "ball.acmesh").returncode == 0
@@ -47,12 +29,12 @@ def test_a_written_file_is_read_back_where_a_reader_exists(tmp_path: Path, here:
     assert "ball.acme-only was not read back and verified, because nothing that is installed reads" in done.stderr
 
 
-@pytest.mark.usefixtures("site")
-def test_a_mesh_that_a_writer_spoils_is_not_written(scan: Path, here: CommandLine) -> None:
+@pytest.mark.usefixtures("acme_site")
+def test_a_mesh_that_a_writer_spoils_is_not_written(acme_ring: Path, here: CommandLine) -> None:
     words = ("--widths", "200", "--steps", "0", "--resolution", "24")
-    here.refuses(ExitCode.MESH, "is open", scan, "-o", scan.with_name("mesh.lossy"), *words, "-q")
-    assert sorted(path.name for path in scan.parent.iterdir()) == ["ring.acme", "site"]
-    done = here(scan, "-o", scan.with_name("mesh.acme-only"), *words)
+    here.refuses(ExitCode.MESH, "is open", acme_ring, "-o", acme_ring.with_name("mesh.lossy"), *words, "-q")
+    assert sorted(path.name for path in acme_ring.parent.iterdir()) == ["ring.acme", "site"]
+    done = here(acme_ring, "-o", acme_ring.with_name("mesh.acme-only"), *words)
     assert done.returncode == 0
     assert "was not read back and verified" in done.stderr
 
