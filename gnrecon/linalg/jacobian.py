@@ -26,6 +26,8 @@ Block = Sequence[LayerRows]
 
 CHUNK_BYTES = 64_000_000
 TILE = 1024
+FILLED = 0.9
+"""Share of a block's rows below which those of zeros are left out of J^T J."""
 
 
 class Jacobian(Protocol):
@@ -239,8 +241,11 @@ class LayeredJacobian:
 
     def dense(self) -> Iterator[Tensor]:
         """Yield chunks of rows, in the precision in which the factors are stored, of at most `CHUNK_BYTES`."""
+        return self._dense(self.blocks())
+
+    def _dense(self, blocks: Iterable[Block]) -> Iterator[Tensor]:
         buffer: Tensor | None = None
-        for block in self.blocks():
+        for block in blocks:
             if buffer is None:
                 item = block[0].left.element_size()
                 length = max(64, CHUNK_BYTES // max(item * self.columns, 1))
@@ -256,7 +261,7 @@ class LayeredJacobian:
 
     def gram(self) -> Tensor:
         """Return J^T J, its lower triangle valid."""
-        return gram(self.dense(), self.columns, self._zeros(0))
+        return gram(self._dense(map(_filled, self.blocks())), self.columns, self._zeros(0))
 
     def group_grams(self) -> list[Tensor]:
         """Return the layers' blocks of J^T J, each with a valid lower triangle."""
@@ -320,6 +325,16 @@ class LayeredJacobian:
                 blocks.append([layer.take(inside) for layer in block])
             start = stop
         return LayeredJacobian(lambda: blocks, len(rows), self.group_sizes, self.device, self.dtype, self.stored)
+
+
+def _filled(block: Block) -> Block:
+    """Return a block without its rows of zeros, such as those of constraints that do not act, if there are many."""
+    filled = torch.zeros(len(block[0]), dtype=torch.bool, device=block[0].left.device)
+    for layer in block:
+        for factor in (layer.left, *(right for right, _ in layer.pairs)):
+            filled |= (factor != 0).any(1)
+    rows = filled.nonzero()[:, 0]
+    return block if len(rows) > FILLED * len(filled) else [layer.take(rows) for layer in block]
 
 
 def _stored(block: Block) -> torch.dtype:

@@ -91,7 +91,7 @@ class FrozenProblem:
         residuals = [free.new_zeros(0)]
         for term in self.terms:
             for points, target in self._pieces(free, term):
-                jet = self.network.curved_jet(free, points)
+                jet = self._jet(free, term.residual, points, 1)
                 linear = self._linearised(free, term, jet, target, points)
                 residuals.append((linear.residual * term.scale).T.flatten())
                 blocks += _rows(jet, linear, term.scale)
@@ -118,9 +118,12 @@ class FrozenProblem:
     def _evaluated(
         self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, target: Tensor | None
     ) -> Linearised:
-        order = 2 if isinstance(residual, SecondOrder) else 1
-        layers = self.network.layout.layers(free)
-        return evaluate(residual, CurvedJet.of(layers, self.network.activation, points, order), target)
+        return evaluate(residual, self._jet(free, residual, points, 0), target)
+
+    def _jet(self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, further: int) -> CurvedJet:
+        """Return the field with the derivatives that a residual takes, and `further` ones for its rows."""
+        order = (2 if isinstance(residual, SecondOrder) else 1) + further
+        return CurvedJet.of(self.network.layout.layers(free), self.network.activation, points, order)
 
     def _pieces(self, free: Tensor, term: FrozenTerm) -> Iterator[tuple[Tensor, Tensor | None]]:
         """Yield points, and targets, chunk by chunk; surface points where they have gone at `free`."""

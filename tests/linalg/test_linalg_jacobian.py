@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import pytest
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gnrecon.linalg import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
 from gnrecon.linalg import jacobian as module
+from gnrecon.linalg.gram import gram
 
 Made = tuple[Jacobian, Tensor]
 
@@ -126,6 +127,23 @@ def test_blocks_are_made_afresh_for_each_product() -> None:
     close(jacobian.mv(torch.ones(J.shape[1], dtype=F64)), J.sum(1), F64)
     close(jacobian.tmv(torch.ones(len(J), dtype=F64)), J.sum(0), F64)
     assert len(calls) == 2
+
+
+def test_rows_of_zeros_are_not_multiplied(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, J = layered(5, [(20, True), (8, False)])
+    acting = torch.arange(28) % 4 == 0
+    acting[20:] = True
+    scales = [part.to(F64) for part in acting.split([20, 8])]
+    blocks = [[layer.times(s) for layer in block] for block, s in zip(whole.blocks(), scales, strict=True)]
+    jacobian = LayeredJacobian(lambda: blocks, whole.rows, whole.group_sizes, whole.device)
+    multiplied: list[int] = []
+
+    def counted(chunks: Iterable[Tensor], size: int, like: Tensor) -> Tensor:
+        return gram((multiplied.append(len(chunk)) or chunk for chunk in chunks), size, like)
+
+    monkeypatch.setattr(module, "gram", counted)
+    close(jacobian.gram().tril(), (J[acting].T @ J[acting]).tril(), F64)
+    assert multiplied == [5, 8]
 
 
 @pytest.mark.parametrize("tangents", [True, False])
