@@ -331,8 +331,9 @@ def _filled(block: Block) -> Block:
     """Return a block without its rows of zeros, such as those of constraints that do not act, if there are many."""
     filled = torch.zeros(len(block[0]), dtype=torch.bool, device=block[0].left.device)
     for layer in block:
-        for factor in (layer.left, *(right for right, _ in layer.pairs)):
-            filled |= (factor != 0).any(1)
+        filled |= layer.left.any(1)
+        for right, tangents in layer.pairs:
+            filled |= right.any(1) & tangents.any(1)
     rows = filled.nonzero()[:, 0]
     return block if len(rows) > FILLED * len(filled) else [layer.take(rows) for layer in block]
 
