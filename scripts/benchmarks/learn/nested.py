@@ -28,10 +28,30 @@ def nested_step(problem: FrozenProblem, theta: Tensor, damping: float) -> Tensor
     KeyError
         When a term's name has no formula here.
     """
+    system = Cholesky().linearise(*_linearised(problem, theta), identity)
+    return system.solve(damping).direction
+
+
+def papers_step(problem: FrozenProblem, theta: Tensor, damping: float) -> Tensor:
+    """Return the same step, solved as the paper does: J^T J + eps I multiplied out, then least squares by QR.
+
+    Raises
+    ------
+    KeyError
+        When a term's name has no formula here.
+    """
+    jacobian, residual = _linearised(problem, theta)
+    matrix = jacobian.matrix
+    damped = matrix.T @ matrix + damping * torch.eye(matrix.shape[1], dtype=matrix.dtype)
+    found: Tensor = torch.linalg.lstsq(damped, (matrix.T @ residual)[:, None], driver="gels").solution
+    return -found[:, 0]
+
+
+def _linearised(problem: FrozenProblem, theta: Tensor) -> tuple[DenseJacobian, Tensor]:
+    """Return J and r."""
     parts = [_rows(problem, theta, term) for term in problem.terms]
     matrix, residual = (torch.cat(columns) for columns in zip(*parts, strict=True))
-    system = Cholesky().linearise(DenseJacobian(matrix), residual, identity)
-    return system.solve(damping).direction
+    return DenseJacobian(matrix), residual
 
 
 def _rows(problem: FrozenProblem, theta: Tensor, term: FrozenTerm) -> tuple[Tensor, Tensor]:
