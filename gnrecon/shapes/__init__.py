@@ -8,7 +8,7 @@ from gnrecon.shapes.learned import LearnedField, mesh_of
 from gnrecon.shapes.measure import Measurement
 from gnrecon.shapes.minimal import catenoid, enneper, minimal_surface
 from gnrecon.shapes.part import bracket
-from gnrecon.shapes.problem import ShapeProblem, circle, cube, plane_through, z_cylinder, z_plane
+from gnrecon.shapes.problem import Pretraining, ShapeProblem, circle, cube, plane_through, z_cylinder, z_plane
 from gnrecon.shapes.scanned import ScannedSurface, scanned
 from gnrecon.shapes.term import Drawn, Moment, Term, at_points, fading, in_box, on_surface, rising
 
@@ -23,6 +23,7 @@ __all__ = [
     "LearnedField",
     "Measurement",
     "Moment",
+    "Pretraining",
     "ScannedSurface",
     "ShapeProblem",
     "Term",

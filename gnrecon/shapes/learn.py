@@ -19,22 +19,25 @@ import numpy as np
 from torch import Tensor
 
 from gnrecon.errors import FitError, UsageError
-from gnrecon.optim import LBFGS, Adam, GaussNewton, Optimiser, Problem, Search, Solution, StopRule
+from gnrecon.optim import LBFGS, Adam, GaussNewton, Optimiser, Problem, Solution, StopRule
 from gnrecon.shapes.learned import LearnedField
 from gnrecon.shapes.measure import Measurement, measure
 from gnrecon.shapes.pretrain import pretrained
 from gnrecon.shapes.problem import ShapeProblem
 
-OPTIMISERS: dict[str, Callable[[Search, float], Optimiser]] = {
-    "gn": lambda search, rate: GaussNewton(search),  # noqa: ARG005 (one signature for all)
-    "lbfgs": lambda search, rate: LBFGS(),  # noqa: ARG005
-    "adam": lambda search, rate: Adam(rate),  # noqa: ARG005
+OPTIMISERS: dict[str, Callable[[ShapeProblem, float], Optimiser]] = {
+    "gn": lambda problem, rate: GaussNewton(problem.search, problem.solver()),  # noqa: ARG005 (one signature for all)
+    "lbfgs": lambda problem, rate: LBFGS(),  # noqa: ARG005
+    "adam": lambda problem, rate: Adam(rate),  # noqa: ARG005
 }
-"""Makes each optimiser by its name, with the problem's step control for Gauss-Newton and a learning rate for Adam."""
+"""Makes each optimiser by its name, for a problem and with a learning rate for Adam."""
 
 MOST_STEPS = 10**6
 FIRST, GROWTH = 5.0, 1.5
 """Seconds or steps to the first measurement, and the factor from one to the next."""
+
+PRETRAINING = 0.25
+"""Share of the budget within which the network must have become the start."""
 
 Heard = Callable[[Measurement], None]
 
@@ -132,11 +135,9 @@ def learn(
         raise UsageError("A positive budget of seconds or number of steps must say when the run ends.")
     rng = np.random.default_rng(seed)
     run = _Run(problem, rng, seed, budget is None, heard)
-    theta = pretrained(problem, seed, rng)
+    theta = pretrained(problem, seed, rng, None if budget is None else PRETRAINING * budget)
     run.note(0, theta)
-    return _finished(
-        run, theta, _solved(run, theta, OPTIMISERS[optimiser](problem.search, learning_rate), budget, steps)
-    )
+    return _finished(run, theta, _solved(run, theta, OPTIMISERS[optimiser](problem, learning_rate), budget, steps))
 
 
 def _solved(run: _Run, theta: Tensor, method: Optimiser, budget: float | None, steps: int | None) -> Solution:

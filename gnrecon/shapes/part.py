@@ -13,8 +13,10 @@ The paper asks for f >= 0 outside of the region, which leaves sheets far from th
 whose points are few. The signed distance of a part within the region is at least that of the region, so half of that is
 no more than what the eikonal term asks for.
 
-It begins as the signed distance of the region itself. The problem is posed in unit coordinates, in which half the
-longest side of the region's box is one.
+It begins as a part that the region holds and the interfaces bound: the region itself, worn off to a depth that falls
+to nothing at the interfaces. A network that is fitted to that, and to the interfaces and their normals, is far nearer
+to a feasible part than one that is fitted to the region's distance alone. The problem is posed in unit coordinates, in
+which half the longest side of the region's box is one.
 
 What is outside of the region is asked of points drawn near its border as well as in the whole box, and of a layer just
 within the border too (`MARGIN`), so that what is left of the term's residual lies within the region. An interface may
@@ -29,7 +31,7 @@ import numpy as np
 import torch
 
 from gnrecon.cloud import Float
-from gnrecon.design import Design
+from gnrecon.design import Design, InterfaceSample
 from gnrecon.field import Network
 from gnrecon.field.activation import WAVELET
 from gnrecon.levelset import Beside, Joints, LevelSet, Region, joints
@@ -42,10 +44,10 @@ from gnrecon.residuals import (
     signed_distance,
     surface_strain,
 )
-from gnrecon.shapes.problem import ShapeProblem
+from gnrecon.shapes.problem import Pretraining, ShapeProblem
 from gnrecon.shapes.term import LAST, Drawn, Moment, Sampler, Term, at_points, in_box, on_surface
 
-NETWORK = Network((24, 24), WAVELET, (6.0, 2.0))
+NETWORK = Network((24, 24), WAVELET, (14.0, 4.0))
 """The paper's has 2 x 32 wavelets; a step's cost grows with the fourth power of the width."""
 
 STRAIN, EIKONAL, INTERFACE, NORMAL, REGION, CONNECTED = 1e-4, 0.1, 100.0, 1.0, 1e4, 1e3
@@ -72,8 +74,14 @@ BESIDE = 0.02
 CELLS = 64
 """Cells along the longest side of the grid on which components are found, as in the paper."""
 
-FAR = 0.05
+FAR = 0.08
 """Distance from which on points are simply far from interfaces."""
+
+EROSION = 0.04
+"""Depth within the region's border at which the part begins, but for what is near to an interface, where it is less."""
+
+FIRST_STEPS, FIRST_POINTS, FIRST_INTERFACE, FIRST_NORMAL = 120, 4000, 3.0, 3e-3
+"""Of the pretraining: most steps, points of the distance, and the weights of the interfaces beside it."""
 
 NECK = 0.02
 """How far beyond zero f should be where components are joined, or removed."""
@@ -92,11 +100,13 @@ def bracket(design: Design, seed: int = 0, clip: float | None = None, network: N
     rng = np.random.default_rng(seed)
     walls = design.interfaces.sample(POOL, rng)
     off_walls = _off(walls.points)
+    around = design.region.around(POOL, rng)
+    distance = design.region.distance(around)
     strain = surface_strain if clip is None else clipped_strain(clip)
     return ShapeProblem(
         "bracket",
         (
-            Term("design region", design_region, _outside(design, off_walls, rng), REGION),
+            Term("design region", design_region, _outside(around, distance, off_walls), REGION),
             Term("interface", interface, at_points(walls.points, count=ON_INTERFACES), INTERFACE),
             Term("normal", normal_vector, at_points(walls.points, walls.normals, count=ON_INTERFACES), NORMAL),
             Term("surface strain", strain, _free_surface(off_walls), STRAIN),
@@ -104,9 +114,28 @@ def bracket(design: Design, seed: int = 0, clip: float | None = None, network: N
             Term("eikonal", eikonal, in_box(IN_BOX), EIKONAL),
         ),
         design.region.box,
-        lambda x: torch.as_tensor(design.region.distance(x.numpy())),
+        lambda x: torch.as_tensor(design.region.distance(x.numpy()) + _depth(off_walls(x.numpy()))),
         network or NETWORK,
+        pretraining=_pretraining(around, distance + _depth(off_walls(around)), walls),
     )
+
+
+def _depth(off_walls: Float) -> Float:
+    """Return how deep the region is worn off, of shape (N,), at distances of shape (N,) from the interfaces."""
+    share = np.minimum(off_walls / FAR, 1.0)
+    depth: Float = EROSION * share**2 * (3 - 2 * share)
+    return depth
+
+
+def _pretraining(points: Float, start: Float, walls: InterfaceSample) -> Pretraining:
+    """Return the fit of the start's values, of shape (N,), at points of shape (N, 3), and of the interfaces."""
+    terms = (
+        Term("start", signed_distance, at_points(points, start, FIRST_POINTS)),
+        Term("interface", interface, at_points(walls.points, count=ON_INTERFACES), FIRST_INTERFACE),
+        Term("normal", normal_vector, at_points(walls.points, walls.normals, count=ON_INTERFACES), FIRST_NORMAL),
+    )
+    # Fresh points make the loss rise and fall, which is no sign of its end.
+    return Pretraining(terms, FIRST_STEPS, tolerance=0.0, patience=FIRST_STEPS)
 
 
 def _off(walls: Float) -> Callable[[Float], Float]:
@@ -120,11 +149,9 @@ def _off(walls: Float) -> Callable[[Float], Float]:
     return lambda points: tree.query(points, distance_upper_bound=FAR)[0]
 
 
-def _outside(design: Design, off_walls: Callable[[Float], Float], rng: np.random.Generator) -> Sampler:
+def _outside(around: Float, distance: Float, off_walls: Callable[[Float], Float]) -> Sampler:
     """Return a sampler of points that are to be outside of the part; those far outside of it are counted, not drawn."""
-    around = design.region.around(POOL, rng)
     layer = np.minimum(MARGIN, off_walls(around) / 4)
-    distance = design.region.distance(around)
     kept = distance > -layer
     pool, least = torch.as_tensor(around[kept]), torch.as_tensor(CLEARANCE * np.maximum(distance[kept], 0.0))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gnrecon.cloud import Float
 from gnrecon.field import TANH, Network
 from gnrecon.levelset import KnownSurface, LevelSet
-from gnrecon.linalg import identity
+from gnrecon.linalg import Cholesky, LinearSolver, identity
 from gnrecon.optim import GainRatioDamping, Search
 from gnrecon.sampling import Box
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
@@ -29,6 +29,23 @@ Start = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
+class Pretraining:
+    """What a network is fitted to before a problem's own terms.
+
+    Parameters
+    ----------
+    terms : constraints whose points do not depend on the field, the values of a start among them
+    steps : most steps
+    tolerance, patience : of `gnrecon.optim.StopRule`
+    """
+
+    terms: tuple[Term, ...]
+    steps: int
+    tolerance: float = 0.02
+    patience: int = 3
+
+
+@dataclass(frozen=True)
 class ShapeProblem:
     """What is asked of a surface.
 
@@ -42,6 +59,8 @@ class ShapeProblem:
     known : the solution, where it is known, to measure against
     shown : the part of the box that is meshed, by default all of it
     search : step control of Gauss-Newton
+    solver : makes Gauss-Newton's linear solver, which may keep what it knows from step to step
+    pretraining : how the network becomes the start, by default from its values in the box
     """
 
     name: str
@@ -52,6 +71,8 @@ class ShapeProblem:
     known: KnownSurface | None = None
     shown: Box | None = None
     search: Search = CAUTIOUS
+    solver: Callable[[], LinearSolver] = Cholesky
+    pretraining: Pretraining | None = None
 
     def level_set(self, theta: Tensor) -> LevelSet:
         """Return the zero level of the network with parameters theta, of shape (p,)."""
@@ -59,8 +80,10 @@ class ShapeProblem:
             lambda x: self.network.value(theta, x), lambda x: self.network.value_and_gradient(theta, x), self.box
         )
 
-    def freeze(self, step: int, theta: Tensor, rng: np.random.Generator) -> FrozenProblem:
-        """Draw the points of a step; terms that weigh nothing at it are left out.
+    def freeze(
+        self, step: int, theta: Tensor, rng: np.random.Generator, terms: tuple[Term, ...] | None = None
+    ) -> FrozenProblem:
+        """Draw the points of a step, of some terms or by default all; what weighs nothing at it is left out.
 
         Raises
         ------
@@ -68,7 +91,7 @@ class ShapeProblem:
             When a term needs points of the surface and there is none.
         """
         moment = Moment(step, self.level_set(theta), rng)
-        weighed = [(term, term.weight_at(step)) for term in self.terms]
+        weighed = [(term, term.weight_at(step)) for term in (self.terms if terms is None else terms)]
         return self._frozen(theta, [(term, term.sampler(moment), weight) for term, weight in weighed if weight > 0.0])
 
     def _frozen(self, theta: Tensor, drawn: list[tuple[Term, Drawn, float]]) -> FrozenProblem:

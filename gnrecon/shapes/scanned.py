@@ -21,18 +21,21 @@ from torch import Tensor
 from gnrecon.cloud import Samples
 from gnrecon.field import Network
 from gnrecon.field.activation import SINE
-from gnrecon.linalg import layer_scaled
+from gnrecon.linalg import Auto, layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance
 from gnrecon.shapes.problem import ShapeProblem, Start
-from gnrecon.shapes.term import Term, at_points, in_box
+from gnrecon.shapes.term import Term, at_points, growing, in_box
 
 NETWORK = Network((32, 32, 32), SINE, (8.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
 
-POINTS, IN_BOX = 3000, 1000
-"""Most points of each term at each step."""
+FIRST_POINTS, GROWTH, IN_BOX = 1500, 1.25, 1000
+"""Points of each term at the first step, their growth from step to step until all are used, and those in the box."""
+
+ENERGY = 0.3
+"""Error at which conjugate gradients stop, where there are so many rows that they solve for the steps."""
 
 MARGIN = 0.2
 """The paper's: how far the box reaches beyond the scan, in radii."""
@@ -75,14 +78,16 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     """
     normals = samples.normals
     terms = (
-        Term("interface", interface, at_points(samples.points, count=POINTS)),
-        Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
+        Term("interface", interface, at_points(samples.points, count=growing(FIRST_POINTS, GROWTH))),
+        Term("normal", normal_projection, at_points(samples.points, normals, count=growing(FIRST_POINTS, GROWTH))),
         Term("eikonal", eikonal, in_box(IN_BOX), lambda step: max(EIKONAL * FALL ** min(step, 100), LEAST), 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))
     search = GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True)
     box = Box.around(samples.points, MARGIN)
-    return ShapeProblem(name, terms, box, _coarse(samples, seed), NETWORK, known, search=search)
+    return ShapeProblem(
+        name, terms, box, _coarse(samples, seed), NETWORK, known, search=search, solver=lambda: Auto(ENERGY)
+    )
 
 
 def _coarse(samples: Samples, seed: int) -> Start:

@@ -88,7 +88,11 @@ class Term:
         return self.weight(step) if callable(self.weight) else self.weight
 
 
-def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count: int | None = None) -> Sampler:
+Count = Callable[[int], int]
+"""Gives the number of points at a step of a number, from 1."""
+
+
+def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count: int | Count | None = None) -> Sampler:
     """Return a sampler of known points, of shape (N, 3), with targets or without; `count` of them at each step.
 
     Without a count, all are used each time.
@@ -97,9 +101,10 @@ def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count
     values = None if targets is None else torch.as_tensor(np.asarray(targets, dtype=np.float64))
 
     def draw(moment: Moment) -> Drawn:
-        if count is None or count >= len(known):
+        wanted = count(moment.step) if callable(count) else count
+        if wanted is None or wanted >= len(known):
             return Drawn(known, values)
-        rows = torch.as_tensor(np.sort(moment.rng.permutation(len(known))[:count]))
+        rows = torch.as_tensor(np.sort(moment.rng.permutation(len(known))[:wanted]))
         return Drawn(known[rows], None if values is None else values[rows])
 
     return draw
@@ -127,6 +132,11 @@ def on_surface(count: int, nodes: int = NODES) -> Sampler:
         return Drawn(sample.points, on_surface=True)
 
     return draw
+
+
+def growing(first: int, factor: float) -> Count:
+    """Return a number of points that grows by a factor a step."""
+    return lambda step: int(first * factor ** min(step - 1, 100))
 
 
 def rising(weight: float, hold: int, factor: float, most: float) -> Weight:

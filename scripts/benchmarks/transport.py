@@ -99,9 +99,7 @@ def run(problem: ShapeProblem, start: Tensor, steps: int, seed: int) -> list[Ten
         return problem.freeze(number, theta, rng)
 
     last = (
-        OPTIMISERS["gn"](problem.search, 0.0)
-        .run(problem_at, start, StopRule(steps, tolerance=0.0, patience=steps + 1))
-        .theta
+        OPTIMISERS["gn"](problem, 0.0).run(problem_at, start, StopRule(steps, tolerance=0.0, patience=steps + 1)).theta
     )
     return [*seen, last]
 
