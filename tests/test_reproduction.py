@@ -20,7 +20,7 @@ def test_an_experiment_is_run_once_and_drawn(tmp_path: Path, capfd: pytest.Captu
     assert "cone by gn" in capfd.readouterr().err
     made = {path.name for path in tmp_path.iterdir()}
     runs = {f"cone-{name}.{end}" for name in ("gn", "lbfgs", "adam") for end in ("ply", "json", "png")}
-    assert made == runs | {"convergence.png", "table.csv", "table.md"}
+    assert made == runs | {"convergence.png", "surfaces.png", "table.csv", "table.md"}
     rows = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
     assert [row["optimiser"] for row in rows] == ["gn", "lbfgs", "adam"]
     assert rows[0]["authors"] == "5e-11"
@@ -43,5 +43,5 @@ def test_missing_data_is_one_sentence(tmp_path: Path, capfd: pytest.CaptureFixtu
 
 def test_colours_are_white_at_zero() -> None:
     mesh = Mesh(np.zeros((3, 3)), np.zeros((0, 3), dtype=int))
-    colors = coloured(mesh, np.array([-1.0, 0.0, 1.0])).attributes["colors"]
+    colors = coloured(mesh, np.array([-2.0, 0.0, 1.0]), 1.0).attributes["colors"]
     assert colors.tolist() == [list(LOW), list(MIDDLE), list(HIGH)]

@@ -17,7 +17,7 @@ from gnrecon.atomic import write_text
 from gnrecon.commands.learn import LearnOptions
 from gnrecon.errors import ExitCode, GnreconError
 from reproduction.experiments import PROBLEMS, Experiment, experiments, interrupted
-from reproduction.figures import draw_convergence, draw_surface
+from reproduction.figures import draw_convergence, draw_surfaces
 from reproduction.table import as_csv, as_markdown
 
 
@@ -48,8 +48,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _draw(done: Sequence[Experiment], folder: Path) -> None:
     draw_convergence(done, folder / "convergence.png")
-    for one in done:
-        draw_surface(one, one.mesh.with_suffix(".png"))
+    draw_surfaces(done, folder)
     write_text(folder / "table.csv", as_csv(done), overwrite=True)
     write_text(folder / "table.md", as_markdown(done), overwrite=True)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from benchmarks.sheet import Row, draw_row, write_sheet
 
 from gnrecon.export import render
 from gnrecon.io import read_mesh
@@ -20,6 +21,10 @@ CURVATURES = {"cone": "gauss_curvature"}
 
 SHOWN = 98.0
 """Percentile of the absolute curvature at which the colours end."""
+
+VIEW = (35.0, 25.0)
+UP = {"bunny": "y", "bunny-sparse": "y", "rockerarm": "y"}
+"""Azimuth and elevation of the pictures, and the upward axis where it is not z."""
 
 LOW, MIDDLE, HIGH = (33, 102, 172), (247, 247, 247), (178, 24, 43)
 
@@ -52,17 +57,31 @@ def _curve(axes: Any, figures: dict[str, Any], quantity: str, label: str) -> Non
     axes.grid(alpha=0.3)
 
 
-def draw_surface(one: Experiment, path: Path) -> None:
-    """Write a PNG file of a learned surface, coloured by its curvature: blue below zero, red above."""
-    mesh = read_mesh(one.mesh)
-    values = np.asarray(mesh.attributes[CURVATURES.get(one.problem, "mean_curvature")], dtype=np.float64)
-    render(coloured(mesh, values), path, size=(700, 560))
+def draw_surfaces(done: Sequence[Experiment], folder: Path) -> None:
+    """Write a PNG file of each learned surface, coloured by its curvature, and ``surfaces.png`` of all of them.
+
+    Blue is below zero, red above. The colours of one problem's surfaces end at the same curvature, the median of what
+    each would end at by itself, so that they can be compared.
+    """
+    rows = []
+    for problem in dict.fromkeys(one.problem for one in done):
+        runs = [one for one in done if one.problem == problem]
+        meshes = [read_mesh(one.mesh) for one in runs]
+        curvature = CURVATURES.get(problem, "mean_curvature")
+        values = [np.asarray(mesh.attributes[curvature], dtype=np.float64) for mesh in meshes]
+        most = float(np.median([np.nanpercentile(np.abs(value), SHOWN) for value in values]))
+        shown = [coloured(mesh, value, most) for mesh, value in zip(meshes, values, strict=True)]
+        for one, mesh in zip(runs, shown, strict=True):
+            render(mesh, one.mesh.with_suffix(".png"), size=(700, 560), views=[VIEW], up=UP.get(problem, "z"))
+        titles = [f"{problem}, {NAMES[one.optimiser]}" for one in runs]
+        titles[0] += f"; full colour at {most:.0e}"
+        rows.append(draw_row(Row(dict(zip(titles, shown, strict=True)), UP.get(problem, "z"), VIEW)))
+    write_sheet(rows, folder / "surfaces.png")
 
 
-def coloured(mesh: Mesh, values: npt.NDArray[np.float64]) -> Mesh:
-    """Return a mesh with colours of values of shape (V,), white at zero."""
-    most = max(float(np.nanpercentile(np.abs(values), SHOWN)), np.finfo(np.float64).tiny)
-    share = np.clip(np.nan_to_num(values) / most, -1, 1)[:, None]
+def coloured(mesh: Mesh, values: npt.NDArray[np.float64], most: float) -> Mesh:
+    """Return a mesh with colours of values of shape (V,), white at zero and full from `most` on."""
+    share = np.clip(np.nan_to_num(values) / max(most, np.finfo(np.float64).tiny), -1, 1)[:, None]
     ends = np.where(share < 0, LOW, HIGH)
     colors = np.rint(np.array(MIDDLE) * (1 - np.abs(share)) + ends * np.abs(share))
     return mesh.with_attributes({"colors": colors.astype(np.uint8)})
