@@ -89,7 +89,7 @@ def fit_large(
         work = Work.begin(place, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
         missing = [number for number in range(count) if not work.done(number)]
-        if scheduler is not None:
+        if scheduler is not None and missing:
             solve_scheduled(work, missing, scheduler, part(advance, CHOSEN, 1.0))
         else:
             # As many as torch has threads, which is what was asked for, or the machine's cores.

@@ -125,7 +125,10 @@ def test_a_cluster_that_loses_a_worker_changes_no_digit(
         assert same(whole, parts)
         # What is there is not solved again, and what cannot be solved is said.
         monkeypatch.setattr(scheduled, "RETRIES", 0)
+        (folder / "block-000001.npz").unlink()
         assert same(whole, fitted(folder, 150, cluster.scheduler_address)[1])
+        # Where nothing is left to do, nobody is asked.
+        assert same(whole, fitted(folder, 150, "tcp://127.0.0.1:9")[1])
         (folder / "block-000000.npz").unlink()
         (folder / "normals.npy").unlink()
         with pytest.raises(FitError, match=r"The cluster could not solve a block: .*normals\.npy"):
