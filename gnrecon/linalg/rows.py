@@ -60,6 +60,11 @@ class LayerRows:
         """Return the columns of the parameters that lead into the given output units, of shape (k,)."""
         return _of(self.left[:, units], self.inputs, [(right[:, units], tangents) for right, tangents in self.pairs])
 
+    def to(self, stored: torch.dtype) -> LayerRows:
+        """Return the rows in another precision, or as they are."""
+        pairs = [(right.to(stored), tangents.to(stored)) for right, tangents in self.pairs]
+        return _of(self.left.to(stored), self.inputs.to(stored), pairs)
+
     def take(self, rows: Tensor | slice) -> LayerRows:
         """Return some of the rows."""
         pairs = [(right[rows], tangents[rows]) for right, tangents in self.pairs]

@@ -59,11 +59,13 @@ class FrozenProblem:
     network : Network
     terms : the constraints on their points
     theta : parameters, of shape (p,), at which the points were drawn
+    stored : precision of the Jacobian's rows
     """
 
     network: Network
     terms: Sequence[FrozenTerm]
     theta: Tensor
+    stored: torch.dtype = torch.float64
 
     def free(self) -> Tensor:
         """Return the parameters, of shape (p,)."""
@@ -94,10 +96,10 @@ class FrozenProblem:
                 jet = self._jet(free, term.residual, points, 1)
                 linear = self._linearised(free, term, jet, target, points)
                 residuals.append((linear.residual * term.scale).T.flatten())
-                blocks += _rows(jet, linear, term.scale)
+                blocks += [[layer.to(self.stored) for layer in block] for block in _rows(jet, linear, term.scale)]
         residual = torch.cat(residuals)
         sizes = tuple(out * (into + 1) for out, into in self.network.layout.shapes)
-        return LayeredJacobian(lambda: blocks, len(residual), sizes, free.device), residual
+        return LayeredJacobian(lambda: blocks, len(residual), sizes, free.device, stored=self.stored), residual
 
     def _residuals(self, free: Tensor, term: FrozenTerm) -> Iterator[Tensor]:
         for points, target in self._pieces(free, term):

@@ -60,6 +60,7 @@ class ShapeProblem:
     shown : the part of the box that is meshed, by default all of it
     search : step control of Gauss-Newton
     solver : makes Gauss-Newton's linear solver, which may keep what it knows from step to step
+    stored : precision of the Jacobian's rows; products of float32 are faster, and end what undamped steps can reach
     pretraining : how the network becomes the start, by default from its values in the box
     """
 
@@ -72,6 +73,7 @@ class ShapeProblem:
     shown: Box | None = None
     search: Search = CAUTIOUS
     solver: Callable[[], LinearSolver] = Cholesky
+    stored: torch.dtype = torch.float64
     pretraining: Pretraining | None = None
 
     def level_set(self, theta: Tensor) -> LevelSet:
@@ -99,7 +101,7 @@ class ShapeProblem:
             FrozenTerm(term.name, term.residual, points.points, points.target, weight * points.share, points.on_surface)
             for term, points, weight in drawn
         ]
-        return FrozenProblem(self.network, terms, theta)
+        return FrozenProblem(self.network, terms, theta, self.stored)
 
 
 def cube(half: float) -> Box:

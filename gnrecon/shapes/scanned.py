@@ -31,8 +31,8 @@ from gnrecon.shapes.term import Term, at_points, growing, in_box
 NETWORK = Network((32, 32, 32), SINE, (8.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
 
-FIRST_POINTS, GROWTH, IN_BOX = 1500, 1.25, 1000
-"""Points of each term at the first step, their growth from step to step until all are used, and those in the box."""
+POINTS, IN_BOX = growing(1500, 1.25, 8000), 1000
+"""Points of each term at each step, and those in the box."""
 
 ENERGY = 0.3
 """Error at which conjugate gradients stop, where there are so many rows that they solve for the steps."""
@@ -78,15 +78,23 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     """
     normals = samples.normals
     terms = (
-        Term("interface", interface, at_points(samples.points, count=growing(FIRST_POINTS, GROWTH))),
-        Term("normal", normal_projection, at_points(samples.points, normals, count=growing(FIRST_POINTS, GROWTH))),
+        Term("interface", interface, at_points(samples.points, count=POINTS)),
+        Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
         Term("eikonal", eikonal, in_box(IN_BOX), lambda step: max(EIKONAL * FALL ** min(step, 100), LEAST), 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))
     search = GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True)
     box = Box.around(samples.points, MARGIN)
     return ShapeProblem(
-        name, terms, box, _coarse(samples, seed), NETWORK, known, search=search, solver=lambda: Auto(ENERGY)
+        name,
+        terms,
+        box,
+        _coarse(samples, seed),
+        NETWORK,
+        known,
+        search=search,
+        solver=lambda: Auto(ENERGY),
+        stored=torch.float32,
     )
 
 

@@ -134,9 +134,9 @@ def on_surface(count: int, nodes: int = NODES) -> Sampler:
     return draw
 
 
-def growing(first: int, factor: float) -> Count:
-    """Return a number of points that grows by a factor a step."""
-    return lambda step: int(first * factor ** min(step - 1, 100))
+def growing(first: int, factor: float, most: int) -> Count:
+    """Return a number of points that grows by a factor a step, up to the most; a measurement takes all points."""
+    return lambda step: step if step == LAST else int(min(most, first * factor ** min(step - 1, 100)))
 
 
 def rising(weight: float, hold: int, factor: float, most: float) -> Weight:

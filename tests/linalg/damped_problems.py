@@ -38,16 +38,6 @@ def multiplied_out(layer: LayerRows) -> Tensor:
     return torch.stack(rows) if rows else torch.zeros(0, layer.size, dtype=F64)
 
 
-def cast(layer: LayerRows, dtype: torch.dtype) -> LayerRows:
-    """The same rows in another precision."""
-    parts = (layer.left, layer.inputs, layer.right, layer.tangents)
-    left, inputs, right, tangents = (None if part is None else part.to(dtype) for part in parts)
-    assert left is not None
-    assert inputs is not None
-    further = tuple((right.to(dtype), tangents.to(dtype)) for right, tangents in layer.further)
-    return LayerRows(left, inputs, right, tangents, further)
-
-
 def layered(
     seed: int,
     rows: Sequence[tuple[int, int]] = ((9, 0), (14, 1), (1, 1), (5, 4)),
@@ -67,7 +57,7 @@ def layered(
             layer = layer_rows(generator, count, into, out, pairs).times(10.0 ** (-k) * torch.ones(count, dtype=F64))
             chosen = None if units is None else units[k]
             layer = layer if chosen is None else layer.into(torch.tensor(chosen, dtype=torch.long))
-            block.append(cast(layer, stored))
+            block.append(layer.to(stored))
         blocks.append(block)
     sizes = tuple(layer.size for layer in blocks[0])
     total = sum(count for count, _ in rows)
