@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from gnrecon.linalg.auto import Auto
+from gnrecon.linalg.averaged import Averaged
 from gnrecon.linalg.cholesky import Cholesky
 from gnrecon.linalg.gmres import gmres
 from gnrecon.linalg.iterative import Iterative
@@ -42,6 +43,7 @@ __all__ = [
     "QR",
     "SOLVERS",
     "Auto",
+    "Averaged",
     "Block",
     "BlockJacobi",
     "Cholesky",

@@ -39,6 +39,8 @@ class GainRatioDamping:
     initial_damping : of the first step
     metric : what the damping is measured in
     geodesic : whether steps bend with the residuals, at one more evaluation and solve a step
+    length : share of an accepted step that is gone; where points are fresh at each step and the residuals do not vanish
+        in the end, shorter steps average over more of them
     smallest : least damping
     trials : rejected steps after which there is no move
     """
@@ -46,6 +48,7 @@ class GainRatioDamping:
     initial_damping: float = 1e-3
     metric: Metric = jacobian_scaled
     geodesic: bool = False
+    length: float = 1.0
     smallest: float = 1e-12
     trials: int = 10
 
@@ -64,7 +67,10 @@ class GainRatioDamping:
                 if math.isfinite(loss) and gain > 0.0:
                     easing = max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3)
                     following = max(damping * easing, self.smallest)
-                    return Move(trial, loss, damping, gain, 1.0, following, iterations)
+                    if self.length < 1.0:
+                        trial = free + self.length * (trial - free)
+                        loss = loss_of(problem, trial)
+                    return Move(trial, loss, damping, gain, self.length, following, iterations)
             damping *= growth
             growth *= 2.0
         # Nothing helped here; the next step, with points of its own, begins not much above where this one did.

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gnrecon.linalg import (
     SOLVERS,
+    Averaged,
     DenseJacobian,
     Jacobian,
     LayeredJacobian,
@@ -259,3 +260,20 @@ def test_descriptions_are_sentences(solver: str) -> None:
     for sentence in (before, made.describe()):
         assert sentence.endswith(".")
         assert sentence[0].isupper()
+
+
+def test_the_averaged_matrix_is_the_mean_of_the_steps() -> None:
+    matrices = [torch.randn(9, 4, generator=torch.Generator().manual_seed(k), dtype=torch.float64) for k in range(4)]
+    residual = torch.arange(9.0, dtype=torch.float64)
+    solver = Averaged(keep=0.6)
+    means = [solver.linearise(DenseJacobian(J), residual, identity).product.tril() for J in matrices]
+    grams = [(J.T @ J).tril() for J in matrices]
+    torch.testing.assert_close(means[1], (grams[0] + grams[1]) / 2)
+    # The third counts two fifths, no longer a third.
+    torch.testing.assert_close(means[2], 0.6 * means[1] + 0.4 * grams[2])
+    step = solver.linearise(DenseJacobian(matrices[3]), residual, identity).solve(0.1).direction
+    mean = 0.6 * means[3] + 0.4 * grams[3]
+    damped = mean + mean.tril(-1).T + 0.1 * torch.eye(4, dtype=torch.float64)
+    torch.testing.assert_close(damped @ step, -(matrices[3].T @ residual))
+    other = DenseJacobian(torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(solver.linearise(other, residual[:3], identity).product, torch.eye(3).double())

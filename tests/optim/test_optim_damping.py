@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from least_squares import CASES, Plain, rosenbrock
 from scripted import Scripted, posed
@@ -31,6 +31,16 @@ def test_the_first_improvement_is_taken_and_eases_the_damping() -> None:
     assert move.gain_ratio == pytest.approx((system.loss - 1.0) / step.predicted)
     easing = max(1 / 3, 1 - (2 * min(move.gain_ratio, 1.0) - 1) ** 3)
     assert move.next_damping == pytest.approx(move.damping * easing)
+
+
+def test_a_share_of_the_accepted_step_is_gone() -> None:
+    search = GainRatioDamping(initial_damping=1e-2, length=0.25)
+    problem, system, theta = posed(search, [1.0, 2.0])
+    move = search.advance(problem, system, theta, 1e-2)
+    step = system.solve(move.damping)
+    torch.testing.assert_close(move.free, theta + 0.25 * step.direction)
+    assert (move.loss, move.length) == (2.0, 0.25)
+    assert move.gain_ratio == pytest.approx((system.loss - 1.0) / step.predicted), "that of the whole step"
 
 
 def test_it_gives_up_where_it_was() -> None:
@@ -94,6 +104,9 @@ def test_a_step_bends_by_the_second_derivative(seed: int, damping: float, metric
     # r_ss by differentiating twice
     r_ss = torch.einsum("nij,i,j->n", jacrev(jacrev(problem.inner.residual))(theta), s, s)
     a = -torch.linalg.solve(damped, J.T @ r_ss)
+    # Where it bends too much there is no trial: see test_a_trial_that_bends_too_much_is_refused.
+    D = search.metric(jacobian)
+    assume(float(D @ a.square()) < 0.5 * float(D @ s.square()))
     torch.testing.assert_close(problem.asked[-1] - theta - s, a / 2, rtol=1e-6, atol=1e-11)
 
 
