@@ -92,17 +92,20 @@ def fit_adaptive(
     if options.regularisers:
         sdf, shape = _shaped(first, samples, options, rng)
     rest = part(advance, SHARE, 1.0)
+    averaging = None
     try:
         if by_blocks:
             detail = fit_large(sdf, samples, held, options, rng, folder, rest, scheduler)
         else:
-            detail = fit_detail(sdf, samples, held, options.features, rng, options.device, rest, shape)
+            detail, averaging = fit_detail(sdf, samples, held, options.features, rng, options.device, rest, shape)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
     chosen = detail.as_dict(samples.frame.scale)
     told = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
     told += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
+    if averaging is not None:
+        told += f" Averaged noisy points over {averaging.width:g} of their disks' radii, where normals agree."
     status = (
         f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
         f"length {chosen['length']:.3g}, noise {chosen['position_noise']:.2g} in position and "

@@ -20,9 +20,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.cloud import Float
+from gnrecon.cloud import Float, Samples
 from gnrecon.field.features import Features
 from gnrecon.fit.patch import Belief, Patch, PatchSystem
+from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
 
 Mask = npt.NDArray[np.bool_]
@@ -73,6 +74,12 @@ class Leftover:
     gradient: Float
     estimated: bool = False
 
+    @classmethod
+    def of(cls, sdf: NeuralSDF, samples: Samples) -> Leftover:
+        """Return what a field leaves over at samples."""
+        value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
+        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -106,6 +113,14 @@ class Volume:
         return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
+@dataclass(frozen=True)
+class Choice:
+    """A belief, and the score of its length at each patch with each noise, of shape (patches, noises), in radii."""
+
+    belief: Belief
+    scores: Float
+
+
 def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
     """Return the belief that predicts left-out points best.
 
@@ -117,24 +132,7 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     rng : draws patches, features and what is left out
     device : a torch device
     """
-    trials = _Trials.draw(leftover, held, radius, rng, device)
-    scores: dict[int, Float] = {}
-
-    def least(number: int) -> float:
-        """Return the least score of a length, over the noises."""
-        if not 0 <= number < len(LENGTHS):
-            return np.inf
-        if number not in scores:
-            scores[number] = trials.scores(LENGTHS[number] * radius)
-        return float(scores[number].mean(axis=0).min())
-
-    at = FIRST
-    step = 1 if least(at + 1) < least(at) else -1
-    while least(at + step) < least(at):
-        at += step
-    number, choice = _smoothest(scores)
-    position, angle = trials.noises[choice]
-    return Belief(LENGTHS[number] * radius, position, angle)
+    return Trials.draw(leftover, held, radius, rng, device).choice().belief
 
 
 def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
@@ -160,10 +158,23 @@ def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class _Trials:
-    """Patches with what they are to predict."""
+class Trials:
+    """Patches with what they are to predict.
+
+    Parameters
+    ----------
+    leftover : what the patches are fitted to
+    told : what the left-out points say, whose rows are those of `leftover`
+    radius : of the disk that a point stands for, unit coordinates
+    features : of the patches
+    centers : of the patches, of shape (patches, 3)
+    predicted : rows of the left-out points that each patch predicts
+    held : mask of shape (N,), of the points that are left out
+    device : a torch device
+    """
 
     leftover: Leftover
+    told: Leftover
     radius: float
     features: Features
     centers: Float
@@ -172,7 +183,8 @@ class _Trials:
     device: str
 
     @classmethod
-    def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> _Trials:
+    def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> Trials:
+        """Draw the patches; parameters as those of `choose`."""
         out = np.flatnonzero(held)
         patches, count = (DENSE_PATCHES, DENSE_FEATURES) if len(leftover) > DENSE else (PATCHES, FEATURES)
         chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
@@ -181,7 +193,27 @@ class _Trials:
         near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = leftover.points[chosen]
-        return cls(leftover, radius, features, centers, list(out[near]), held, device)
+        return cls(leftover, leftover, radius, features, centers, list(out[near]), held, device)
+
+    def choice(self) -> Choice:
+        """Return the belief that predicts best."""
+        scores: dict[int, Float] = {}
+
+        def least(number: int) -> float:
+            """Return the least score of a length, over the noises."""
+            if not 0 <= number < len(LENGTHS):
+                return np.inf
+            if number not in scores:
+                scores[number] = self.scores(LENGTHS[number] * self.radius)
+            return float(scores[number].mean(axis=0).min())
+
+        at = FIRST
+        step = 1 if least(at + 1) < least(at) else -1
+        while least(at + step) < least(at):
+            at += step
+        number, noise = _smoothest(scores)
+        position, angle = self.noises[noise]
+        return Choice(Belief(LENGTHS[number] * self.radius, position, angle), scores[number])
 
     @cached_property
     def noises(self) -> list[tuple[float, float]]:
@@ -205,8 +237,8 @@ class _Trials:
             rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
         patch = self.leftover.patch(rows, center, Volume.none(), self.device)
         system = PatchSystem(patch, self.features, length, patch.size)
-        target = self.leftover.patch(predicted, center, Volume.none(), self.device)
-        normals = torch.as_tensor(self.leftover.normals[predicted], device=self.device)
+        target = self.told.patch(predicted, center, Volume.none(), self.device)
+        normals = torch.as_tensor(self.told.normals[predicted], device=self.device)
         return [self._score(system.solve(p, a), target, normals, length) for p, a in self.noises]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:

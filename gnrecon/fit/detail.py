@@ -21,7 +21,9 @@ from gnrecon.cloud import Float, Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
-from gnrecon.fit.choose import Int, Leftover, Mask, Volume, choose
+from gnrecon.fit.averaged import told
+from gnrecon.fit.bilateral import Averaging
+from gnrecon.fit.choose import Int, Leftover, Mask, Volume
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
@@ -58,8 +60,8 @@ def fit_detail(
     device: str,
     advance: Advance = unheard,
     shape: ShapingFor | None = None,
-) -> Detail:
-    """Return what to add to a global field.
+) -> tuple[Detail, Averaging | None]:
+    """Return what to add to a global field, and how the samples were averaged for it, if they were.
 
     Parameters
     ----------
@@ -72,8 +74,8 @@ def fit_detail(
     advance : told of the share that is done
     shape : gives what is asked of the surface besides, for the length of the detail
     """
-    leftover = left_over(sdf, samples)
-    belief = choose(leftover, held, leftover.density.radius, rng, device)
+    found = told(sdf, samples, held, rng, device)
+    samples, leftover, belief = found.samples, found.leftover, found.belief
     _log.info(
         "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",
         belief.length,
@@ -84,14 +86,8 @@ def fit_detail(
     advance(CHOSEN)
     coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
     shaping = None if shape is None else shape(belief.length)
-    return _Cubes.of(leftover, belief, features, rng, device, shaping).detail(sdf, coarse, rng, advance)
-
-
-def left_over(sdf: NeuralSDF, samples: Samples) -> Leftover:
-    """Return the values and gradients of a field at samples, in unit coordinates."""
-    points = samples.frame.to_world(samples.points)
-    value, gradient = sdf.sdf_and_gradient(points)
-    return Leftover(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
+    cubes = _Cubes.of(leftover, belief, features, rng, device, shaping)
+    return cubes.detail(sdf, coarse, rng, advance), found.averaging
 
 
 def cube_length(belief: Belief, disks: Float, radius: float) -> float:

@@ -25,7 +25,7 @@ from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Int, Partition
 from gnrecon.fit.choose import Leftover, Mask, choose
-from gnrecon.fit.detail import CELL, CHOSEN, left_over
+from gnrecon.fit.detail import CELL, CHOSEN
 from gnrecon.fit.dipoles import Dipoles
 from gnrecon.fit.octree import morton, octree_blocks
 from gnrecon.fit.options import FitOptions
@@ -77,7 +77,7 @@ def fit_large(
     FitError, MemoryLimitError
         When a block cannot be solved.
     """
-    leftover = left_over(sdf, samples)
+    leftover = Leftover.of(sdf, samples)
     belief = choose(leftover, held, leftover.density.radius, rng, options.device)
     advance(CHOSEN)
     like = torch.zeros(0, dtype=torch.float64, device=options.device)

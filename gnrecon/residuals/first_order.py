@@ -46,6 +46,19 @@ def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lin
     return Linearised(torch.where(within, excess, 0.0)[:, None], within.to(value)[:, None], None)
 
 
+def free_space(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The surface keeps away: f has its target's sign, and is not less in magnitude, r = min(0, sign(t) (f - t)).
+
+    Targets t are of shape (N,); what is nearer to zero, or beyond it, has a residual, and nothing else has.
+    """
+    del gradient
+    assert target is not None, "free space has targets"
+    sign = torch.sign(target)
+    short = sign * (value - target)
+    within = short < 0
+    return Linearised(torch.where(within, short, 0.0)[:, None], torch.where(within, sign, 0.0)[:, None], None)
+
+
 def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
     """The value is known: r = f - target, targets of shape (N,).
 

@@ -35,6 +35,8 @@ from gnrecon.design import Design, InterfaceSample
 from gnrecon.field import Network
 from gnrecon.field.activation import WAVELET
 from gnrecon.levelset import Beside, Joints, LevelSet, Region, joints
+from gnrecon.linalg import Averaged, identity
+from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import (
     clipped_strain,
     design_region,
@@ -45,27 +47,29 @@ from gnrecon.residuals import (
     surface_strain,
 )
 from gnrecon.shapes.problem import Pretraining, ShapeProblem
-from gnrecon.shapes.term import LAST, Drawn, Moment, Sampler, Term, at_points, in_box, on_surface
+from gnrecon.shapes.term import LAST, Drawn, Moment, Sampler, Term, at_points, in_box, on_surface, rising
 
 NETWORK = Network((24, 24), WAVELET, (14.0, 4.0))
 """The paper's has 2 x 32 wavelets; a step's cost grows with the fourth power of the width."""
 
-STRAIN, EIKONAL, INTERFACE, NORMAL, REGION, CONNECTED = 1e-4, 0.1, 100.0, 1.0, 1e4, 1e3
-"""Weights. The paper's are 1e-4, 1, 10, 10, 1e3 and 1e3; a slope of one everywhere costs the part its fit."""
+STRAIN, EIKONAL, NORMAL, CONNECTED = 1e-4, 0.1, 0.3, 1e3
+INTERFACE, REGION = rising(3e3, 60, 1.02, 1.5e4), rising(3e4, 60, 1.02, 1e6)
+"""Weights. The paper's are 1e-4, 1, 10, 1e3, 10 and 1e3; a slope of one everywhere costs the part its fit. The last two
+rise, as what a term leaves over where it acts falls with its weight, and at once they would tear the start apart."""
 
-ON_SURFACE, ON_INTERFACES, IN_BOX, AROUND = 600, 500, 600, 4000
+ON_SURFACE, ON_INTERFACES, IN_BOX, AROUND = 600, 1000, 600, 12_000
 """Points of each term at each step."""
 
 POOL = 100_000
 """Points around the region and on the interfaces that each step draws from, so that distances are computed once."""
 
-MARGIN = 0.01
+MARGIN, THINNER = 0.015, 0.33
 """Depth of the layer within the region's border that is kept free as well."""
 
 CLEARANCE = 0.5
 """Least value of f outside of the region, as a share of the distance from it; a distance would have all of it."""
 
-ACTIVE = 0.05
+ACTIVE = 0.015
 """Points outside of the region with a larger value than this have no residual, nor will have after the step."""
 
 BESIDE = 0.02
@@ -80,8 +84,11 @@ FAR = 0.08
 EROSION = 0.04
 """Depth within the region's border at which the part begins, but for what is near to an interface, where it is less."""
 
-FIRST_STEPS, FIRST_POINTS, FIRST_INTERFACE, FIRST_NORMAL = 120, 4000, 3.0, 3e-3
+FIRST_STEPS, FIRST_POINTS, FIRST_INTERFACE, FIRST_NORMAL = 120, 4000, 10.0, 3e-3
 """Of the pretraining: most steps, points of the distance, and the weights of the interfaces beside it."""
+
+KEEP, LENGTH = 0.8, 0.2
+"""Share of the former mean of J^T J in the next one, and of each step that is gone."""
 
 NECK = 0.02
 """How far beyond zero f should be where components are joined, or removed."""
@@ -116,6 +123,8 @@ def bracket(design: Design, seed: int = 0, clip: float | None = None, network: N
         design.region.box,
         lambda x: torch.as_tensor(design.region.distance(x.numpy()) + _depth(off_walls(x.numpy()))),
         network or NETWORK,
+        search=GainRatioDamping(initial_damping=0.1, metric=identity, length=LENGTH),
+        solver=lambda: Averaged(KEEP),
         pretraining=_pretraining(around, distance + _depth(off_walls(around)), walls),
     )
 
@@ -151,7 +160,7 @@ def _off(walls: Float) -> Callable[[Float], Float]:
 
 def _outside(around: Float, distance: Float, off_walls: Callable[[Float], Float]) -> Sampler:
     """Return a sampler of points that are to be outside of the part; those far outside of it are counted, not drawn."""
-    layer = np.minimum(MARGIN, off_walls(around) / 4)
+    layer = np.minimum(MARGIN, THINNER * off_walls(around))
     kept = distance > -layer
     pool, least = torch.as_tensor(around[kept]), torch.as_tensor(CLEARANCE * np.maximum(distance[kept], 0.0))
 

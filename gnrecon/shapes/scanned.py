@@ -3,7 +3,9 @@
 Its terms are f = 0 and n . grad f = 1 at the points, both of weight one, and the eikonal constraint in the box around
 them; the network has 3 x 32 sine units. The eikonal weight falls from the paper's 1e-2 to a hundredth of that within
 some thirteen steps, because it stands against the data, and the loss that is reported is that of points and normals,
-which the paper's figures are. The paper begins with a sphere; here it is the cloud's own coarse signed distance
+which the paper's figures are. One term is not the paper's: away from the points, where their winding number tells the
+sign, the field keeps it. Without that, steps that are as long as these leave sheets in the free space, of which neither
+loss nor points know. The paper begins with a sphere; here it is the cloud's own coarse signed distance
 (`sampling`), on features of more than one wavelength, so that there is no plateau.
 
 For a product's sake use `gnrecon.reconstruct`: it fits more finely, and holds the free space.
@@ -23,10 +25,10 @@ from gnrecon.field import Network
 from gnrecon.field.activation import SINE
 from gnrecon.linalg import Auto, layer_scaled
 from gnrecon.optim import GainRatioDamping
-from gnrecon.residuals import eikonal, interface, normal_projection
+from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance
 from gnrecon.shapes.problem import ShapeProblem, Start
-from gnrecon.shapes.term import Term, at_points, growing, in_box
+from gnrecon.shapes.term import Drawn, Moment, Sampler, Term, at_points, growing, in_box
 
 NETWORK = Network((32, 32, 32), SINE, (8.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
@@ -42,6 +44,13 @@ MARGIN = 0.2
 
 EIKONAL, FALL, LEAST = 1e-2, 0.7, 1e-4
 """Weight of the eikonal term to begin with, its factor from step to step, and the least."""
+
+FREE, POOL, IN_FREE, CLEAR = 1.0, 20_000, 4000, 0.05
+"""Weight of the free space, points of which its sign is known, those that are looked at in each step, and how far from
+the scan they are at least. Hardly any of them has a residual, so that it does not stand against the data."""
+
+STEEPNESS, DEEP = 0.3, 0.03
+"""Least magnitude of f there as a share of the distance, and the most that is asked."""
 
 
 @dataclass(frozen=True)
@@ -77,19 +86,21 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     seed : of the coarse distance
     """
     normals = samples.normals
+    box = Box.around(samples.points, MARGIN)
+    coarse = CoarseDistance(samples.points, normals, np.random.default_rng(seed))
     terms = (
         Term("interface", interface, at_points(samples.points, count=POINTS)),
         Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
         Term("eikonal", eikonal, in_box(IN_BOX), lambda step: max(EIKONAL * FALL ** min(step, 100), LEAST), 0.0),
+        Term("free space", free_space, _free(coarse, box, np.random.default_rng(seed)), FREE, 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))
     search = GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True)
-    box = Box.around(samples.points, MARGIN)
     return ShapeProblem(
         name,
         terms,
         box,
-        _coarse(samples, seed),
+        _start(coarse),
         NETWORK,
         known,
         search=search,
@@ -98,9 +109,26 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     )
 
 
-def _coarse(samples: Samples, seed: int) -> Start:
+def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler:
+    """Return a sampler of the points whose sign the field has lost; the others are counted, not drawn."""
+    pool = box.sample(POOL, rng)
+    known, signed, distance = coarse.at(pool)
+    clear = distance > CLEAR
+    points = torch.as_tensor(pool[known][clear])
+    least = torch.as_tensor(np.sign(signed[clear]) * np.minimum(STEEPNESS * np.abs(signed[clear]), DEEP))
+
+    def draw(moment: Moment) -> Drawn:
+        # A cloud of few points may leave nothing of the box so far from it that its sign is known.
+        rows = torch.as_tensor(moment.rng.integers(len(points), size=IN_FREE if len(points) else 0))
+        x, targets = points[rows], least[rows]
+        lost = targets.sign() * (moment.level_set.values(x) - targets) < 0
+        return Drawn(x[lost], targets[lost], share=float(lost.sum()) / IN_FREE)
+
+    return draw
+
+
+def _start(coarse: CoarseDistance) -> Start:
     """Return the coarse signed distance to a cloud, zero where it is too near to be known."""
-    coarse = CoarseDistance(samples.points, samples.normals, np.random.default_rng(seed))
 
     def start(x: Tensor) -> Tensor:
         known, signed, _ = coarse.at(x.numpy())

@@ -12,7 +12,6 @@ from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import InputError
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, adaptive, fit
 from gnrecon.fit.choose import ANGLES, LENGTHS, POSITIONS, Leftover, _smoothest, choose
-from gnrecon.fit.detail import left_over
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
 
@@ -211,7 +210,7 @@ def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
 
 def test_left_over_is_in_unit_coordinates(clean: tuple[Samples, NeuralSDF]) -> None:
     samples, sdf = clean
-    leftover = left_over(sdf.coarse(), samples)
+    leftover = Leftover.of(sdf.coarse(), samples)
     np.testing.assert_allclose(leftover.value * FRAME.scale, sdf.coarse().sdf(FRAME.to_world(samples.points)))
 
 

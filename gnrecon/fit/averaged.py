@@ -1,0 +1,133 @@
+"""Whether a scan's points are averaged before their detail is fitted, and how: what predicts left-out points better.
+
+The left-out points are as they were scanned, and the patches are the same, so that scores compare patch by patch. Only
+scans in which noise was found are tried.
+
+Some tens of patches tell a gain of less than their scatter from a loss no better than a coin does, so that it decides
+what is known of the shape beside them. Where faces meet at edges, the fit is better for averaging unless the patches
+contradict; anywhere else it smooths better by itself, unless they show that it does not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gnrecon.cloud import Float, Samples
+from gnrecon.fit.bilateral import Averaging
+from gnrecon.fit.choose import Choice, Leftover, Mask, Trials
+from gnrecon.fit.patch import Belief
+from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.sampling import Density
+
+_log = logging.getLogger(__name__)
+
+FIRST = Averaging(2.5, 0.4)
+"""What is tried first; only where it helps are the others."""
+
+OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4), Averaging(2.5, 0.2), Averaging(4.0, 0.2))
+
+NOISY = 0.05
+"""Least noise of the positions, in radii of a point's disk, with which points are averaged."""
+
+SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.6
+"""Lengths of the difference of two neighbours' normals: above the first there is an edge between them, up to the last,
+from which on they are the two sides of a sheet. Round shapes have more that differ by the second to the first."""
+
+EDGES, CLEARLY = 0.01, 3.0
+"""Least share of the neighbours with an edge between them where a shape has edges, and how often it is the others'."""
+
+BESIDE = 6
+"""Nearest neighbours of a point that are asked."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a fit of the detail is told.
+
+    Parameters
+    ----------
+    samples : averaged, or as they were
+    leftover : of a global field at the samples
+    belief : about them
+    averaging : how they were averaged, or None
+    """
+
+    samples: Samples
+    leftover: Leftover
+    belief: Belief
+    averaging: Averaging | None = None
+
+
+def told(sdf: NeuralSDF, samples: Samples, held: Mask, rng: np.random.Generator, device: str) -> Told:
+    """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
+
+    Parameters
+    ----------
+    sdf : the global field, in the samples' frame
+    samples : all of them
+    held : mask of shape (N,), of samples that the global field has not seen
+    rng : draws patches and features
+    device : a torch device
+    """
+    leftover = Leftover.of(sdf, samples)
+    radius = leftover.density.radius
+    trials = Trials.draw(leftover, held, radius, rng, device)
+    choice = trials.choice()
+    # Estimated normals are means over edges already.
+    if samples.estimated or choice.belief.position < NOISY * radius:
+        return Told(samples, leftover, choice.belief)
+
+    def with_kept(averaging: Averaging) -> Trials:
+        points, normals = samples.points.copy(), samples.normals.copy()
+        points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
+        return replace(trials, leftover=Leftover.of(sdf, replace(samples, points=points, normals=normals)))
+
+    found = _best(choice, with_kept, has_edges(*FIRST.of(samples.points, samples.normals)))
+    if found is None:
+        return Told(samples, leftover, choice.belief)
+    averaging, better = found
+    points, normals = averaging.of(samples.points, samples.normals)
+    samples = replace(samples, points=points, normals=normals)
+    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
+    return Told(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
+
+
+def has_edges(points: Float, normals: Float) -> bool:
+    """Return whether faces meet at edges, by points and unit normals, both of shape (N, 3), that have been averaged."""
+    near = Density(points).tree.query(points, list(range(2, min(len(points), BESIDE + 1) + 1)))[1]
+    apart = np.linalg.norm(normals[near] - normals[:, None], axis=2)
+    sharp, bent = (((low < apart) & (apart < high)).mean() for low, high in ((SHARP, OPPOSED), (FLAT, SHARP)))
+    return bool(sharp > EDGES and sharp > CLEARLY * bent)
+
+
+def _best(choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: bool) -> tuple[Averaging, Trials] | None:
+    """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
+
+    All are compared at the length that suits the points as they are; a better one is chosen afterwards.
+    """
+    plain = _of_best_noise(choice.scores)
+
+    def tried(averaging: Averaging) -> tuple[Float, Trials]:
+        trials = kept_averaged(averaging)
+        return plain - _of_best_noise(trials.scores(choice.belief.length)), trials
+
+    gain, trials = tried(FIRST)
+    doubt = gain.std() / np.sqrt(len(gain))
+    if not gain.mean() > (-doubt if edges else doubt):
+        return None
+    best, averaging = float(gain.mean()), FIRST
+    for other in OTHERS:
+        gain, of_other = tried(other)
+        if gain.mean() > best:
+            best, averaging, trials = float(gain.mean()), other, of_other
+    return averaging, trials
+
+
+def _of_best_noise(scores: Float) -> Float:
+    """Return the patches' scores, of shape (patches,), of the noise that is best on the mean of (patches, noises)."""
+    best: Float = scores[:, int(scores.mean(axis=0).argmin())]
+    return best
