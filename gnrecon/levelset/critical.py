@@ -20,6 +20,7 @@ from gnrecon.levelset.level_set import LevelSet
 _ITERATIONS = 12
 _REACH = 2.0
 _SMALL = 1e-6
+_DIGITS = 10
 
 
 def refined(level_set: LevelSet, nodes: Tensor, spacing: float, negative: int) -> Tensor:
@@ -45,7 +46,8 @@ def refined(level_set: LevelSet, nodes: Tensor, spacing: float, negative: int) -
         & (slope <= _SMALL * before.clamp_min(torch.finfo(before.dtype).tiny))
         & ((torch.linalg.eigvalsh(hessian) < 0).sum(1) == negative)
     )
-    return torch.where(found[:, None], points, nodes)
+    # The last digits of the linear solves depend on where arrays lie in memory, and a run should not.
+    return torch.where(found[:, None], points.round(decimals=_DIGITS), nodes)
 
 
 def _derivatives(level_set: LevelSet, points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:

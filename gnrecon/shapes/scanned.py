@@ -45,11 +45,11 @@ MARGIN = 0.2
 EIKONAL, FALL, LEAST = 1e-2, 0.7, 1e-4
 """Weight of the eikonal term to begin with, its factor from step to step, and the least."""
 
-FREE, POOL, IN_FREE, CLEAR = 1.0, 20_000, 4000, 0.05
+FREE, POOL, IN_FREE, CLEAR = 30.0, 60_000, 20_000, 0.05
 """Weight of the free space, points of which its sign is known, those that are looked at in each step, and how far from
 the scan they are at least. Hardly any of them has a residual, so that it does not stand against the data."""
 
-STEEPNESS, DEEP = 0.3, 0.03
+STEEPNESS, DEEP = 0.3, 0.05
 """Least magnitude of f there as a share of the distance, and the most that is asked."""
 
 

@@ -58,12 +58,12 @@ def drawn(problem: ShapeProblem, name: str, when: Moment) -> Drawn:
 def test_what_is_to_be_free_is_outside_or_just_within(problem: ShapeProblem, design: Design) -> None:
     found = drawn(problem, "design region", moment(problem, 1, shift=-0.5))
     distance = design.region.distance(found.points.numpy())
-    assert distance.min() > -0.011
+    assert distance.min() > -1.1 * part.MARGIN
     assert 0.02 < (distance < 0).mean() < 0.3
     # Half the distance is the least value, and the others are farther from the part than a step will take it.
     assert found.target is not None
     np.testing.assert_allclose(found.target, np.maximum(distance, 0) / 2, atol=1e-6)
-    assert (balls(found.points) - 0.5 - found.target < 0.05).all()
+    assert (balls(found.points) - 0.5 - found.target < part.ACTIVE).all()
     assert 0.1 < found.share < 1
 
 
@@ -73,7 +73,7 @@ def test_the_layer_within_the_border_leaves_the_interfaces_alone(problem: ShapeP
     walls = design.interfaces.sample(6000, np.random.default_rng(1)).points
     nearest = np.linalg.norm(found[:, None] - walls[None, ::3], axis=2).min(axis=1)
     inside = -design.region.distance(found)
-    assert (inside < nearest / 3 + 1e-3).all()
+    assert (inside < part.THINNER * nearest + 1e-3).all()
 
 
 def test_the_strain_is_that_of_the_free_surface(problem: ShapeProblem, design: Design) -> None:
