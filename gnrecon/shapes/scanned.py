@@ -45,9 +45,13 @@ MARGIN = 0.2
 EIKONAL, FALL, LEAST = 1e-2, 0.7, 1e-4
 """Weight of the eikonal term to begin with, its factor from step to step, and the least."""
 
-FREE, POOL, IN_FREE, CLEAR = 30.0, 60_000, 20_000, 0.05
-"""Weight of the free space, points of which its sign is known, those that are looked at in each step, and how far from
-the scan they are at least. Hardly any of them has a residual, so that it does not stand against the data."""
+FREE, POOL, IN_FREE = 30.0, 60_000, 20_000
+"""Weight of the free space, points of the box whose sign may be known, and those that are looked at in each step. Hardly
+any of them has a residual, so that it does not stand against the data."""
+
+CLEAR, CLEAR_DISKS = 0.05, 3.0
+"""Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
+sign of sparse points is a guess here and there."""
 
 STEEPNESS, DEEP = 0.3, 0.05
 """Least magnitude of f there as a share of the distance, and the most that is asked."""
@@ -112,7 +116,7 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
 def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler:
     """Return a sampler of the points whose sign the field has lost; the others are counted, not drawn."""
     pool = box.sample(POOL, rng)
-    known, signed, distance = coarse.at(pool)
+    known, signed, distance = coarse.at(pool, CLEAR_DISKS)
     clear = distance > CLEAR
     points = torch.as_tensor(pool[known][clear])
     least = torch.as_tensor(np.sign(signed[clear]) * np.minimum(STEEPNESS * np.abs(signed[clear]), DEEP))

@@ -20,6 +20,7 @@ Formula = Callable[[Tensor, Tensor, Tensor], Tensor]
 FORMULAS: dict[str, Formula] = {
     "interface": lambda f, _g, _t: f[None],
     "design_region": lambda f, _g, _t: torch.minimum(f, torch.zeros_like(f))[None],
+    "free_space": lambda f, _g, t: torch.minimum(torch.sign(t) * (f - t), torch.zeros_like(f))[None],
     "signed_distance": lambda f, _g, t: (f - t)[None],
     "normal_vector": lambda _f, g, t: g - t,
     "normal_projection": lambda _f, g, t: (g @ t)[None] - 1,
@@ -40,7 +41,7 @@ def by_name(name: str) -> Residual:
 def targets(name: str, generator: torch.Generator, count: int) -> Tensor | None:
     if name in ("interface", "design_region", "eikonal"):
         return None
-    if name == "signed_distance":
+    if name in ("signed_distance", "free_space"):
         return torch.randn(count, generator=generator, dtype=torch.float64)
     normals = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     return normals / normals.norm(dim=1, keepdim=True)
@@ -53,6 +54,15 @@ def test_a_design_region_may_ask_for_more_than_zero() -> None:
     torch.testing.assert_close(linear.residual[:, 0], torch.tensor([-0.2, -0.2, 0.0], dtype=torch.float64))
     assert linear.by_value is not None
     assert linear.by_value[:, 0].tolist() == [1.0, 1.0, 0.0]
+
+
+def test_free_space_has_two_sides() -> None:
+    value = torch.tensor([0.3, 0.1, -0.1, -0.1, 0.2], dtype=torch.float64)
+    least = torch.tensor([0.2, 0.2, 0.2, -0.2, -0.2], dtype=torch.float64)
+    linear = residuals.free_space(value, torch.zeros(5, 3, dtype=torch.float64), least)
+    torch.testing.assert_close(linear.residual[:, 0], torch.tensor([0, -0.1, -0.3, -0.1, -0.4], dtype=torch.float64))
+    assert linear.by_value is not None
+    assert linear.by_value[:, 0].tolist() == [0.0, 1.0, 1.0, -1.0, -1.0]
 
 
 def test_every_residual_is_tested() -> None:
@@ -91,16 +101,19 @@ def test_an_exact_distance_has_no_residual(name: str, seed: int) -> None:
     normals = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     normals = normals / normals.norm(dim=1, keepdim=True)
     distance = torch.zeros(20, dtype=torch.float64)
-    if name in ("signed_distance", "eikonal"):
+    if name in ("signed_distance", "free_space", "eikonal"):
         distance = torch.rand(20, generator=generator, dtype=torch.float64) - 0.2
     x = (center + (radius + distance)[:, None] * normals).requires_grad_()
     value = (x - center).norm(dim=1) - radius
     (gradient,) = torch.autograd.grad(value.sum(), x)
-    known = {"interface": None, "design_region": None, "eikonal": None, "signed_distance": distance}
+    known = dict.fromkeys(("interface", "design_region", "eikonal"), None) | dict.fromkeys(
+        ("signed_distance", "free_space"), distance
+    )
     target = known.get(name, normals)
     residual = by_name(name)(value.detach(), gradient, target).residual
     torch.testing.assert_close(residual, torch.zeros_like(residual), rtol=0, atol=1e-12)
-    inward = -0.3 if name == "design_region" else 0.1
+    # A field that keeps away from the surface may do so by more, on either side.
+    inward = -0.3 if name == "design_region" else -0.1 * distance.sign() if name == "free_space" else 0.1
     moved = by_name(name)(value.detach() + inward, 1.2 * gradient.roll(1, dims=1), target).residual
     assert float(moved.abs().max()) > 0.05
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
 from gnrecon.cloud import Frame, Samples
+from gnrecon.levelset import LevelSet
 from gnrecon.shapes import ScannedSurface, learn, scanned
-from gnrecon.shapes.term import LAST
+from gnrecon.shapes.term import LAST, Drawn, Moment
 
 
 def ball(count: int = 300) -> Samples:
@@ -37,6 +40,40 @@ def test_the_eikonal_weight_falls_and_is_not_reported() -> None:
     assert weights == sorted(weights, reverse=True)
     assert weights[-1] == pytest.approx(1e-4)
     assert eikonal.weight_at(LAST) == 0
+
+
+def test_the_free_space_is_asked_for_where_the_field_has_lost_its_sign() -> None:
+    problem = scanned(ball(400))
+    (free,) = (term for term in problem.terms if term.name == "free space")
+
+    def drawn(value: Callable[[torch.Tensor], torch.Tensor]) -> Drawn:
+        level_set = LevelSet(value, lambda x: (value(x), torch.zeros_like(x)), problem.box)
+        return free.sampler(Moment(1, level_set, np.random.default_rng(0)))
+
+    axes = torch.tensor([0.9, 0.7, 0.6], dtype=torch.float64)
+    right = drawn(lambda x: (x / axes).norm(dim=1) - 1)
+    assert len(right.points) == 0
+    assert right.share == 0
+
+    # A sheet around a corner of the box, and a hollow in the middle.
+    def wrong(x: torch.Tensor) -> torch.Tensor:
+        body = (x / axes).norm(dim=1) - 1
+        corner = torch.as_tensor(problem.box.upper)
+        return torch.where((x - corner).norm(dim=1) < 0.5, -body, torch.where(x.norm(dim=1) < 0.2, -body, body))
+
+    lost = drawn(wrong)
+    assert lost.target is not None
+    assert 0 < lost.share < 0.3
+    inside = (lost.points / axes).norm(dim=1) < 1
+    assert inside.any()
+    assert not inside.all()
+    assert ((lost.target < 0) == inside).all()
+    assert free.weight_at(LAST) == 0
+
+
+def test_a_cloud_of_few_points_has_no_known_free_space() -> None:
+    learned = learn(scanned(ball(20)), budget=None, steps=2)
+    assert np.isfinite(learned.best.loss)
 
 
 def test_points_as_a_surface() -> None:
