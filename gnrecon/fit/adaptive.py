@@ -26,7 +26,7 @@ from gnrecon.fit.large import LARGE, fit_large
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.outlying import outlying
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.fit.shaped import Shaping, bend_global
+from gnrecon.fit.shaped import Free, Shaping, bend_global
 from gnrecon.optim import Solution
 from gnrecon.sampling import Density
 
@@ -134,5 +134,6 @@ def _shaped(
 ) -> tuple[NeuralSDF, ShapingFor]:
     """Return the global field bent to the regularisers, and how the detail is to heed them."""
     density, wanted = Density(samples.points), options.regularisers
-    bent = bend_global(Shaping.of(wanted, first.sdf, density, first.length, rng), first.scene, options, rng)
-    return bent, lambda shorter: Shaping.of(wanted, bent, density, shorter, rng)
+    free = Free.of(first.scene, rng)
+    bent = bend_global(Shaping.of(wanted, first.sdf, density, free, first.length, rng), first.scene, options, rng)
+    return bent, lambda shorter: Shaping.of(wanted, bent, density, free, shorter, rng)

@@ -37,7 +37,7 @@ Jet = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Wish:
-    """A residual of curvature that is asked of points of the surface.
+    """A residual of curvature that is asked of points of the surface, or one of the value, at points that stay.
 
     Parameters
     ----------
@@ -45,18 +45,25 @@ class Wish:
     points : of shape (N, 3), near the surface, onto which they are brought
     scale : factor of each point's rows, of shape (N, 1)
     robust : size of the residual from which on it hardly counts, or None
+    target : of each point, of shape (N,), or None
+    stays : whether the points are left where they are
     """
 
     residual: SecondOrder
     points: Tensor
     scale: Tensor
     robust: float | None = None
+    target: Tensor | None = None
+    stays: bool = False
+
+    def asked(self, jet: Jet) -> Linearised:
+        """Return the residuals at the points' jet."""
+        return self.residual(*jet, self.target)
 
     def weighed(self, jet: Jet) -> Wish:
-        """Return the wish with what its residuals count, at the points' jet, in its scale."""
-        if self.robust is None:
-            return self
-        square = self.residual(*jet).residual.square().sum(1, keepdim=True)
+        """Return a robust wish with what its residuals count, at the points' jet, in its scale."""
+        assert self.robust is not None, "what is not robust counts alike"
+        square = self.asked(jet).residual.square().sum(1, keepdim=True)
         # The tangent of r^2 / (1 + r^2) is a multiple of r^2: iteratively reweighted least squares.
         return replace(self, scale=self.scale / (1 + square / self.robust**2))
 
@@ -86,6 +93,10 @@ class Sines:
             return self.base(x)
         return x.new_zeros(len(x)), x.new_zeros(len(x), 3), x.new_zeros(len(x), 3, 3)
 
+    def value(self, amplitudes: Tensor, x: Tensor, known: Jet) -> Jet:
+        """Return the value of both together, with the known function's derivatives."""
+        return known[0] + self.features.sums(amplitudes, x, self.center, self.length, 0)[0], known[1], known[2]
+
     def jet(self, amplitudes: Tensor, x: Tensor, known: Jet) -> Jet:
         """Return the jet of both together; `known` is that of the known function there."""
         own = self.features.sums(amplitudes, x, self.center, self.length, 2)
@@ -94,7 +105,8 @@ class Sines:
     def rows(self, x: Tensor, linear: Linearised, scale: Tensor) -> Tensor:
         """Return the rows of residuals, of shape (m N, p), residual by residual."""
         z = self.features.phase(x, self.center, self.length)
-        sines, cosines, waves = z.sin(), z.cos(), self.features.frequencies / self.length
+        sines, waves = z.sin(), self.features.frequencies / self.length
+        cosines = sines if linear.by_gradient is None else z.cos()
         squares = (waves[:, :, None] * waves[:, None, :]).reshape(-1, 9)
         made = []
         for column in range(linear.residual.shape[1]):
@@ -139,11 +151,25 @@ class BendProblem:
     known: Sequence[Jet]
 
     @classmethod
-    def at(cls, sines: Sines, factor: Tensor, target: Tensor, wishes: Sequence[Wish], theta: Tensor) -> BendProblem:
-        """Pose the problem of the surface that the amplitudes theta make."""
-        placed = [replace(wish, points=sines.on_surface(theta, wish.points)) for wish in wishes]
-        known = [sines.known(wish.points) for wish in placed]
-        weighed = [wish.weighed(sines.jet(theta, wish.points, jet)) for wish, jet in zip(placed, known, strict=True)]
+    def at(
+        cls,
+        sines: Sines,
+        factor: Tensor,
+        target: Tensor,
+        wishes: Sequence[Wish],
+        theta: Tensor,
+        still: Sequence[Jet | None],
+    ) -> BendProblem:
+        """Pose the problem of the surface that the amplitudes theta make.
+
+        `still` are the known function's jets at the points of those wishes whose points stay.
+        """
+        placed = [wish if wish.stays else replace(wish, points=sines.on_surface(theta, wish.points)) for wish in wishes]
+        known = [sines.known(wish.points) if jet is None else jet for wish, jet in zip(placed, still, strict=True)]
+        weighed = [
+            wish if wish.robust is None else wish.weighed(sines.jet(theta, wish.points, jet))
+            for wish, jet in zip(placed, known, strict=True)
+        ]
         return cls(sines, factor, target, weighed, theta, known)
 
     def free(self) -> Tensor:
@@ -167,7 +193,8 @@ class BendProblem:
 
     def _asked(self, free: Tensor) -> Iterator[tuple[Wish, Linearised]]:
         for wish, known in zip(self.wishes, self.known, strict=True):
-            yield wish, wish.residual(*self.sines.jet(free, wish.points, known))
+            jet = self.sines.value if wish.stays else self.sines.jet
+            yield wish, wish.asked(jet(free, wish.points, known))
 
 
 def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], amplitudes: Tensor, steps: int) -> Tensor:
@@ -182,10 +209,11 @@ def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], am
     steps : of Gauss-Newton, at most
     """
     target = torch.linalg.solve_triangular(factor, right[:, None], upper=False)[:, 0]
+    still = [sines.known(wish.points) if wish.stays else None for wish in wishes]
 
     def posed(number: int, theta: Tensor) -> BendProblem:
         del number
-        return BendProblem.at(sines, factor, target, wishes, theta)
+        return BendProblem.at(sines, factor, target, wishes, theta, still)
 
     # A step knows nothing of how the surface moves away from its points; what counts is how it is where it has gone.
     method = GaussNewton(GainRatioDamping(initial_damping=1e-9, metric=identity))

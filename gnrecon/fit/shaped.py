@@ -4,6 +4,9 @@ Where a hole is to be filled by a film of its own, the coarse distances there sa
 the winding number, another film's, and their size the distance to the hole's rim. So samples of the volume that are
 nearer to the film than to any scanned point are told the distance to the film instead, as it is then: that keeps the
 field's sign and slope beside it, and hardly holds it, because these rows weigh little.
+
+So little that features which are bent to a surface's curvature may run off in the free space beside it, and leave
+sheets there. Where the sign is beyond doubt the field is asked to keep it, by a residual that is zero where it does.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from gnrecon.errors import FitError
 from gnrecon.field.features import Features
 from gnrecon.fit.bend import Jet, Sines, Wish, bent
 from gnrecon.fit.choose import Mask
+from gnrecon.fit.global_field import CERTAIN
 from gnrecon.fit.loss import data_terms, distance_term
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.patch import Belief, PatchSystem
@@ -31,6 +35,7 @@ from gnrecon.fit.sheet import Sheet
 from gnrecon.fit.start import FINAL_POINTS, RIDGE
 from gnrecon.fit.terms import Term
 from gnrecon.linalg.cholesky import damped_factor
+from gnrecon.residuals import SecondOrder, free_space
 from gnrecon.sampling import Density
 
 GLOBAL_STEPS, CUBE_STEPS = 8, 3
@@ -47,6 +52,45 @@ ROUNDS = 2
 
 ATTEMPTS = 8
 
+FREE, CLEAR, MORE = 100.0, 0.05, 3
+"""Weight of the free space, how far from the scan it begins, in radii, and how many times the fit's samples it has."""
+
+STEEPNESS, DEEP = 0.3, 0.03
+"""Least magnitude of f there as a share of the distance, and the most that is asked."""
+
+_FREE_SPACE = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
+
+
+@dataclass(frozen=True)
+class Free:
+    """Points of the volume at which the sign is beyond doubt, and what f should be there at least.
+
+    Parameters
+    ----------
+    points : of shape (Q, 3)
+    least : of shape (Q,), signed
+    """
+
+    points: Float
+    least: Float
+
+    @classmethod
+    def of(cls, scene: Scene, rng: np.random.Generator) -> Free:
+        """Draw points of a scan's box."""
+        x, distance = scene.volume(MORE * scene.volume_count, rng)
+        certain = np.abs(scene.coarse.winding_number(x) - 0.5) > CERTAIN
+        kept = certain & (np.abs(distance) > CLEAR)
+        x, distance = x[kept], distance[kept]
+        return cls(x, np.sign(distance) * np.minimum(STEEPNESS * np.abs(distance), DEEP))
+
+    def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
+        """Return what is asked at some of the points, `scale` being each one's for a weight of one."""
+        if not rows.any():
+            return []
+        points, least = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least))
+        scales = torch.full_like(least, scale * FREE**0.5)[:, None]
+        return [Wish(_FREE_SPACE, points, scales, target=least, stays=True)]
+
 
 @dataclass(frozen=True)
 class Shaping:
@@ -58,19 +102,27 @@ class Shaping:
     sheet : points of the surface, at which they are asked for
     sdf : the global field
     density : of the scanned points
+    free : where the field is to keep its sign
     """
 
     wanted: Sequence[Regulariser]
     sheet: Sheet
     sdf: NeuralSDF
     density: Density
+    free: Free
 
     @classmethod
     def of(
-        cls, wanted: Sequence[Regulariser], sdf: NeuralSDF, density: Density, length: float, rng: np.random.Generator
+        cls,
+        wanted: Sequence[Regulariser],
+        sdf: NeuralSDF,
+        density: Density,
+        free: Free,
+        length: float,
+        rng: np.random.Generator,
     ) -> Shaping:
         """Draw points of the surface for features of a length, in radii."""
-        return cls(wanted, Sheet.of(sdf, density, length / PER_LENGTH, rng), sdf, density)
+        return cls(wanted, Sheet.of(sdf, density, length / PER_LENGTH, rng), sdf, density, free)
 
     def told(self, x: Float, signed: Float) -> Float:
         """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
@@ -108,6 +160,8 @@ class Shaping:
         wishes = self.wishes(rows, scale, amplitudes)
         if equations is None or not wishes:
             return amplitudes
+        near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
+        wishes += self.free.wishes(near, (len(self.density.points) / len(near)) ** 0.5 / belief.position, amplitudes)
         whole, known = as_sines(self.sdf)
 
         def base(x: Tensor) -> Jet:
@@ -126,7 +180,9 @@ def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.ran
         When the data's system cannot be factored.
     """
     sdf, like = shaping.sdf, scene.points
-    wishes = shaping.wishes(np.ones(len(shaping.sheet), dtype=bool), max(len(shaping.sheet), 1) ** -0.5, like)
+    everywhere, free = (np.ones(len(one), dtype=bool) for one in (shaping.sheet.points, shaping.free.points))
+    wishes = shaping.wishes(everywhere, max(len(everywhere), 1) ** -0.5, like)
+    wishes += shaping.free.wishes(free, max(len(free), 1) ** -0.5, like)
     x, wanted = _volume(shaping, scene, scene.volume_count, rng)
     for left in reversed(range(ROUNDS)):
         volume = scene.tensor(x), scene.tensor(wanted)

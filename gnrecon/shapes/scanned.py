@@ -46,8 +46,8 @@ EIKONAL, FALL, LEAST = 1e-2, 0.7, 1e-4
 """Weight of the eikonal term to begin with, its factor from step to step, and the least."""
 
 FREE, POOL, IN_FREE = 30.0, 60_000, 20_000
-"""Weight of the free space, points of the box whose sign may be known, and those that are looked at in each step. Hardly
-any of them has a residual, so that it does not stand against the data."""
+"""Weight of the free space, points of the box whose sign may be known, and those that are looked at in each step.
+Hardly any of them has a residual, so that it does not stand against the data."""
 
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the

@@ -11,7 +11,7 @@ from gnrecon.errors import UsageError
 from gnrecon.field.features import Features
 from gnrecon.fit.bend import BendProblem, Sines, Wish, bent
 from gnrecon.fit.regulariser import CREASE, FILL, regularisers
-from gnrecon.residuals import SecondOrder, gauss_curvature, interface, mean_curvature, surface_strain
+from gnrecon.residuals import SecondOrder, free_space, gauss_curvature, interface, mean_curvature, surface_strain
 
 RESIDUALS = [mean_curvature, gauss_curvature, surface_strain]
 
@@ -90,12 +90,31 @@ def test_a_weight_of_nearly_nothing_changes_nearly_nothing(rng: np.random.Genera
     assert after == pytest.approx(before, rel=1e-3)
 
 
+def test_points_that_stay_keep_what_is_asked_of_their_values(rng: np.random.Generator) -> None:
+    """A cap that is bent flat would leave the points below it on its other side."""
+    field, points = sines(rng), cap(rng)
+    none = torch.zeros(80, dtype=torch.float64)
+    flat = Wish(mean_curvature, points, torch.full((150, 1), 0.1).double())
+    below = 0.85 * torch.nn.functional.normalize(points, dim=1)
+    least = torch.full((150,), -0.1).double()
+    keeps = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
+    held = Wish(keeps, below, torch.full((150, 1), 1.0).double(), target=least, stays=True)
+    factor = 1e-2 * torch.eye(80).double()
+
+    def highest(*wishes: Wish) -> float:
+        found = bent(field, factor, none, wishes, none, 8)
+        return float((sphere(below)[0] + field.features.sums(found, below, field.center, field.length, 0)[0]).max())
+
+    assert highest(flat) > -0.05
+    assert highest(flat, held) < -0.07
+
+
 def test_creases_hardly_count(rng: np.random.Generator) -> None:
     """The tangent of r^2 / (1 + r^2) at r = 10 is a multiple of r^2 that weighs 1 / 101^2."""
     field, points = sines(rng), cap(rng, 5)
     none = torch.zeros(80, dtype=torch.float64)
     wish = Wish(mean_curvature, points, torch.ones(5, 1).double(), robust=0.2)
-    problem = BendProblem.at(field, torch.eye(80).double(), none, [wish], none)
+    problem = BendProblem.at(field, torch.eye(80).double(), none, [wish], none, [None])
     # On the unit sphere k1 + k2 is 2, which is ten times 0.2.
     torch.testing.assert_close(problem.residual(none)[80:], torch.full((5,), 2 / 101).double(), rtol=1e-4, atol=0)
 
