@@ -1,4 +1,4 @@
-"""Whether points are averaged is chosen by left-out points: for noisy edges, not for smooth or clean shapes."""
+"""Whether points are averaged, and how: by the shape's edges, and by what left-out points say of it."""
 
 from __future__ import annotations
 
@@ -9,22 +9,12 @@ import pytest
 
 from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, NeuralSDF, averaged, fit
-from gnrecon.fit.averaged import NOISY, Told, told
+from gnrecon.fit.averaged import NOISY, Told, _best, has_edges, told
+from gnrecon.fit.bilateral import Averaging
+from gnrecon.fit.choose import Choice, Leftover
+from gnrecon.fit.patch import Belief
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
-
-
-class Rounded:
-    """What a smooth field knows of a cube or, with exponent 2, of a ball: |x|_p - 0.8, in the frame."""
-
-    def __init__(self, exponent: float) -> None:
-        self.exponent = exponent
-
-    def sdf_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, p = FRAME.to_unit(points), self.exponent
-        norm = (np.abs(x) ** p).sum(axis=1) ** (1 / p)
-        gradient = np.sign(x) * (np.abs(x) / norm[:, None]) ** (p - 1)
-        return (norm - 0.8) * FRAME.scale, gradient
 
 
 def cube(count: int, noise: float, rng: np.random.Generator) -> Samples:
@@ -41,52 +31,89 @@ def ball(count: int, noise: float, rng: np.random.Generator) -> Samples:
     return Samples(x * (0.8 + noise * rng.standard_normal((count, 1))), x, FRAME)
 
 
-def found(samples: Samples, exponent: float) -> Told:
-    rng = np.random.default_rng(1)
-    held = rng.random(len(samples)) < 0.15
-    field: NeuralSDF = Rounded(exponent)  # type: ignore[assignment]
-    return told(field, samples, held, rng, "cpu")
-
-
 def off_cube(x: np.ndarray) -> np.ndarray:
     outside = np.abs(x) - 0.8
     return np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
 
 
-def test_noisy_points_of_a_cube_are_averaged() -> None:
-    samples = cube(1200, 0.01, np.random.default_rng(2))
-    result = found(samples, 8.0)
-    assert result.averaging is not None
-    assert off_cube(result.samples.points).mean() < 0.5 * off_cube(samples.points).mean()
-    np.testing.assert_array_equal(result.leftover.points, result.samples.points)
-    # What is left to be averaged by the fit is less.
-    raw = off_cube(samples.points).mean()
-    assert result.belief.position < raw
-
-
-def test_noisy_points_of_a_ball_are_not() -> None:
-    samples = ball(1200, 0.015, np.random.default_rng(3))
-    result = found(samples, 2.0)
-    assert result.belief.position > NOISY * result.leftover.density.radius
-    assert result.averaging is None
-    assert result.samples is samples
-
-
-def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> None:
-        raise AssertionError("tried")
-
-    monkeypatch.setattr(averaged, "_best", refused)
-    assert found(cube(1200, 0.0, np.random.default_rng(4)), 8.0).averaging is None
-    noisy = replace(cube(1200, 0.01, np.random.default_rng(4)), estimated=True)
-    assert found(noisy, 8.0).averaging is None
-
-
-def test_a_fit_says_how_it_averaged() -> None:
-    """The whole of it: the edges of a noisy cube come out sharper than its points are."""
+def test_a_noisy_cube_is_averaged_and_its_fit_says_so() -> None:
+    """The whole of it: the fit of a noisy cube is nearer to the cube than any mean without regard to edges is."""
     samples = cube(1200, 0.015, np.random.default_rng(5))
     sdf, solution = fit(samples, FitOptions(quality="draft"))
     assert "Averaged noisy points" in solution.status
     exact = cube(2000, 0.0, np.random.default_rng(6))
     errors = np.abs(sdf.sdf(FRAME.to_world(exact.points))) / FRAME.scale
     assert errors.mean() < 0.4 * off_cube(samples.points).mean()
+
+
+def test_faces_that_meet_are_told_from_bends() -> None:
+    def edges(samples: Samples) -> bool:
+        return has_edges(*averaged.FIRST.of(samples.points, samples.normals))
+
+    rng = np.random.default_rng(2)
+    assert edges(cube(1500, 0.0, rng))
+    assert edges(cube(1500, 0.01, rng))
+    assert not edges(ball(1500, 0.01, rng))
+    # So few that neighbours' normals differ as if there were edges between them.
+    assert not edges(ball(60, 0.0, rng))
+    # The two sides of a thin sheet are no edge.
+    side = rng.choice([-1.0, 1.0], 1000)
+    x = np.stack([*rng.uniform(-1, 1, (2, 1000)), 0.002 * side], axis=1)
+    assert not edges(Samples(x, np.stack([0 * side, 0 * side, side], axis=1), FRAME))
+
+
+def chosen(gains: dict[Averaging, float], edges: bool) -> Averaging | None:
+    """Return the averaging whose left-out points are told better, by gains of a scatter of one hundredth."""
+    scatter = 0.01 * np.tile([1.0, -1.0], 50)[:, None]
+    belief = Belief(0.1, 0.01, 0.1)
+
+    class Scores:
+        def __init__(self, gain: float) -> None:
+            self.gain = gain
+
+        def scores(self, length: float) -> np.ndarray:
+            assert length == belief.length
+            return np.full((100, 3), 0.5) - self.gain - scatter
+
+    choice = Choice(belief, np.full((100, 3), 0.5))
+    found = _best(choice, lambda one: Scores(gains.get(one, -1.0)), edges)  # type: ignore[arg-type,return-value]
+    return None if found is None else found[0]
+
+
+def test_edges_decide_what_scatter_hides() -> None:
+    # The doubt about a mean of a hundred is a thousandth.
+    first, *others = averaged.FIRST, *averaged.OTHERS
+    for gain, without, with_edges in ((0.002, first, first), (0.0005, None, first), (-0.0005, None, first)):
+        assert chosen({first: gain}, edges=False) == without
+        assert chosen({first: gain}, edges=True) == with_edges
+    assert chosen({first: -0.002}, edges=True) is None
+    assert chosen({first: 0.002, others[1]: 0.004, others[2]: 0.003}, edges=False) == others[1]
+
+
+def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = ball(300, 0.0, np.random.default_rng(4))
+    leftover = Leftover(samples.points, samples.normals, np.zeros(300), samples.normals)
+
+    def result(position: float, estimated: bool) -> Told | None:
+        """What is told of a noise, in radii of a point's disk; None where averaging was tried."""
+        choice = Choice(Belief(0.1, position * leftover.density.radius, 0.1), np.zeros((2, 2)))
+
+        class Canned:
+            def choice(self) -> Choice:
+                return choice
+
+        monkeypatch.setattr(averaged.Trials, "draw", lambda *_: Canned())
+        monkeypatch.setattr(averaged.Leftover, "of", lambda *_: leftover)
+        monkeypatch.setattr(averaged, "_best", lambda *_: tried.append(True))
+        tried: list[bool] = []
+        field: NeuralSDF = None  # type: ignore[assignment]
+        given = replace(samples, estimated=estimated)
+        found = told(field, given, np.zeros(300, dtype=bool), np.random.default_rng(0), "cpu")
+        assert found.samples is given
+        assert found.belief is choice.belief
+        assert found.averaging is None
+        return None if tried else found
+
+    assert result(0.9 * NOISY, estimated=False) is not None
+    assert result(1.1 * NOISY, estimated=True) is not None
+    assert result(1.1 * NOISY, estimated=False) is None

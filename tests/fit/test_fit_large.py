@@ -22,6 +22,8 @@ from gnrecon.field.detail import Detail
 from gnrecon.field.partition import Int
 from gnrecon.field.siren import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
+from gnrecon.fit.averaged import Told
+from gnrecon.fit.choose import Leftover
 from gnrecon.fit.detail import CHOSEN, fit_detail
 from gnrecon.fit.options import QUALITIES
 from gnrecon.fit.patch import Belief
@@ -147,8 +149,10 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail, monkeypatch: pytest.MonkeyPatch) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    monkeypatch.setattr("gnrecon.fit.detail.choose", known)
-    single = fit_detail(sdf, samples, np.arange(COUNT) % 6 == 0, FEATURES, np.random.default_rng(0), "cpu")
+    found = Told(samples, Leftover.of(sdf, samples), known())
+    monkeypatch.setattr("gnrecon.fit.detail.told", lambda *_: found)
+    single, averaging = fit_detail(sdf, samples, np.arange(COUNT) % 6 == 0, FEATURES, np.random.default_rng(0), "cpu")
+    assert averaging is None
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
     by_single, by_blocks = (0.05 + d.value(samples.points) for d in (single, detail))

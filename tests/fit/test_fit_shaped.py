@@ -82,7 +82,7 @@ def test_strain_smooths() -> None:
 
 
 def test_the_same_again_is_the_same() -> None:
-    cloud = can(0.2, 0.45)
+    cloud = can(0.25, 0.45)
     one, other = (fitted(cloud, fill="minimal", prior="developable", smooth="strain=1e-5") for _ in range(2))
     assert one.theta.equal(other.theta)
     assert one.detail is not None
