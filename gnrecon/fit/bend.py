@@ -46,7 +46,7 @@ class Wish:
     scale : factor of each point's rows, of shape (N, 1)
     robust : size of the residual from which on it hardly counts, or None
     target : of each point, of shape (N,), or None
-    stays : whether the points are left where they are
+    still : value of the known function at each point, of shape (N,), where the points are to stay; else None
     """
 
     residual: SecondOrder
@@ -54,7 +54,7 @@ class Wish:
     scale: Tensor
     robust: float | None = None
     target: Tensor | None = None
-    stays: bool = False
+    still: Tensor | None = None
 
     def asked(self, jet: Jet) -> Linearised:
         """Return the residuals at the points' jet."""
@@ -130,6 +130,12 @@ class Sines:
         return x
 
 
+def valued(value: Tensor) -> Jet:
+    """Return values, of shape (N,), as a jet whose derivatives nobody asks for."""
+    count = len(value)
+    return value, value.new_zeros(1, 3).expand(count, 3), value.new_zeros(1, 3, 3).expand(count, 3, 3)
+
+
 @dataclass(frozen=True)
 class BendProblem:
     """The least-squares problem of one step: L^T a = y, and the wishes at their points, of which none moves.
@@ -151,21 +157,13 @@ class BendProblem:
     known: Sequence[Jet]
 
     @classmethod
-    def at(
-        cls,
-        sines: Sines,
-        factor: Tensor,
-        target: Tensor,
-        wishes: Sequence[Wish],
-        theta: Tensor,
-        still: Sequence[Jet | None],
-    ) -> BendProblem:
-        """Pose the problem of the surface that the amplitudes theta make.
-
-        `still` are the known function's jets at the points of those wishes whose points stay.
-        """
-        placed = [wish if wish.stays else replace(wish, points=sines.on_surface(theta, wish.points)) for wish in wishes]
-        known = [sines.known(wish.points) if jet is None else jet for wish, jet in zip(placed, still, strict=True)]
+    def at(cls, sines: Sines, factor: Tensor, target: Tensor, wishes: Sequence[Wish], theta: Tensor) -> BendProblem:
+        """Pose the problem of the surface that the amplitudes theta make."""
+        placed = [
+            replace(wish, points=sines.on_surface(theta, wish.points)) if wish.still is None else wish
+            for wish in wishes
+        ]
+        known = [sines.known(wish.points) if wish.still is None else valued(wish.still) for wish in placed]
         weighed = [
             wish if wish.robust is None else wish.weighed(sines.jet(theta, wish.points, jet))
             for wish, jet in zip(placed, known, strict=True)
@@ -187,13 +185,22 @@ class BendProblem:
         return torch.cat(parts)
 
     def linearise(self, free: Tensor) -> tuple[DenseJacobian, Tensor]:
-        """Return J, of shape (M, p), and r."""
-        rows = [self.sines.rows(wish.points, linear, wish.scale) for wish, linear in self._asked(free)]
-        return DenseJacobian(torch.cat([self.factor.T, *rows])), self.residual(free)
+        """Return J, of shape (M, p), and r, without the rows of values of which nothing is asked, which are zero."""
+        rows, parts = [self.factor.T], [self.factor.T @ free - self.target]
+        for wish, linear in self._asked(free):
+            points, scale, residual = wish.points, wish.scale, linear
+            if wish.still is not None:
+                active = linear.residual.ne(0).any(dim=1)
+                assert linear.by_value is not None, "residuals of the value"
+                points, scale = points[active], scale[active]
+                residual = Linearised(linear.residual[active], linear.by_value[active], None)
+            rows.append(self.sines.rows(points, residual, scale))
+            parts.append((scale * residual.residual).T.flatten())
+        return DenseJacobian(torch.cat(rows)), torch.cat(parts)
 
     def _asked(self, free: Tensor) -> Iterator[tuple[Wish, Linearised]]:
         for wish, known in zip(self.wishes, self.known, strict=True):
-            jet = self.sines.value if wish.stays else self.sines.jet
+            jet = self.sines.jet if wish.still is None else self.sines.value
             yield wish, wish.asked(jet(free, wish.points, known))
 
 
@@ -209,11 +216,10 @@ def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], am
     steps : of Gauss-Newton, at most
     """
     target = torch.linalg.solve_triangular(factor, right[:, None], upper=False)[:, 0]
-    still = [sines.known(wish.points) if wish.stays else None for wish in wishes]
 
     def posed(number: int, theta: Tensor) -> BendProblem:
         del number
-        return BendProblem.at(sines, factor, target, wishes, theta, still)
+        return BendProblem.at(sines, factor, target, wishes, theta)
 
     # A step knows nothing of how the surface moves away from its points; what counts is how it is where it has gone.
     method = GaussNewton(GainRatioDamping(initial_damping=1e-9, metric=identity))

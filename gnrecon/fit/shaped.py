@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -83,13 +84,21 @@ class Free:
         x, distance = x[kept], distance[kept]
         return cls(x, np.sign(distance) * np.minimum(STEEPNESS * np.abs(distance), DEEP))
 
-    def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
-        """Return what is asked at some of the points, `scale` being each one's for a weight of one."""
+    def wishes(self, rows: Mask, known: Float, scale: float, like: Tensor) -> list[Wish]:
+        """Return what is asked at some of the points.
+
+        Parameters
+        ----------
+        rows : mask of them
+        known : value at all points, of shape (Q,), of what the features are added to
+        scale : of each point's residual, for a weight of one
+        like : tensor whose device is used
+        """
         if not rows.any():
             return []
-        points, least = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least))
+        points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
         scales = torch.full_like(least, scale * FREE**0.5)[:, None]
-        return [Wish(_FREE_SPACE, points, scales, target=least, stays=True)]
+        return [Wish(_FREE_SPACE, points, scales, target=least, still=still)]
 
 
 @dataclass(frozen=True)
@@ -123,6 +132,11 @@ class Shaping:
     ) -> Shaping:
         """Draw points of the surface for features of a length, in radii."""
         return cls(wanted, Sheet.of(sdf, density, length / PER_LENGTH, rng), sdf, density, free)
+
+    @cached_property
+    def in_free(self) -> Float:
+        """Values of the global field at the points of the free space, of shape (Q,)."""
+        return self.sdf.sdf(self.sdf.frame.to_world(self.free.points)) / self.sdf.frame.scale
 
     def told(self, x: Float, signed: Float) -> Float:
         """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
@@ -161,7 +175,8 @@ class Shaping:
         if equations is None or not wishes:
             return amplitudes
         near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
-        wishes += self.free.wishes(near, (len(self.density.points) / len(near)) ** 0.5 / belief.position, amplitudes)
+        scale = (len(self.density.points) / len(near)) ** 0.5 / belief.position
+        wishes += self.free.wishes(near, self.in_free, scale, amplitudes)
         whole, known = as_sines(self.sdf)
 
         def base(x: Tensor) -> Jet:
@@ -182,7 +197,8 @@ def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.ran
     sdf, like = shaping.sdf, scene.points
     everywhere, free = (np.ones(len(one), dtype=bool) for one in (shaping.sheet.points, shaping.free.points))
     wishes = shaping.wishes(everywhere, max(len(everywhere), 1) ** -0.5, like)
-    wishes += shaping.free.wishes(free, max(len(free), 1) ** -0.5, like)
+    # The global field is all of f.
+    wishes += shaping.free.wishes(free, np.zeros(len(free)), max(len(free), 1) ** -0.5, like)
     x, wanted = _volume(shaping, scene, scene.volume_count, rng)
     for left in reversed(range(ROUNDS)):
         volume = scene.tensor(x), scene.tensor(wanted)

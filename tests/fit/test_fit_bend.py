@@ -98,7 +98,7 @@ def test_points_that_stay_keep_what_is_asked_of_their_values(rng: np.random.Gene
     below = 0.85 * torch.nn.functional.normalize(points, dim=1)
     least = torch.full((150,), -0.1).double()
     keeps = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
-    held = Wish(keeps, below, torch.full((150, 1), 1.0).double(), target=least, stays=True)
+    held = Wish(keeps, below, torch.full((150, 1), 1.0).double(), target=least, still=sphere(below)[0])
     factor = 1e-2 * torch.eye(80).double()
 
     def highest(*wishes: Wish) -> float:
@@ -114,7 +114,7 @@ def test_creases_hardly_count(rng: np.random.Generator) -> None:
     field, points = sines(rng), cap(rng, 5)
     none = torch.zeros(80, dtype=torch.float64)
     wish = Wish(mean_curvature, points, torch.ones(5, 1).double(), robust=0.2)
-    problem = BendProblem.at(field, torch.eye(80).double(), none, [wish], none, [None])
+    problem = BendProblem.at(field, torch.eye(80).double(), none, [wish], none)
     # On the unit sphere k1 + k2 is 2, which is ten times 0.2.
     torch.testing.assert_close(problem.residual(none)[80:], torch.full((5,), 2 / 101).double(), rtol=1e-4, atol=0)
 
