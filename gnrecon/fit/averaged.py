@@ -28,10 +28,10 @@ _log = logging.getLogger(__name__)
 FIRST = Averaging(2.5, 0.4)
 """What is tried first; only where it helps are the others."""
 
-OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4), Averaging(2.5, 0.2), Averaging(4.0, 0.2))
+OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4))
 
 NOISY = 0.05
-"""Least noise of the positions, in radii of a point's disk, with which points are averaged."""
+"""Noise of the positions, in radii of a point's disk, above which points are averaged."""
 
 SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.6
 """Lengths of the difference of two neighbours' normals: above the first there is an edge between them, up to the last,
@@ -78,7 +78,7 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, rng: np.random.Generator,
     trials = Trials.draw(leftover, held, radius, rng, device)
     choice = trials.choice()
     # Estimated normals are means over edges already.
-    if samples.estimated or choice.belief.position < NOISY * radius:
+    if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
         return Told(samples, leftover, choice.belief)
 
     def with_kept(averaging: Averaging) -> Trials:
