@@ -33,6 +33,9 @@ _TOGETHER = 128
 KNOWN = 2.0
 """How far from the points a distance is known at least, in radii of the disk that the nearest one stands for."""
 
+STEEPNESS = 0.3
+"""Least magnitude of a field in the free space, as a share of the distance from the surface."""
+
 
 @dataclass(frozen=True)
 class Box:
@@ -54,6 +57,15 @@ class Box:
 def near_surface(points: Float, spread: float, count: int, rng: np.random.Generator) -> Float:
     """Return `count` points, of shape (count, 3): data points moved by normal noise of standard deviation `spread`."""
     return points[rng.integers(len(points), size=count)] + spread * rng.standard_normal((count, 3))
+
+
+def least_values(signed: Float, most: float) -> Float:
+    """Return what a field should be at least where the free space has signed distances, of shape (Q,), on its own side.
+
+    No more than `most` is asked: what is far from the surface does not matter, as long as the sign is right.
+    """
+    least: Float = np.sign(signed) * np.minimum(STEEPNESS * np.abs(signed), most)
+    return least
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, rng: np.random.Generator,
     radius = leftover.density.radius
     trials = Trials.draw(leftover, held, radius, rng, device)
     choice = trials.choice()
-    # Estimated normals are means over edges already.
+    # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
         return Told(samples, leftover, choice.belief)
 
@@ -86,7 +86,7 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, rng: np.random.Generator,
         points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
         return replace(trials, leftover=Leftover.of(sdf, replace(samples, points=points, normals=normals)))
 
-    found = _best(choice, with_kept, has_edges(*FIRST.of(samples.points, samples.normals)))
+    found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
     if found is None:
         return Told(samples, leftover, choice.belief)
     averaging, better = found
@@ -104,10 +104,13 @@ def has_edges(points: Float, normals: Float) -> bool:
     return bool(sharp > EDGES and sharp > CLEARLY * bent)
 
 
-def _best(choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: bool) -> tuple[Averaging, Trials] | None:
+def _best(
+    choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: Callable[[], bool]
+) -> tuple[Averaging, Trials] | None:
     """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
 
-    All are compared at the length that suits the points as they are; a better one is chosen afterwards.
+    Whether there are edges is asked where scatter hides the gain. All are compared at the length that suits the points
+    as they are; a better one is chosen afterwards.
     """
     plain = _of_best_noise(choice.scores)
 
@@ -117,7 +120,7 @@ def _best(choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: b
 
     gain, trials = tried(FIRST)
     doubt = gain.std() / np.sqrt(len(gain))
-    if not gain.mean() > (-doubt if edges else doubt):
+    if not (gain.mean() > doubt or (gain.mean() > -doubt and edges())):
         return None
     best, averaging = float(gain.mean()), FIRST
     for other in OTHERS:

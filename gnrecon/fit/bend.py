@@ -12,7 +12,7 @@ and so a residual linearised to dr = c df + v . d(grad f) + M : d(Hess f) the ro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -59,6 +59,14 @@ class Wish:
     def asked(self, jet: Jet) -> Linearised:
         """Return the residuals at the points' jet."""
         return self.residual(*jet, self.target)
+
+    def unmet(self, jet: Jet) -> tuple[Wish, Linearised]:
+        """Return those of the points that stay whose residuals of the value are not zero, and these, at the jet."""
+        linear = self.asked(jet)
+        assert linear.by_value is not None, "residuals of the value"
+        rows = linear.residual.ne(0).any(dim=1)
+        kept = replace(self, points=self.points[rows], scale=self.scale[rows])
+        return kept, Linearised(linear.residual[rows], linear.by_value[rows], None)
 
     def weighed(self, jet: Jet) -> Wish:
         """Return a robust wish with what its residuals count, at the points' jet, in its scale."""
@@ -179,29 +187,25 @@ class BendProblem:
         return free
 
     def residual(self, free: Tensor) -> Tensor:
-        """Return r, of shape (M,)."""
-        parts = [self.factor.T @ free - self.target]
-        parts += [(wish.scale * linear.residual).T.flatten() for wish, linear in self._asked(free)]
-        return torch.cat(parts)
+        """Return r, of shape (M,), without values that are as they should be; M depends on how many are."""
+        return self._residual(free, self._asked(free))
 
     def linearise(self, free: Tensor) -> tuple[DenseJacobian, Tensor]:
-        """Return J, of shape (M, p), and r, without the rows of values of which nothing is asked, which are zero."""
-        rows, parts = [self.factor.T], [self.factor.T @ free - self.target]
-        for wish, linear in self._asked(free):
-            points, scale, residual = wish.points, wish.scale, linear
-            if wish.still is not None:
-                active = linear.residual.ne(0).any(dim=1)
-                assert linear.by_value is not None, "residuals of the value"
-                points, scale = points[active], scale[active]
-                residual = Linearised(linear.residual[active], linear.by_value[active], None)
-            rows.append(self.sines.rows(points, residual, scale))
-            parts.append((scale * residual.residual).T.flatten())
-        return DenseJacobian(torch.cat(rows)), torch.cat(parts)
+        """Return J, of shape (M, p), and r."""
+        asked = list(self._asked(free))
+        rows = [self.sines.rows(wish.points, linear, wish.scale) for wish, linear in asked]
+        return DenseJacobian(torch.cat([self.factor.T, *rows])), self._residual(free, asked)
+
+    def _residual(self, free: Tensor, asked: Iterable[tuple[Wish, Linearised]]) -> Tensor:
+        parts = [(wish.scale * linear.residual).T.flatten() for wish, linear in asked]
+        return torch.cat([self.factor.T @ free - self.target, *parts])
 
     def _asked(self, free: Tensor) -> Iterator[tuple[Wish, Linearised]]:
         for wish, known in zip(self.wishes, self.known, strict=True):
-            jet = self.sines.jet if wish.still is None else self.sines.value
-            yield wish, wish.asked(jet(free, wish.points, known))
+            if wish.still is None:
+                yield wish, wish.asked(self.sines.jet(free, wish.points, known))
+            else:
+                yield wish.unmet(self.sines.value(free, wish.points, known))
 
 
 def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], amplitudes: Tensor, steps: int) -> Tensor:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -181,6 +181,7 @@ class Trials:
     predicted: Sequence[Int]
     held: Mask
     device: str
+    _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> Trials:
@@ -203,8 +204,7 @@ class Trials:
             """Return the least score of a length, over the noises."""
             if not 0 <= number < len(LENGTHS):
                 return np.inf
-            if number not in scores:
-                scores[number] = self.scores(LENGTHS[number] * self.radius)
+            scores[number] = self.scores(LENGTHS[number] * self.radius)
             return float(scores[number].mean(axis=0).min())
 
         at = FIRST
@@ -222,8 +222,11 @@ class Trials:
         return [(min(position * self.radius, most), angle) for position, angle in CHOICES]
 
     def scores(self, length: float) -> Float:
-        """Return the scores of a length, of shape (patches, noises), in radii."""
-        return np.array([self._scores(number, length) for number in range(len(self.centers))]) / self.radius
+        """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
+        if length not in self._scored:
+            found = np.array([self._scores(number, length) for number in range(len(self.centers))])
+            self._scored[length] = found / self.radius
+        return self._scored[length]
 
     def _scores(self, number: int, length: float) -> list[float]:
         """Return the scores of one patch for each choice of noise."""

@@ -37,7 +37,7 @@ from gnrecon.fit.start import FINAL_POINTS, RIDGE
 from gnrecon.fit.terms import Term
 from gnrecon.linalg.cholesky import damped_factor
 from gnrecon.residuals import SecondOrder, free_space
-from gnrecon.sampling import Density
+from gnrecon.sampling import Density, least_values
 
 GLOBAL_STEPS, CUBE_STEPS = 8, 3
 """Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""
@@ -56,8 +56,8 @@ ATTEMPTS = 8
 FREE, CLEAR, MORE = 100.0, 0.05, 3
 """Weight of the free space, how far from the scan it begins, in radii, and how many times the fit's samples it has."""
 
-STEEPNESS, DEEP = 0.3, 0.03
-"""Least magnitude of f there as a share of the distance, and the most that is asked."""
+DEEP = 0.03
+"""The most that is asked of f there, in magnitude."""
 
 _FREE_SPACE = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
 
@@ -81,8 +81,7 @@ class Free:
         x, distance = scene.volume(MORE * scene.volume_count, rng)
         certain = np.abs(scene.coarse.winding_number(x) - 0.5) > CERTAIN
         kept = certain & (np.abs(distance) > CLEAR)
-        x, distance = x[kept], distance[kept]
-        return cls(x, np.sign(distance) * np.minimum(STEEPNESS * np.abs(distance), DEEP))
+        return cls(x[kept], least_values(distance[kept], DEEP))
 
     def wishes(self, rows: Mask, known: Float, scale: float, like: Tensor) -> list[Wish]:
         """Return what is asked at some of the points.
@@ -91,13 +90,13 @@ class Free:
         ----------
         rows : mask of them
         known : value at all points, of shape (Q,), of what the features are added to
-        scale : of each point's residual, for a weight of one
+        scale : of the root mean square residual of all points, for a weight of one
         like : tensor whose device is used
         """
         if not rows.any():
             return []
         points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
-        scales = torch.full_like(least, scale * FREE**0.5)[:, None]
+        scales = torch.full_like(least, scale * (FREE / len(rows)) ** 0.5)[:, None]
         return [Wish(_FREE_SPACE, points, scales, target=least, still=still)]
 
 
@@ -175,8 +174,7 @@ class Shaping:
         if equations is None or not wishes:
             return amplitudes
         near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
-        scale = (len(self.density.points) / len(near)) ** 0.5 / belief.position
-        wishes += self.free.wishes(near, self.in_free, scale, amplitudes)
+        wishes += self.free.wishes(near, self.in_free, len(self.density.points) ** 0.5 / belief.position, amplitudes)
         whole, known = as_sines(self.sdf)
 
         def base(x: Tensor) -> Jet:
@@ -198,7 +196,7 @@ def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.ran
     everywhere, free = (np.ones(len(one), dtype=bool) for one in (shaping.sheet.points, shaping.free.points))
     wishes = shaping.wishes(everywhere, max(len(everywhere), 1) ** -0.5, like)
     # The global field is all of f.
-    wishes += shaping.free.wishes(free, np.zeros(len(free)), max(len(free), 1) ** -0.5, like)
+    wishes += shaping.free.wishes(free, np.zeros(len(free)), 1.0, like)
     x, wanted = _volume(shaping, scene, scene.volume_count, rng)
     for left in reversed(range(ROUNDS)):
         volume = scene.tensor(x), scene.tensor(wanted)

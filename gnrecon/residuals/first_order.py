@@ -41,9 +41,7 @@ def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lin
     With least values as targets, of shape (N,), r = min(0, f - target).
     """
     del gradient
-    excess = value if target is None else value - target
-    within = excess < 0
-    return Linearised(torch.where(within, excess, 0.0)[:, None], within.to(value)[:, None], None)
+    return _below_zero(value if target is None else value - target, torch.ones_like(value))
 
 
 def free_space(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
@@ -54,9 +52,7 @@ def free_space(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linear
     del gradient
     assert target is not None, "free space has targets"
     sign = torch.sign(target)
-    short = sign * (value - target)
-    within = short < 0
-    return Linearised(torch.where(within, short, 0.0)[:, None], torch.where(within, sign, 0.0)[:, None], None)
+    return _below_zero(sign * (value - target), sign)
 
 
 def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
@@ -110,3 +106,9 @@ def _length(gradient: Tensor) -> Tensor:
     """|grad f| of shape (N, 1), bounded below so that a critical point of f has a finite direction."""
     length: Tensor = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
     return length.clamp_min(1e-12)
+
+
+def _below_zero(excess: Tensor, by_value: Tensor) -> Linearised:
+    """Return r = min(0, excess), of shape (N, 1), from the excess and its derivative by f, of shape (N,) each."""
+    below = excess < 0
+    return Linearised(torch.where(below, excess, 0.0)[:, None], torch.where(below, by_value, 0.0)[:, None], None)

@@ -26,7 +26,7 @@ from gnrecon.field.activation import SINE
 from gnrecon.linalg import Auto, layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
-from gnrecon.sampling import Box, CoarseDistance
+from gnrecon.sampling import Box, CoarseDistance, least_values
 from gnrecon.shapes.problem import ShapeProblem, Start
 from gnrecon.shapes.term import Drawn, Moment, Sampler, Term, at_points, growing, in_box
 
@@ -53,8 +53,8 @@ CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
 sign of sparse points is a guess here and there."""
 
-STEEPNESS, DEEP = 0.3, 0.05
-"""Least magnitude of f there as a share of the distance, and the most that is asked."""
+DEEP = 0.05
+"""The most that is asked of f there, in magnitude."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler
     known, signed, distance = coarse.at(pool, CLEAR_DISKS)
     clear = distance > CLEAR
     points = torch.as_tensor(pool[known][clear])
-    least = torch.as_tensor(np.sign(signed[clear]) * np.minimum(STEEPNESS * np.abs(signed[clear]), DEEP))
+    least = torch.as_tensor(least_values(signed[clear], DEEP))
 
     def draw(moment: Moment) -> Drawn:
         # A cloud of few points may leave nothing of the box so far from it that its sign is known.

@@ -76,7 +76,7 @@ def chosen(gains: dict[Averaging, float], edges: bool) -> Averaging | None:
             return np.full((100, 3), 0.5) - self.gain - scatter
 
     choice = Choice(belief, np.full((100, 3), 0.5))
-    found = _best(choice, lambda one: Scores(gains.get(one, -1.0)), edges)  # type: ignore[arg-type,return-value]
+    found = _best(choice, lambda one: Scores(gains.get(one, -1.0)), lambda: edges)  # type: ignore[arg-type,return-value]
     return None if found is None else found[0]
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 from holed_can import RADIUS, can, distance
 
 from gnrecon.cloud import Frame, PointCloud, Samples
 from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, fit
+from gnrecon.fit.shaped import FREE, Free
 from gnrecon.fit.sheet import Sheet, _joined
 from gnrecon.ingest import prepare
 from gnrecon.sampling import Density
@@ -88,6 +90,21 @@ def test_the_same_again_is_the_same() -> None:
     assert one.detail is not None
     assert other.detail is not None
     assert one.detail.amplitudes.equal(other.detail.amplitudes)
+
+
+def test_a_cloud_without_known_free_space_is_asked_for_none() -> None:
+    free = Free(np.zeros((0, 3)), np.zeros(0))
+    assert free.wishes(np.zeros(0, dtype=bool), np.zeros(0), 1.0, torch.zeros(0)) == []
+
+
+def test_the_free_space_counts_as_a_whole() -> None:
+    free = Free(np.eye(3), np.array([0.03, -0.03, 0.01]))
+    (wish,) = free.wishes(np.array([True, False, True]), np.arange(3.0), 2.0, torch.zeros(0, dtype=torch.float64))
+    assert wish.points.tolist() == [[1, 0, 0], [0, 0, 1]]
+    assert wish.still is not None
+    assert wish.still.tolist() == [0, 2]
+    # All three points together weigh as much as is asked, whatever part of them a cube holds.
+    assert (wish.scale**2).flatten().tolist() == pytest.approx([4 * FREE / 3] * 2)
 
 
 def test_sheets_without_data_are_no_part_of_the_shape() -> None:
