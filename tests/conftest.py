@@ -25,6 +25,15 @@ hypothesis.settings.register_profile("gnrecon", deadline=None)
 hypothesis.settings.load_profile("gnrecon")
 
 
+LONGEST = ("test_docs.py",)
+"""Files that take minutes. Each is one process's, so that one begun late would leave the others without work."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The folder that holds setup.cfg."""

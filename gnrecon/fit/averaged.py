@@ -62,7 +62,7 @@ class Told:
     averaging: Averaging | None = None
 
 
-def told(sdf: NeuralSDF, samples: Samples, held: Mask, rng: np.random.Generator, device: str) -> Told:
+def told(sdf: NeuralSDF, samples: Samples, held: Mask, features: int, rng: np.random.Generator, device: str) -> Told:
     """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
 
     Parameters
@@ -70,12 +70,13 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, rng: np.random.Generator,
     sdf : the global field, in the samples' frame
     samples : all of them
     held : mask of shape (N,), of samples that the global field has not seen
+    features : number of features a cube, which patches do not exceed
     rng : draws patches and features
     device : a torch device
     """
     leftover = Leftover.of(sdf, samples)
     radius = leftover.density.radius
-    trials = Trials.draw(leftover, held, radius, rng, device)
+    trials = Trials.draw(leftover, held, radius, rng, device, features)
     choice = trials.choice()
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:

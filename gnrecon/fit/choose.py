@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.features import Features
-from gnrecon.fit.patch import Belief, Patch, PatchSystem
+from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
 
@@ -184,10 +184,19 @@ class Trials:
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
-    def draw(cls, leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str) -> Trials:
-        """Draw the patches; parameters as those of `choose`."""
+    def draw(
+        cls,
+        leftover: Leftover,
+        held: Mask,
+        radius: float,
+        rng: np.random.Generator,
+        device: str,
+        most_features: int = FEATURES,
+    ) -> Trials:
+        """Draw the patches, of at most so many features; the other parameters as those of `choose`."""
         out = np.flatnonzero(held)
         patches, count = (DENSE_PATCHES, DENSE_FEATURES) if len(leftover) > DENSE else (PATCHES, FEATURES)
+        count = min(count, most_features)
         chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(HELD_NEAR, len(out)) + 1))
@@ -239,10 +248,12 @@ class Trials:
             far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
             rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
         patch = self.leftover.patch(rows, center, Volume.none(), self.device)
-        system = PatchSystem(patch, self.features, length, patch.size)
+        system = patch_system(patch, self.features, length, patch.size)
         target = self.told.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.told.normals[predicted], device=self.device)
-        return [self._score(system.solve(p, a), target, normals, length) for p, a in self.noises]
+        # Of a scan that is nearly exact, what is left over makes several noises one.
+        found = {each: self._score(system.solve(*each), target, normals, length) for each in set(self.noises)}
+        return [found[each] for each in self.noises]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
         value, gradient = self.features.sums(amplitudes, target.points, target.center, length, 1)

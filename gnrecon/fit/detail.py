@@ -74,7 +74,7 @@ def fit_detail(
     advance : told of the share that is done
     shape : gives what is asked of the surface besides, for the length of the detail
     """
-    found = told(sdf, samples, held, rng, device)
+    found = told(sdf, samples, held, features, rng, device)
     samples, leftover, belief = found.samples, found.leftover, found.belief
     _log.info(
         "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",

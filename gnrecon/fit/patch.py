@@ -92,8 +92,8 @@ class PatchSystem:
         parts = [_data_sums(patch, features, length, slice(n, n + ROWS)) for n in range(0, len(like), ROWS)]
         positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
         self._positions, self._angles = (positions, of_positions), (angles, of_angles)
-        free = features.phase(patch.volume, patch.center, length).sin() / (SHARE * patch.distance[:, None])
-        self._volume = gram([free], count, like), free.T @ (patch.wanted / (SHARE * patch.distance))
+        free, wanted = _volume_rows(patch, features, length)
+        self._volume = gram([free], count, like), free.T @ wanted
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
@@ -113,26 +113,77 @@ class PatchSystem:
 
     def _factored(self, position: float, angle: float) -> tuple[Tensor | None, Tensor]:
         """Return the Cholesky factor and the right-hand side for amplitudes over their standard deviation."""
-        data = self._positions[0] / position**2 + self._angles[0] / angle**2
-        product = self._scale**2 * (data + self._volume[0])
         right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2 + self._volume[1])
         damping = torch.ones_like(right)
         for _ in range(ATTEMPTS):
-            factor = damped_factor(product, damping)
+            factor = damped_factor(self._product(position, angle), damping, overwrite=True)
             if factor is not None:
                 return factor, right
             damping = 10 * damping
         return None, right
 
+    def _product(self, position: float, angle: float) -> Tensor:
+        """Return s^2 J^T J in its lower triangle, in as few passes over the matrices as there are matrices."""
+        product: Tensor = self._positions[0] * (self._scale / position) ** 2
+        product.add_(self._angles[0], alpha=(self._scale / angle) ** 2)
+        return product.add_(self._volume[0], alpha=self._scale**2)
+
+
+class RowSystem:
+    """The same system in the space of its rows, for a patch of few points: K + 1 with K = s^2 J J^T.
+
+    The most probable amplitudes are s^2 J^T (s^2 J J^T + 1)^-1 r. Parameters are those of `PatchSystem`.
+    Source: Rasmussen and Williams (2006), equation 2.12.
+    """
+
+    def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
+        variance = size**2 * 2.0 / len(features)
+        sines, slopes = _data_rows(patch, features, length, slice(None))
+        free, wanted = _volume_rows(patch, features, length)
+        rows = torch.cat([sines, *slopes, free])
+        self._spread = variance * rows.T
+        self._kernel = rows @ self._spread
+        self._wanted = torch.cat([patch.value, patch.gradient.T.flatten(), wanted])
+        self._counts = torch.tensor([len(sines), 3 * len(sines), len(free)], device=rows.device)
+
+    def solve(self, position: float, angle: float) -> Tensor:
+        """Return amplitudes, of shape (m,), as `PatchSystem.solve` does."""
+        each = torch.tensor([1 / position, 1 / angle, 1.0]).to(self._wanted)
+        weights = each.repeat_interleave(self._counts)
+        damping = torch.ones_like(weights)
+        for _ in range(ATTEMPTS):
+            factor = damped_factor((weights[:, None] * self._kernel).mul_(weights), damping, overwrite=True)
+            if factor is not None:
+                return self._spread @ (weights * solve_factored(factor, weights * self._wanted))
+            damping = 10 * damping
+        return torch.zeros_like(self._spread[:, 0])
+
+
+def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | RowSystem:
+    """Return the smaller one of the two systems that `solve` may use; parameters as those of `PatchSystem`."""
+    rows = 4 * len(patch.points) + len(patch.volume)
+    return (RowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
+
 
 def _data_sums(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return matrix and right-hand side of some rows' positions, and those of their normals."""
-    z = features.phase(patch.points[rows], patch.center, length)
-    sines, cosines = z.sin(), z.cos()
+    sines, slopes = _data_rows(patch, features, length, rows)
     like, count, wanted = patch.value, len(features), patch.gradient[rows].T
-    slopes = [cosines * (features.frequencies[:, axis] / length) for axis in range(3)]
     right = sum((s.T @ target for s, target in zip(slopes, wanted, strict=True)), torch.zeros(count).to(like))
     return gram([sines], count, like), sines.T @ patch.value[rows], gram(slopes, count, like), right
+
+
+def _data_rows(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, list[Tensor]]:
+    """Return the features at some points, of shape (N, m), and their derivatives along each axis."""
+    z = features.phase(patch.points[rows], patch.center, length)
+    sines, cosines = z.sin(), z.cos()
+    return sines, [cosines * (features.frequencies[:, axis] / length) for axis in range(3)]
+
+
+def _volume_rows(patch: Patch, features: Features, length: float) -> tuple[Tensor, Tensor]:
+    """Return the features at the samples of the volume, of shape (Q, m), and what is wanted, over their deviation."""
+    deviation = SHARE * patch.distance
+    return features.phase(patch.volume, patch.center, length).sin() / deviation[:, None], patch.wanted / deviation
 
 
 def _summed(parts: tuple[Tensor, ...]) -> Tensor:

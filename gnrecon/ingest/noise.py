@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 Float = npt.NDArray[np.float64]
 
@@ -86,7 +86,9 @@ def _spread(tree: cKDTree, chosen: Float, size: int) -> tuple[float, float]:
     rest = w - np.einsum("gkc,gc->gk", basis, np.einsum("gkc,gk->gc", basis, w))
     freedom = size - columns.shape[2]
     squares = (rest**2).sum(axis=1) * distances[:, -1] ** 2
-    return float(np.sqrt(np.median(squares) / chi2.median(freedom))), float(np.median(distances[:, -1]))
+    # Of chi squared, without scipy.stats, which takes as long to load as the rest of scipy.
+    median = 2 * gammaincinv(freedom / 2, 0.5)
+    return float(np.sqrt(np.median(squares) / median)), float(np.median(distances[:, -1]))
 
 
 def local_frames(groups: Float) -> Float:

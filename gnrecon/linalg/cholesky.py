@@ -49,9 +49,12 @@ class Cholesky:
         return "Dense normal equations by Cholesky."
 
 
-def damped_factor(product: Tensor, diagonal: Tensor) -> Tensor | None:
-    """Return the lower Cholesky factor of `product` + diag(`diagonal`), or None where that is not positive definite."""
-    damped = product.clone()
+def damped_factor(product: Tensor, diagonal: Tensor, overwrite: bool = False) -> Tensor | None:
+    """Return the lower Cholesky factor of `product` + diag(`diagonal`), or None where that is not positive definite.
+
+    With `overwrite`, `product` is not kept as it was, which spares a copy.
+    """
+    damped = product if overwrite else product.clone()
     damped.diagonal().add_(diagonal)
     factor, failed = torch.linalg.cholesky_ex(damped)
     return None if int(failed) or not bool(torch.isfinite(factor.diagonal()).all()) else factor

@@ -108,7 +108,7 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
         tried: list[bool] = []
         field: NeuralSDF = None  # type: ignore[assignment]
         given = replace(samples, estimated=estimated)
-        found = told(field, given, np.zeros(300, dtype=bool), np.random.default_rng(0), "cpu")
+        found = told(field, given, np.zeros(300, dtype=bool), 300, np.random.default_rng(0), "cpu")
         assert found.samples is given
         assert found.belief is choice.belief
         assert found.averaging is None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.features import Features
-from gnrecon.fit.patch import SHARE, SIZE, Patch, PatchSystem
+from gnrecon.fit.patch import SHARE, SIZE, Patch, PatchSystem, RowSystem, patch_system
 
 LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
 
@@ -45,11 +45,14 @@ def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor]:
     return J, r
 
 
-def test_amplitudes_are_the_mode_of_bayesian_regression(patch: Patch, features: Features) -> None:
+@pytest.mark.parametrize("system", [PatchSystem, RowSystem])
+def test_amplitudes_are_the_mode_of_bayesian_regression(
+    system: type[PatchSystem | RowSystem], patch: Patch, features: Features
+) -> None:
     prior = SIZE * float(patch.value.square().mean().sqrt()) * (2 / len(features)) ** 0.5
     J, r = plainly(patch, features)
     expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
-    found = PatchSystem(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
+    found = system(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
     torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
 
 
@@ -61,3 +64,16 @@ def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Feature
         misfits.append(float((value - patch.value).norm()))
     assert misfits == sorted(misfits)
     assert misfits[-1] > 1.1 * misfits[0]
+
+
+def test_the_smaller_system_is_solved(patch: Patch, features: Features, rng: np.random.Generator) -> None:
+    many = Features.draw(89, rng, torch.zeros(0, dtype=torch.float64))
+    # The patch has 20 values, 60 derivatives and 8 samples of the volume.
+    assert isinstance(patch_system(patch, many, LENGTH, patch.size), RowSystem)
+    assert isinstance(patch_system(patch, features, LENGTH, patch.size), PatchSystem)
+
+
+def test_what_rounding_makes_indefinite_is_damped_more(patch: Patch, features: Features) -> None:
+    for system in (PatchSystem, RowSystem):
+        amplitudes = system(patch, features, LENGTH, 1e12).solve(1e-9, 1e-9)
+        assert bool(torch.isfinite(amplitudes).all())
