@@ -70,7 +70,7 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, features: int, rng: np.ra
     sdf : the global field, in the samples' frame
     samples : all of them
     held : mask of shape (N,), of samples that the global field has not seen
-    features : number of features a cube, which patches do not exceed
+    features : number of features a cube
     rng : draws patches and features
     device : a torch device
     """

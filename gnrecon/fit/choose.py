@@ -191,12 +191,14 @@ class Trials:
         radius: float,
         rng: np.random.Generator,
         device: str,
-        most_features: int = FEATURES,
+        cube_features: int = FEATURES,
     ) -> Trials:
-        """Draw the patches, of at most so many features; the other parameters as those of `choose`."""
+        """Draw the patches, for cubes of so many features; the other parameters as those of `choose`."""
         out = np.flatnonzero(held)
-        patches, count = (DENSE_PATCHES, DENSE_FEATURES) if len(leftover) > DENSE else (PATCHES, FEATURES)
-        count = min(count, most_features)
+        dense = len(leftover) > DENSE
+        patches = DENSE_PATCHES if dense else PATCHES
+        # What is to predict a cube of few features resolves no more than it.
+        count = DENSE_FEATURES if dense or cube_features <= DENSE_FEATURES else FEATURES
         chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(HELD_NEAR, len(out)) + 1))
