@@ -19,7 +19,7 @@ from gnrecon.cloud import Float
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Int, Partition
 
-ROWS = 2048
+ROWS = 512
 """Points that are evaluated together: their features stay in the processor's cache."""
 
 

@@ -53,12 +53,12 @@ class Features:
         list of Tensor
             Of shapes (N,), (N, 3) and (N, 3, 3).
         """
+        # The amplitudes go with the frequencies, of which there are few, and not with a matrix of a column a feature.
         z = self.phase(x, center, length)
-        sines = z.sin()
-        parts = [sines @ amplitudes]
-        if order >= 1:
-            parts.append((z.cos() * (amplitudes / length)) @ self.frequencies)
+        columns = [amplitudes[:, None]]
         if order >= 2:
-            squares = (self.frequencies[:, :, None] * self.frequencies[:, None, :]).reshape(-1, 9)
-            parts.append(-((sines * (amplitudes / length**2)) @ squares).reshape(-1, 3, 3))
-        return parts
+            waves = self.frequencies / length
+            columns.append(-amplitudes[:, None] * (waves[:, :, None] * waves[:, None, :]).reshape(-1, 9))
+        along = [z.cos() @ (self.frequencies * (amplitudes / length)[:, None])] if order >= 1 else []
+        sums = z.sin() @ torch.cat(columns, dim=1)
+        return [sums[:, 0], *along, *([sums[:, 1:].reshape(-1, 3, 3)] if order >= 2 else [])]

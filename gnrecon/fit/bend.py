@@ -131,7 +131,9 @@ class Sines:
     def on_surface(self, amplitudes: Tensor, x: Tensor) -> Tensor:
         """Return points, of shape (N, 3), moved along the gradient onto the zero level, as far as it is near."""
         for _ in range(FOLLOWED):
-            value, gradient, _ = self.jet(amplitudes, x, self.known(x))
+            known = self.known(x)
+            value, gradient = self.features.sums(amplitudes, x, self.center, self.length, 1)
+            value, gradient = known[0] + value, known[1] + gradient
             step = value[:, None] * gradient / gradient.square().sum(1, keepdim=True).clamp_min(1e-6)
             far = torch.linalg.vector_norm(step, dim=1, keepdim=True).clamp_min(self.reach)
             x = x - step * (self.reach / far)
