@@ -117,13 +117,15 @@ surface_strain = SecondOrder("surface strain", _strain)
 def clipped_strain(maximum: float) -> SecondOrder:
     """Return the strain that counts as `maximum`, in squared inverse lengths, wherever it is more.
 
-    There the loss is constant, so that edges and creases neither dominate it nor are pulled at.
+    There the loss is constant, so that edges and creases neither dominate it nor are pulled at. Targets, of shape (N,),
+    are maxima of their own.
     """
 
     def linearise(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | None) -> Linearised:
-        linear = _strain(value, gradient, hessian, target)
-        beyond = linear.residual.square().sum(1) > maximum
-        constant = linear.residual.new_tensor([math.sqrt(maximum), 0.0, 0.0])
+        linear = _strain(value, gradient, hessian, None)
+        most = torch.full_like(value, maximum) if target is None else target
+        beyond = linear.residual.square().sum(1) > most
+        constant = torch.stack([most.sqrt(), torch.zeros_like(most), torch.zeros_like(most)], 1)
         return Linearised(
             torch.where(beyond[:, None], constant, linear.residual),
             None,

@@ -72,6 +72,10 @@ CLEARANCE = 0.5
 ACTIVE = 0.015
 """Points outside of the region with a larger value than this have no residual, nor will have after the step."""
 
+CLIP_START, CLIP_FALL = 100.0, 0.99
+"""How many times its end the clipping's maximum is at first, and its factor from step to step. What is clipped is not
+pulled at: creases of a part that has not found its shape yet would stay."""
+
 BESIDE = 0.02
 """Distance from an interface within which the strain is none of the part's."""
 
@@ -116,7 +120,7 @@ def bracket(design: Design, seed: int = 0, clip: float | None = None, network: N
             Term("design region", design_region, _outside(around, distance, off_walls), REGION),
             Term("interface", interface, at_points(walls.points, count=ON_INTERFACES), INTERFACE),
             Term("normal", normal_vector, at_points(walls.points, walls.normals, count=ON_INTERFACES), NORMAL),
-            Term("surface strain", strain, _free_surface(off_walls), STRAIN),
+            Term("surface strain", strain, _free_surface(off_walls, clip), STRAIN),
             Term("connectedness", signed_distance, _joints(design, walls.points), CONNECTED),
             Term("eikonal", eikonal, in_box(IN_BOX), EIKONAL),
         ),
@@ -173,13 +177,17 @@ def _outside(around: Float, distance: Float, off_walls: Callable[[Float], Float]
     return draw
 
 
-def _free_surface(off_walls: Callable[[Float], Float]) -> Sampler:
-    """Return a sampler of the surface away from the interfaces, whose shape is given."""
+def _free_surface(off_walls: Callable[[Float], Float], clip: float | None) -> Sampler:
+    """Return a sampler of the surface away from the interfaces, which are given, with the most strain that counts."""
     everywhere = on_surface(ON_SURFACE)
 
     def draw(moment: Moment) -> Drawn:
         points = everywhere(moment).points
-        return Drawn(points[torch.as_tensor(off_walls(points.numpy()) > BESIDE)], on_surface=True)
+        points = points[torch.as_tensor(off_walls(points.numpy()) > BESIDE)]
+        if clip is None:
+            return Drawn(points, on_surface=True)
+        most = clip * max(1.0, CLIP_START * CLIP_FALL ** min(moment.step, 1000))
+        return Drawn(points, torch.full_like(points[:, 0], most), on_surface=True)
 
     return draw
 

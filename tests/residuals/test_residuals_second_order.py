@@ -214,6 +214,10 @@ def test_clipping_caps_the_loss_and_lets_go() -> None:
     smooth = surface_strain(torch.zeros(3, dtype=F64), gradient, hessian)
     assert torch.equal(linear.by_hessian[1:], smooth.by_hessian[1:])
     assert "50" in clipped_strain(50.0).name
+    own = clipped_strain(50.0)(
+        torch.zeros(3, dtype=F64), gradient, hessian, torch.tensor([300.0, 1.0, 0.01], dtype=F64)
+    )
+    torch.testing.assert_close(own.residual.square().sum(1), torch.tensor([200.0, 1.0, 0.01], dtype=F64))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])

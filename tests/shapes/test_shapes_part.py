@@ -109,6 +109,14 @@ def test_the_strain_can_be_clipped(design: Design) -> None:
     assert names == ["surface strain, at most 50"]
 
 
+def test_clipping_begins_far_above_its_maximum(design: Design) -> None:
+    clipped, whole = (bracket(design, network=SMALL, clip=clip) for clip in (50.0, None))
+    assert drawn(whole, "surface strain", moment(whole, 1)).target is None
+    found = [drawn(clipped, "surface strain", moment(clipped, step)) for step in (1, 100, 1000, LAST)]
+    maxima = [float(one.target.unique()) for one in found if one.target is not None]
+    assert maxima == pytest.approx([50 * 99.0, 50 * 100 * 0.99**100, 50.0, 50.0])
+
+
 def test_the_start_is_the_region_worn_off_but_at_the_interfaces(problem: ShapeProblem, design: Design) -> None:
     walls = design.interfaces.sample(2000, np.random.default_rng(2)).points
     np.testing.assert_allclose(problem.start(torch.as_tensor(walls)), design.region.distance(walls), atol=2e-3)
