@@ -13,8 +13,11 @@ from reproduction.figures import HIGH, LOW, MIDDLE, coloured
 from gnrecon.mesh import Mesh
 
 
-def test_an_experiment_is_run_once_and_drawn(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_experiment_is_run_once_and_drawn(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("matplotlib")
+    monkeypatch.setattr("reproduction.figures.SIZES", ((70, 56), (46, 40)))
     words = ["-o", str(tmp_path), "--only", "cone", "--steps", "1", "--resolution", "16"]
     assert main(words) == 0
     assert "cone by gn" in capfd.readouterr().err

@@ -121,18 +121,19 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
     distance = answer["t_hit"].numpy()
     hit = np.isfinite(distance)
     corners = mesh.faces[answer["primitive_ids"].numpy()[hit]]
-    u, v = answer["primitive_uvs"].numpy()[hit].astype(np.float64).T
-    normals = np.einsum("ij,ijk->ik", np.stack([1 - u - v, u, v], axis=1), mesh.vertex_normals()[corners])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    # In single precision, which is more than a picture has: there are millions of samples.
+    u, v = answer["primitive_uvs"].numpy()[hit].T
+    shares = np.stack([1 - u - v, u, v], axis=1)
+    normals = np.einsum("ij,ijk->ik", shares, mesh.vertex_normals().astype(np.float32)[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-9))
     if "colors" in mesh.attributes:
         light = to_light(as_bytes(mesh.attributes["colors"])[:, :3])
-        color = np.einsum("ij,ijk->ik", np.stack([1 - u - v, u, v], axis=1), light[corners])
-    places = rays[hit][:, :3] + distance[hit][:, None] * rays[hit][:, 3:]
+        color = np.einsum("ij,ijk->ik", shares, light.astype(np.float32)[corners])
     # The sky is looked for once a pixel of the picture, not once a sample: it varies slowly, and costs most.
     coarse = np.zeros_like(hit)
     coarse[::SUPERSAMPLING, ::SUPERSAMPLING] = hit[::SUPERSAMPLING, ::SUPERSAMPLING]
-    chosen = coarse[hit]
-    small = sky_share(scene, places[chosen], normals[chosen], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
+    places = rays[coarse][:, :3] + distance[coarse][:, None] * rays[coarse][:, 3:]
+    small = sky_share(scene, places, normals[coarse[hit]], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
     sky = small.repeat(SUPERSAMPLING, 0).repeat(SUPERSAMPLING, 1)[: hit.shape[0], : hit.shape[1]]
     image = _background(camera)
     image[hit] = shade(normals, color, camera.axes, sky[hit])

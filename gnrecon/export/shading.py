@@ -38,18 +38,20 @@ def shade(normals: Float, color: Float, axes: Float, sky: Float | float) -> Floa
     sky : array of shape (N,), or float
         Share of the sky that is seen.
     """
-    seen = normals @ axes.T
+    # In the precision of the normals, of which there may be millions.
+    kind = normals.dtype
+    seen = normals @ axes.T.astype(kind)
     # Squared, because light that bounces between close walls is missing, and hollows should read as hollows.
-    share = np.broadcast_to(np.square(sky), len(seen))[:, None]
+    share = np.broadcast_to(np.square(np.asarray(sky, dtype=kind)), len(seen))[:, None]
     height = (seen[:, 1:2] + 1) / 2
-    light = (GROUND + (SKY - GROUND) * height) * share
+    light = (GROUND.astype(kind) + (SKY - GROUND).astype(kind) * height) * share
     for direction, strength in (KEY, FILL):
         # Wrapping the light a little round the form keeps the shaded side readable.
-        facing = np.clip((seen @ (direction / np.linalg.norm(direction)) + 0.15) / 1.15, 0, 1)
-        light = light + strength * facing[:, None] * (0.35 + 0.65 * share)
+        facing = np.clip((seen @ (direction / np.linalg.norm(direction)).astype(kind) + 0.15) / 1.15, 0, 1)
+        light += strength * facing[:, None] * (0.35 + 0.65 * share)
     half = KEY[0] / np.linalg.norm(KEY[0]) + np.array([0, 0, 1])
-    gloss = np.clip(seen @ (half / np.linalg.norm(half)), 0, 1) ** 40
-    result: Float = color * light / EXPOSURE + 0.06 * gloss[:, None] * share
+    gloss = np.clip(seen @ (half / np.linalg.norm(half)).astype(kind), 0, 1) ** 40
+    result: Float = color.astype(kind) * light / EXPOSURE + 0.06 * gloss[:, None] * share
     return result
 
 

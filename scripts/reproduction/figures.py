@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from benchmarks.sheet import Row, draw_row, write_sheet
+from benchmarks.sheet import PANEL, Row, draw_row, write_sheet
 
 from gnrecon.export import render
 from gnrecon.io import read_mesh
@@ -25,6 +25,9 @@ SHOWN = 98.0
 VIEW = (35.0, 25.0)
 UP = {"bunny": "y", "bunny-sparse": "y", "rockerarm": "y"}
 """Azimuth and elevation of the pictures, and the upward axis where it is not z."""
+
+SIZES = (700, 560), PANEL
+"""Width and height of a surface's own picture and of its panel in that of all, in pixels."""
 
 LOW, MIDDLE, HIGH = (33, 102, 172), (247, 247, 247), (178, 24, 43)
 
@@ -72,10 +75,10 @@ def draw_surfaces(done: Sequence[Experiment], folder: Path) -> None:
         most = float(np.median([np.nanpercentile(np.abs(value), SHOWN) for value in values]))
         shown = [coloured(mesh, value, most) for mesh, value in zip(meshes, values, strict=True)]
         for one, mesh in zip(runs, shown, strict=True):
-            render(mesh, one.mesh.with_suffix(".png"), size=(700, 560), views=[VIEW], up=UP.get(problem, "z"))
+            render(mesh, one.mesh.with_suffix(".png"), size=SIZES[0], views=[VIEW], up=UP.get(problem, "z"))
         titles = [f"{problem}, {NAMES[one.optimiser]}" for one in runs]
         titles[0] += f"; full colour at {most:.0e}"
-        rows.append(draw_row(Row(dict(zip(titles, shown, strict=True)), UP.get(problem, "z"), VIEW)))
+        rows.append(draw_row(Row(dict(zip(titles, shown, strict=True)), UP.get(problem, "z"), VIEW), SIZES[1]))
     write_sheet(rows, folder / "surfaces.png")
 
 
