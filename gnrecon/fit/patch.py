@@ -148,8 +148,7 @@ class RowSystem:
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), as `PatchSystem.solve` does."""
-        each = torch.tensor([1 / position, 1 / angle, 1.0]).to(self._wanted)
-        weights = each.repeat_interleave(self._counts)
+        weights = self._wanted.new_tensor([1 / position, 1 / angle, 1.0]).repeat_interleave(self._counts)
         damping = torch.ones_like(weights)
         for _ in range(ATTEMPTS):
             factor = damped_factor((weights[:, None] * self._kernel).mul_(weights), damping, overwrite=True)

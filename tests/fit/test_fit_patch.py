@@ -53,7 +53,7 @@ def test_amplitudes_are_the_mode_of_bayesian_regression(
     J, r = plainly(patch, features)
     expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
     found = system(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
-    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
 
 
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:
