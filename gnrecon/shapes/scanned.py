@@ -45,7 +45,7 @@ MARGIN = 0.2
 EIKONAL, FALL, LEAST = 1e-2, 0.7, 1e-4
 """Weight of the eikonal term to begin with, its factor from step to step, and the least."""
 
-FREE, POOL, IN_FREE = 30.0, 60_000, 20_000
+FREE, POOL, IN_FREE = 1.0, 60_000, 20_000
 """Weight of the free space, points of the box whose sign may be known, and those that are looked at in each step.
 Hardly any of them has a residual, so that it does not stand against the data."""
 
