@@ -11,6 +11,7 @@ and Recht (2007) and observations of the gradient.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -114,13 +115,7 @@ class PatchSystem:
     def _factored(self, position: float, angle: float) -> tuple[Tensor | None, Tensor]:
         """Return the Cholesky factor and the right-hand side for amplitudes over their standard deviation."""
         right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2 + self._volume[1])
-        damping = torch.ones_like(right)
-        for _ in range(ATTEMPTS):
-            factor = damped_factor(self._product(position, angle), damping, overwrite=True)
-            if factor is not None:
-                return factor, right
-            damping = 10 * damping
-        return None, right
+        return _factor(lambda: self._product(position, angle), right), right
 
     def _product(self, position: float, angle: float) -> Tensor:
         """Return s^2 J^T J in its lower triangle, in as few passes over the matrices as there are matrices."""
@@ -149,19 +144,27 @@ class RowSystem:
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), as `PatchSystem.solve` does."""
         weights = self._wanted.new_tensor([1 / position, 1 / angle, 1.0]).repeat_interleave(self._counts)
-        damping = torch.ones_like(weights)
-        for _ in range(ATTEMPTS):
-            factor = damped_factor((weights[:, None] * self._kernel).mul_(weights), damping, overwrite=True)
-            if factor is not None:
-                return self._spread @ (weights * solve_factored(factor, weights * self._wanted))
-            damping = 10 * damping
-        return torch.zeros_like(self._spread[:, 0])
+        factor = _factor(lambda: (weights[:, None] * self._kernel).mul_(weights), weights)
+        if factor is None:
+            return torch.zeros_like(self._spread[:, 0])
+        return self._spread @ (weights * solve_factored(factor, weights * self._wanted))
 
 
 def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | RowSystem:
     """Return the smaller one of the two systems that `solve` may use; parameters as those of `PatchSystem`."""
     rows = 4 * len(patch.points) + len(patch.volume)
     return (RowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
+
+
+def _factor(product: Callable[[], Tensor], like: Tensor) -> Tensor | None:
+    """Return the Cholesky factor of a product, made anew for each attempt, plus one or what more rounding asks."""
+    damping = torch.ones_like(like)
+    for _ in range(ATTEMPTS):
+        factor = damped_factor(product(), damping, overwrite=True)
+        if factor is not None:
+            return factor
+        damping = 10 * damping
+    return None
 
 
 def _data_sums(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -47,7 +47,7 @@ from gnrecon.residuals import (
     surface_strain,
 )
 from gnrecon.shapes.problem import Pretraining, ShapeProblem
-from gnrecon.shapes.term import LAST, Drawn, Moment, Sampler, Term, at_points, in_box, on_surface, rising
+from gnrecon.shapes.term import LAST, Drawn, Moment, Sampler, Term, at_points, falling, in_box, on_surface, rising
 
 NETWORK = Network((24, 24), WAVELET, (14.0, 4.0))
 """The paper's has 2 x 32 wavelets; a step's cost grows with the fourth power of the width."""
@@ -180,14 +180,13 @@ def _outside(around: Float, distance: Float, off_walls: Callable[[Float], Float]
 def _free_surface(off_walls: Callable[[Float], Float], clip: float | None) -> Sampler:
     """Return a sampler of the surface away from the interfaces, which are given, with the most strain that counts."""
     everywhere = on_surface(ON_SURFACE)
+    most = None if clip is None else falling(CLIP_START * clip, CLIP_FALL, clip)
 
     def draw(moment: Moment) -> Drawn:
         points = everywhere(moment).points
         points = points[torch.as_tensor(off_walls(points.numpy()) > BESIDE)]
-        if clip is None:
-            return Drawn(points, on_surface=True)
-        most = clip * max(1.0, CLIP_START * CLIP_FALL ** min(moment.step, 1000))
-        return Drawn(points, torch.full_like(points[:, 0], most), on_surface=True)
+        target = None if most is None else torch.full_like(points[:, 0], most(moment.step))
+        return Drawn(points, target, on_surface=True)
 
     return draw
 

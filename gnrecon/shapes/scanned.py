@@ -28,7 +28,7 @@ from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance, least_values
 from gnrecon.shapes.problem import ShapeProblem, Start
-from gnrecon.shapes.term import Drawn, Moment, Sampler, Term, at_points, growing, in_box
+from gnrecon.shapes.term import Drawn, Moment, Sampler, Term, at_points, falling, growing, in_box
 
 NETWORK = Network((32, 32, 32), SINE, (8.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
@@ -95,7 +95,7 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     terms = (
         Term("interface", interface, at_points(samples.points, count=POINTS)),
         Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
-        Term("eikonal", eikonal, in_box(IN_BOX), lambda step: max(EIKONAL * FALL ** min(step, 100), LEAST), 0.0),
+        Term("eikonal", eikonal, in_box(IN_BOX), falling(EIKONAL, FALL, LEAST), 0.0),
         Term("free space", free_space, _free(coarse, box, np.random.default_rng(seed)), FREE, 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))

@@ -149,6 +149,12 @@ def rising(weight: float, hold: int, factor: float, most: float) -> Weight:
     return at
 
 
+def falling(weight: float, factor: float, least: float) -> Weight:
+    """Return a weight that shrinks by a factor from the first step on, down to the least."""
+    steps = int(math.log(least / weight) / math.log(factor)) + 1
+    return lambda step: max(least, weight * factor ** min(step, steps))
+
+
 def fading(weight: float, hold: int, factor: float, least: float = 1e-5) -> Weight:
     """Return a weight that holds for some steps, then shrinks by a factor a step, and is zero below `least`."""
 

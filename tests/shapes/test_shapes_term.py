@@ -25,7 +25,7 @@ from gnrecon.shapes import (
     rising,
     z_cylinder,
 )
-from gnrecon.shapes.term import LAST
+from gnrecon.shapes.term import LAST, falling
 
 
 def moment(value: object, box: Box, step: int = 1) -> Moment:
@@ -86,6 +86,11 @@ def test_weights_rise_to_the_most_and_are_reported_as_asked() -> None:
     assert [weight(step) for step in (1, 10, 11, 12, 13, 14, LAST)] == [1.0, 1.0, 2.0, 4.0, 5.0, 5.0, 5.0]
     term = Term("interface", interface, in_box(3), weight, reported=1.0)
     assert [term.weight_at(step) for step in (1, 12, LAST)] == [1.0, 4.0, 1.0]
+
+
+def test_weights_fall_to_the_least() -> None:
+    weight = falling(4.0, 0.5, least=0.75)
+    assert [weight(step) for step in (1, 2, 3, LAST)] == [2.0, 1.0, 0.75, 0.75]
 
 
 def test_starts() -> None:
