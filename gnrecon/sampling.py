@@ -132,12 +132,21 @@ class CoarseDistance:
 
         Of these, in their order, follow the signed distances, and those to the nearest point itself.
         """
+        known, size, nearest = self.size(x, clear)
+        return known, self.sign(x[known]) * size, nearest
+
+    def size(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float]:
+        """Return the same as `at`, but for the sign, which is what takes time."""
         # One worker: with several, Ctrl-C unwinds while scipy's threads still use the arrays, and the process crashes.
-        distances, nearest = self._density.tree.query(x)
-        known = distances > clear * self._density.disks[nearest]
-        x, distances, disks = x[known], distances[known], self._density.disks[nearest[known]]
-        sign = np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
-        return known, sign * np.sqrt(distances**2 - disks**2), distances
+        nearest, rows = self._density.tree.query(x)
+        disks = self._density.disks[rows]
+        known = nearest > clear * disks
+        nearest, disks = nearest[known], disks[known]
+        return known, np.sqrt(nearest**2 - disks**2), nearest
+
+    def sign(self, x: Float) -> Float:
+        """Return the sign of the distance, of shape (Q,), at x, of shape (Q, 3)."""
+        return np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
 
     def winding_number(self, x: Float, batch: int = _TOGETHER) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""

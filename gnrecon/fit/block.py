@@ -129,7 +129,7 @@ class Blocks:
         length = cube_length(self.belief, self.disks[rows], self.radius)
         patch = self.leftover.patch(rows, center, self._volume(key, center, around), self.device)
         system = PatchSystem(patch, self.features, length, patch.size)
-        amplitudes = system.solve(self.belief.position, self.belief.angle)
+        amplitudes = system.solve_within(self.belief.position, self.belief.angle)
         return length, amplitudes.cpu().numpy()
 
     def _around(self, key: Int) -> Int:
@@ -142,7 +142,7 @@ class Blocks:
         return np.concatenate([np.zeros(0, dtype=np.int64), *stretches])
 
     def _volume(self, key: Int, center: Float, around: Int) -> Volume:
-        """Return samples of the cube clear of the data, with what the coarse distance asks for there."""
+        """Return samples of the cube clear of the data, with the bounds that the coarse distance sets there."""
         rng = np.random.default_rng([self.seed, CHANCE, *(int(number) + 1 for number in key)])
         x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (VOLUME, 3))
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
@@ -153,4 +153,4 @@ class Blocks:
         inside = self.dipoles.winding_number(x, center, self.partition.reach) > 0.5
         signed = np.where(inside, -1.0, 1.0) * np.sqrt(distance**2 - disks**2)
         has = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume(x, signed - has, distance)
+        return Volume.apart(x, has, signed, distance)

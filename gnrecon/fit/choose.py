@@ -57,6 +57,9 @@ where many scans do not quite match, distances alone are least for a field that 
 MOST_POINTS = 2500
 FEATURES, DENSE_FEATURES = 700, 300
 LEAST_SLOPE = 0.05
+ENOUGH = 0.5
+"""Least size of the field in free space, as a share of the coarse distance's."""
+
 BEYOND = 1.5
 """How far a patch's data reaches beyond what it predicts, in lengths."""
 
@@ -95,22 +98,43 @@ class Leftover:
     def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
         """Return the patch of some rows, with samples of the volume."""
         turn = self.normals[rows] - self.gradient[rows]
-        arrays = (self.points[rows], -self.value[rows], turn, volume.points, volume.wanted, volume.distance, center)
+        arrays = (self.points[rows], -self.value[rows], turn, *volume.rows(), center)
         return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
 
 
 @dataclass(frozen=True)
 class Volume:
-    """Samples of space, of shape (Q, 3), what a correction should be there, and how far the data is, of shape (Q,)."""
+    """Samples of space, of shape (Q, 3), bounds of a correction there, and how far the data is, of shape (Q,)."""
 
     points: Float
-    wanted: Float
+    lower: Float
+    upper: Float
     distance: Float
+
+    @classmethod
+    def apart(cls, points: Float, own: Float, signed: Float, distance: Float) -> Volume:
+        """Return samples at which a field is to have the sign of the coarse distance, and at least so much of its size.
+
+        No more is asked: a correction that brought down a field that is too steep would go too far between samples, and
+        make a horn.
+
+        Parameters
+        ----------
+        points : array of shape (Q, 3)
+        own, signed : arrays of shape (Q,), the field, and the coarse distance
+        distance : array of shape (Q,), of the data
+        """
+        bound, outside = ENOUGH * signed - own, signed > 0
+        return cls(points, np.where(outside, bound, -np.inf), np.where(outside, np.inf, bound), distance)
 
     @classmethod
     def none(cls) -> Volume:
         """Return no samples."""
-        return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+        return cls(np.zeros((0, 3)), *np.zeros((3, 0)))
+
+    def rows(self) -> tuple[Float, Float, Float, Float]:
+        """Return all four arrays."""
+        return self.points, self.lower, self.upper, self.distance
 
 
 @dataclass(frozen=True)

@@ -155,11 +155,11 @@ class _Cubes:
     def _solved(self, system: PatchSystem, length: float, center: Float) -> Tensor:
         """Return the amplitudes of the cube about a centre, of shape (m,)."""
         if self.shaping is None:
-            return system.solve(self.belief.position, self.belief.angle)
+            return system.solve_within(self.belief.position, self.belief.angle)
         return self.shaping.bend_cube(self.features, length, center, self.partition.reach, self.belief, system)
 
     def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
-        """Return samples of each cube that lie clear of the data, with what the coarse distance asks for there."""
+        """Return samples of each cube that lie clear of the data, with bounds that the coarse distance sets."""
         centers = self.partition.center(keys)
         x = centers[:, None, :] + self.partition.reach * rng.uniform(-1.0, 1.0, (len(keys), VOLUME, 3))
         cube = np.repeat(np.arange(len(keys)), VOLUME)
@@ -170,7 +170,7 @@ class _Cubes:
         x, cube = x[clear], cube[clear]
         if self.shaping is not None:
             signed = self.shaping.told(x, signed)
-        wanted = signed - sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
+        own = sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
         ends = np.searchsorted(cube, np.arange(1, len(keys)))
-        parts = (np.split(values, ends) for values in (x, wanted, distance))
-        return [Volume(*of_cube) for of_cube in zip(*parts, strict=True)]
+        parts = (np.split(values, ends) for values in (x, own, signed, distance))
+        return [Volume.apart(*of_cube) for of_cube in zip(*parts, strict=True)]

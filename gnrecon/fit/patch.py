@@ -2,9 +2,10 @@
 
 A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) has, with independent normal a_j of variance 2 s^2 / m, the
 distribution of a smooth random function of size s and length l. Given points where f + c = 0 and grad(f + c) = n, up to
-a noise of the positions and one of the normals, and samples of the volume where f + c is the coarse signed distance up
-to a share of it, its most probable amplitudes solve one linear system. It smooths as much as the noise asks for, and
-free space keeps its sign.
+a noise of the positions and one of the normals, and samples of the volume where c is what comes nearest to zero within
+bounds, up to a share of the distance, its most probable amplitudes solve one linear system. It smooths as much as the
+noise asks for, and free space keeps its sign: where the correction leaves its bounds, the samples are asked for again,
+with more weight.
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 2.1, with the features of Rahimi
 and Recht (2007) and observations of the gradient.
 """
@@ -25,7 +26,10 @@ SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""
 
 SHARE = 0.5
-"""Standard deviation of the coarse distance in the volume, as a share of itself."""
+"""Standard deviation of the correction in the volume, as a share of the distance from the data."""
+
+AGAIN, FIRMLY = 3, 0.1
+"""Times that samples beyond their bounds are asked for again, and that share then."""
 
 ATTEMPTS = 6
 
@@ -57,7 +61,7 @@ class Patch:
     ----------
     points : of shape (N, 3), unit coordinates
     value, gradient : what c and grad c should be there, of shape (N,) and (N, 3)
-    volume, wanted, distance : samples of shape (Q, 3), what c should be there, and how far from the data they are, both
+    volume, lower, upper, distance : samples of shape (Q, 3), bounds of c there, and how far from the data they are, all
         of shape (Q,)
     center : of shape (3,), origin of the features' coordinates
     """
@@ -66,9 +70,15 @@ class Patch:
     value: Tensor
     gradient: Tensor
     volume: Tensor
-    wanted: Tensor
+    lower: Tensor
+    upper: Tensor
     distance: Tensor
     center: Tensor
+
+    @property
+    def wanted(self) -> Tensor:
+        """What c should be at the samples, of shape (Q,): as little as its bounds allow."""
+        return self.distance.new_zeros(()).clamp(self.lower, self.upper)
 
     @property
     def size(self) -> float:
@@ -89,6 +99,7 @@ class PatchSystem:
 
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         self._scale = size * (2.0 / len(features)) ** 0.5
+        self._patch, self._features, self._length = patch, features, length
         like, count = patch.value, len(features)
         parts = [_data_sums(patch, features, length, slice(n, n + ROWS)) for n in range(0, len(like), ROWS)]
         positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
@@ -105,6 +116,27 @@ class PatchSystem:
         if factor is None:
             return torch.zeros_like(right)
         amplitudes: Tensor = self._scale * solve_factored(factor, right)
+        return amplitudes
+
+    def solve_within(self, position: float, angle: float) -> Tensor:
+        """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
+
+        A one-sided penalty by an active set: where c is beyond a bound, the bound is asked for with more weight. What
+        was asked for stays in the system.
+        """
+        amplitudes, patch = self.solve(position, angle), self._patch
+        sines = self._features.phase(patch.volume, patch.center, self._length).sin()
+        for _ in range(AGAIN):
+            value = sines @ amplitudes
+            bound = value.clamp(patch.lower, patch.upper)
+            beyond = bound != value
+            if not beyond.any():
+                break
+            deviation = FIRMLY * patch.distance[beyond]
+            rows, wanted = sines[beyond] / deviation[:, None], bound[beyond] / deviation
+            product, right = self._volume
+            self._volume = product.addmm_(rows.T, rows), right + rows.T @ wanted
+            amplitudes = self.solve(position, angle)
         return amplitudes
 
     def equations(self, position: float, angle: float) -> tuple[Tensor, Tensor] | None:

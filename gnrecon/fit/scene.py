@@ -47,9 +47,13 @@ class Scene:
 
     def volume(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
         """Return about `count` points of the box, (Q, 3), half of them near the data, and their coarse distances."""
+        return self.coarse.sample(self.places(count, rng))
+
+    def places(self, count: int, rng: np.random.Generator) -> Float:
+        """Return such points, of shape (Q, 3), also where no distance is known because the data is too near."""
         shell = near_surface(self.samples.points, SHELL * self.coarse.spacing, count // 2, rng)
         inside = ((shell > self.box.lower) & (shell < self.box.upper)).all(axis=1)
-        return self.coarse.sample(np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]]))
+        return np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]])
 
     def tensor(self, values: Float) -> Tensor:
         """Return `values` as a tensor like the data's."""

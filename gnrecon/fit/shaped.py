@@ -166,7 +166,7 @@ class Shaping:
         self, features: Features, length: float, center: Float, reach: float, belief: Belief, system: PatchSystem
     ) -> Tensor:
         """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
-        amplitudes = system.solve(belief.position, belief.angle)
+        amplitudes = system.solve_within(belief.position, belief.angle)
         equations = system.equations(belief.position, belief.angle)
         rows = np.asarray((np.abs(self.sheet.points - center) < reach).all(axis=1))
         scale = (len(self.density.points) / len(self.sheet)) ** 0.5 / belief.position

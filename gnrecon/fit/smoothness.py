@@ -75,9 +75,11 @@ def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random
     seen = rng.permutation(len(scene.samples))[:POINTS]
     x, distance = scene.volume(VOLUME, rng)
     points, normals = scene.points[seen], scene.normals[seen]
-    volume = scene.tensor(x), scene.tensor(distance), scene.tensor(distance).abs()
+    signed = scene.tensor(distance)
     center = torch.zeros(3).to(points)
-    patch = Patch(points, torch.zeros(len(points)).to(points), normals, *volume, center)
+    patch = Patch(
+        points, torch.zeros(len(points)).to(points), normals, scene.tensor(x), signed, signed, signed.abs(), center
+    )
     features = Features.draw(FEATURES, rng, points)
     out = np.flatnonzero(held)[:POINTS]
     left, turned = scene.tensor(samples.points[out]), scene.tensor(samples.normals[out])

@@ -17,14 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gnrecon.advance import Advance, unheard
+from gnrecon.cloud import Float
 from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
+from gnrecon.fit.ghosts import GhostSearch
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.terms import Term
@@ -32,7 +35,9 @@ from gnrecon.linalg.cholesky import Cholesky
 from gnrecon.linalg.metric import identity
 
 RIDGE = 1e-8
-ROUNDS = 3
+ROUNDS, TRIALS = 3, 3
+"""Solves, and how many times a solve's samples are searched for ghosts after it."""
+
 WRONG_WEIGHT = 5
 """How much more a sample counts that an earlier round gave the wrong sign: without it, horns grow on sparse scans."""
 
@@ -91,18 +96,24 @@ def wide_start(
     frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
+    search = GhostSearch(scene.coarse, x, np.sign(distance))
     for round_number in range(ROUNDS):
         last = round_number + 1 == ROUNDS
         terms = terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS if last else SEARCH_POINTS)
         theta = solve_last_layer(field, terms, theta)
         advance((round_number + 1) / ROUNDS)
         if not last:
-            trial, expected = scene.volume(3 * scene.volume_count, rng)
-            value = field.value(theta, scene.tensor(trial)).cpu().numpy()
-            wrong = np.flatnonzero(value * np.sign(expected) <= 0)[: scene.volume_count // 2]
-            wrong = np.repeat(wrong, WRONG_WEIGHT)
-            x, distance = np.concatenate([x, trial[wrong]]), np.concatenate([distance, expected[wrong]])
+            trial = scene.places(TRIALS * scene.volume_count, rng)
+            wrong, expected = search.ghosts(trial, partial(_value, field, theta, scene))
+            some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], WRONG_WEIGHT)
+            x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
     return theta
+
+
+def _value(field: Siren, theta: Tensor, scene: Scene, x: Float) -> Float:
+    """Return the field's values, of shape (Q,), at points, of shape (Q, 3)."""
+    values: Float = field.value(theta, scene.tensor(x)).cpu().numpy()
+    return values
 
 
 def spectral_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,8 +23,12 @@ def features(rng: np.random.Generator) -> Features:
 @pytest.fixture
 def patch(rng: np.random.Generator) -> Patch:
     shapes = [(20, 3), (20,), (20, 3), (8, 3), (8,)]
-    draws = [torch.as_tensor(rng.standard_normal(shape)) for shape in shapes]
-    return Patch(*draws, torch.as_tensor(rng.uniform(0.5, 1.0, 8)), torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64))
+    *draws, bound = [torch.as_tensor(rng.standard_normal(shape)) for shape in shapes]
+    # Of the samples two have both bounds, three the lower one alone and three the upper one alone.
+    infinite = torch.full((3,), torch.inf).to(bound)
+    lower, upper = torch.cat([bound[:5], -infinite]), torch.cat([bound[:2], infinite, bound[5:]])
+    distance = torch.as_tensor(rng.uniform(0.5, 1.0, 8))
+    return Patch(*draws, lower, upper, distance, torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64))
 
 
 def rows(features: Features, x: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,6 +60,36 @@ def test_amplitudes_are_the_mode_of_bayesian_regression(
     expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
     found = system(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
+
+
+def test_a_correction_is_asked_for_as_little_as_its_bounds_allow(patch: Patch) -> None:
+    wanted, lower, upper = patch.wanted, patch.lower, patch.upper
+    torch.testing.assert_close(wanted[:2], lower[:2])
+    torch.testing.assert_close(wanted[2:5], lower[2:5].clamp_min(0))
+    torch.testing.assert_close(wanted[5:], upper[5:].clamp_max(0))
+
+
+def test_a_correction_is_brought_within_its_bounds(patch: Patch, features: Features) -> None:
+    # Loose data: what the prior and the volume's own weight leave of the bounds is seen.
+    system, loose = PatchSystem(patch, features, LENGTH, patch.size), (1.0, 10.0)
+    sines = rows(features, patch.volume, patch.center)[0]
+
+    def beyond(amplitudes: Tensor) -> float:
+        value = sines @ amplitudes
+        return float((value - value.clamp(patch.lower, patch.upper)).norm())
+
+    before = beyond(system.solve(*loose))
+    assert before > 0.1
+    assert beyond(system.solve_within(*loose)) < 0.1 * before
+    # What was asked for stays in the equations that others add to.
+    factor, right = system.equations(*loose) or pytest.fail("indefinite")
+    assert beyond(torch.cholesky_solve(right[:, None], factor)[:, 0]) < 0.1 * before
+
+
+def test_a_correction_within_its_bounds_is_left_alone(patch: Patch, features: Features) -> None:
+    free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
+    system = PatchSystem(free, features, LENGTH, free.size)
+    torch.testing.assert_close(system.solve_within(POSITION, ANGLE), system.solve(POSITION, ANGLE), rtol=0, atol=0)
 
 
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:
