@@ -53,7 +53,8 @@ def mean_angle(sdf: NeuralSDF, rays: Float) -> float:
 
 def test_wide_fit_of_a_sphere() -> None:
     samples = sphere()
-    sdf, solution = fit(samples, FitOptions(widths=(400,), steps=1))
+    # With 400 features three of eight seeds leave the sphere somewhere; with 600 none does.
+    sdf, solution = fit(samples, FitOptions(widths=(600,), steps=1))
     rays = directions(500, 1)
     error = np.abs(radii(sdf, rays) / RADIUS - 1)
     assert error.mean() < 0.01
