@@ -17,13 +17,23 @@ from gnrecon.commands.part import NAME, DesignFiles, part_mesh
 from gnrecon.commands.scanned import FILES, ScanFiles, is_scan, placed
 from gnrecon.design import Design, DesignFacts, judge
 from gnrecon.errors import ExitCode, UsageError
-from gnrecon.export import MeshFacts, curvatures, require_bordered, require_sound, verify, verify_file
+from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
 from gnrecon.files import require_files
 from gnrecon.io import check_writable, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.pipeline import limited
 from gnrecon.report import plain, versions
-from gnrecon.shapes import OPTIMISERS, PROBLEMS, Learned, Measurement, ShapeProblem, bracket, learn, mesh_of
+from gnrecon.shapes import (
+    OPTIMISERS,
+    PROBLEMS,
+    Learned,
+    Measurement,
+    ScannedSurface,
+    ShapeProblem,
+    bracket,
+    learn,
+    mesh_of,
+)
 
 OPEN = "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
 CLOSED = "closed, oriented 2-manifold"
@@ -106,7 +116,7 @@ def run_learn(
         notes: list[str] = []
         rng = np.random.default_rng(options.seed)
         if design is None:
-            mesh = _mesh(learned, problem, options)
+            mesh, notes = _mesh(learned, problem, options)
             mesh = mesh if frame is None else placed(mesh, frame)
         else:
             mesh, notes = part_mesh(learned.field, design, options.resolution, options.curvature, rng)
@@ -141,12 +151,16 @@ def _say(console: Console, sentence: str) -> None:
     console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
 
-def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> Mesh:
+def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> tuple[Mesh, list[str]]:
+    """Return the surface, of a scan without what no point holds, and a sentence about what was dropped."""
     mesh = mesh_of(learned.field, problem.shown or problem.box, options.resolution)
+    notes: list[str] = []
+    if isinstance(problem.known, ScannedSurface):
+        mesh, notes = drop_stray(mesh, problem.known.points.numpy())
     if not options.curvature:
-        return mesh
+        return mesh, notes
     mean, gauss = curvatures(learned.field.gradient(mesh.vertices), learned.field.hessian(mesh.vertices))
-    return mesh.with_attributes({"mean_curvature": mean, "gauss_curvature": gauss})
+    return mesh.with_attributes({"mean_curvature": mean, "gauss_curvature": gauss}), notes
 
 
 def _write(output: Path, report: Path | None, mesh: Mesh, facts: dict[str, Any], overwrite: bool) -> list[str]:

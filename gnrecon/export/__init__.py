@@ -23,7 +23,7 @@ from gnrecon.export.repair import repair
 from gnrecon.export.sharpen import sharpen
 from gnrecon.export.sheet import render_sheet
 from gnrecon.export.sparsely import sparsely
-from gnrecon.export.stray import remove_stray
+from gnrecon.export.stray import drop_stray, remove_stray
 from gnrecon.export.trim import Trimming, trim
 from gnrecon.export.verify import MeshFacts, require_bordered, require_sound, verify, verify_file
 
@@ -42,6 +42,7 @@ __all__ = [
     "carry",
     "curvatures",
     "decimate",
+    "drop_stray",
     "examine",
     "extract",
     "invented",

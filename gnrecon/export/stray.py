@@ -10,6 +10,7 @@ cavities (negative volume): dropping a shell may have changed which of the two a
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
@@ -18,6 +19,9 @@ from gnrecon.export.topology import face_components, submesh
 from gnrecon.mesh import Mesh
 
 LEAST_VOTES, LEAST_SHARE = 3, 0.005
+
+Labels = npt.NDArray[np.integer]
+Mask = npt.NDArray[np.bool_]
 
 
 def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
@@ -44,29 +48,45 @@ def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     UsageError
         When there are no points.
     """
-    if not len(points):
-        raise UsageError("There are no points to tell stray components by.")
-    labels = face_components(mesh)
-    count = int(labels.max(initial=-1)) + 1
-    if count < 2:
-        return mesh, []
-    votes = np.bincount(labels[nearest_on_surface(mesh, points)[1]], minlength=count)
-    least = max(LEAST_VOTES, LEAST_SHARE * len(points))
-    stays = votes >= least
-    stays[votes.argmax()] = True
+    labels, stays, actions = _judged(mesh, points)
     if stays.all():
         return mesh, []
     parts = [submesh(mesh, labels == label) for label in np.flatnonzero(stays)]
     oriented = [_oriented(part, [other for other in parts if other is not part]) for part in parts]
     turned = sum(new is not old for new, old in zip(oriented, parts, strict=True))
-    actions = [
-        f"Dropped {count - len(parts)} of {count} components, with {np.count_nonzero(~stays[labels])} of "
-        f"{len(labels)} faces, that fewer than {least:g} of the {len(points)} points lie nearest to "
-        f"(at most {votes[~stays].max()})."
-    ]
     if turned:
         actions.append(f"Turned {turned} components round, because the shell around them was dropped.")
     return _joined(oriented), actions
+
+
+def drop_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
+    """Drop the same components of a mesh that may have borders; those that stay keep their sides.
+
+    Parameters, what is returned and what is raised are those of `remove_stray`.
+    """
+    labels, stays, actions = _judged(mesh, points)
+    return (mesh, []) if stays.all() else (submesh(mesh, stays[labels]), actions)
+
+
+def _judged(mesh: Mesh, points: Float) -> tuple[Labels, Mask, list[str]]:
+    """Return each face's component, which components stay, and a sentence about those that do not."""
+    if not len(points):
+        raise UsageError("There are no points to tell stray components by.")
+    labels = face_components(mesh)
+    count = int(labels.max(initial=-1)) + 1
+    if count < 2:
+        return labels, np.ones(count, dtype=bool), []
+    votes = np.bincount(labels[nearest_on_surface(mesh, points)[1]], minlength=count)
+    least = max(LEAST_VOTES, LEAST_SHARE * len(points))
+    stays = votes >= least
+    stays[votes.argmax()] = True
+    dropped = np.count_nonzero(~stays)
+    said = (
+        f"Dropped {dropped} of {count} components, with {np.count_nonzero(~stays[labels])} of "
+        f"{len(labels)} faces, that fewer than {least:g} of the {len(points)} points lie nearest to "
+        f"(at most {votes[~stays].max(initial=0)})."
+    )
+    return labels, stays, [said] if dropped else []
 
 
 def _oriented(part: Mesh, others: list[Mesh]) -> Mesh:
