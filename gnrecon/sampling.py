@@ -33,6 +33,9 @@ _TOGETHER = 128
 KNOWN = 2.0
 """How far from the points a distance is known at least, in radii of the disk that the nearest one stands for."""
 
+CERTAIN = 0.25
+"""How far from one half a winding number is beyond doubt: across a hole it passes through one half slowly."""
+
 STEEPNESS = 0.3
 """Least magnitude of a field in the free space, as a share of the distance from the surface."""
 
@@ -146,11 +149,21 @@ class CoarseDistance:
 
     def sign(self, x: Float) -> Float:
         """Return the sign of the distance, of shape (Q,), at x, of shape (Q, 3)."""
-        return np.where(self.winding_number(x) > 0.5, -1.0, 1.0)
+        return side_of(self.winding_number(x))
 
     def winding_number(self, x: Float, batch: int = _TOGETHER) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
         return winding_number(x, self._sources, self._dipoles, self._radii, batch)
+
+
+def side_of(winding: Float) -> Float:
+    """Return the sign of the distance, of shape (Q,), that winding numbers tell: negative inside."""
+    return np.where(winding > 0.5, -1.0, 1.0)
+
+
+def is_certain(winding: Float) -> Mask:
+    """Return where winding numbers, of shape (Q,), tell the sign beyond doubt."""
+    return np.asarray(np.abs(winding - 0.5) > CERTAIN)
 
 
 def winding_number(x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = _TOGETHER) -> Float:

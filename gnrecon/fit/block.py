@@ -25,7 +25,7 @@ from gnrecon.fit.dipoles import Dipoles
 from gnrecon.fit.octree import Codes, morton
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.work import Arrays, Work
-from gnrecon.sampling import Box
+from gnrecon.sampling import Box, is_certain, side_of
 
 CHANCE = 3
 """Tells the cubes' chance from that of the rest of the fit, which has the same seed."""
@@ -150,7 +150,7 @@ class Blocks:
         disks = self.disks[around][nearest]
         clear = distance > CLEAR * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
-        inside = self.dipoles.winding_number(x, center, self.partition.reach) > 0.5
-        signed = np.where(inside, -1.0, 1.0) * np.sqrt(distance**2 - disks**2)
+        winding = self.dipoles.winding_number(x, center, self.partition.reach)
+        signed = side_of(winding) * np.sqrt(distance**2 - disks**2)
         has = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.apart(x, has, signed, distance)
+        return Volume.around(x, has, signed, is_certain(winding), distance)

@@ -57,8 +57,11 @@ where many scans do not quite match, distances alone are least for a field that 
 MOST_POINTS = 2500
 FEATURES, DENSE_FEATURES = 700, 300
 LEAST_SLOPE = 0.05
-ENOUGH = 0.5
-"""Least size of the field in free space, as a share of the coarse distance's."""
+ABOUT = 0.7, 1.5
+"""The field in free space that is left as it is, over the coarse distance."""
+
+LEAST_SHARE = 0.5
+"""Least size that the field must have there, as a share of the coarse distance's."""
 
 BEYOND = 1.5
 """How far a patch's data reaches beyond what it predicts, in lengths."""
@@ -104,37 +107,51 @@ class Leftover:
 
 @dataclass(frozen=True)
 class Volume:
-    """Samples of space, of shape (Q, 3), bounds of a correction there, and how far the data is, of shape (Q,)."""
+    """Samples of space, of shape (Q, 3), where a correction is known roughly; the rest of shape (Q,).
+
+    Parameters
+    ----------
+    wanted : what it should be
+    lower, upper : what it must be at least, and at most
+    distance : how far the data is
+    """
 
     points: Float
+    wanted: Float
     lower: Float
     upper: Float
     distance: Float
 
     @classmethod
-    def apart(cls, points: Float, own: Float, signed: Float, distance: Float) -> Volume:
-        """Return samples at which a field is to have the sign of the coarse distance, and at least so much of its size.
+    def around(cls, points: Float, own: Float, signed: Float, certain: Mask, distance: Float) -> Volume:
+        """Return samples at which a field is to be about the coarse distance, and of its sign where that is certain.
 
-        No more is asked: a correction that brought down a field that is too steep would go too far between samples, and
-        make a horn.
+        A field that is somewhat steeper or flatter than a distance needs no correction: one that brought it to the
+        distance would go too far between samples, and make a horn.
 
         Parameters
         ----------
         points : array of shape (Q, 3)
         own, signed : arrays of shape (Q,), the field, and the coarse distance
+        certain : mask of shape (Q,), where the sign of that is beyond doubt
         distance : array of shape (Q,), of the data
         """
-        bound, outside = ENOUGH * signed - own, signed > 0
-        return cls(points, np.where(outside, bound, -np.inf), np.where(outside, np.inf, bound), distance)
+        near, far = (share * signed for share in ABOUT)
+        wanted = own.clip(np.minimum(near, far), np.maximum(near, far)) - own
+        bound = LEAST_SHARE * signed - own
+        lower, upper = (
+            np.where(certain & side, bound, no) for side, no in ((signed > 0, -np.inf), (signed < 0, np.inf))
+        )
+        return cls(points, wanted, lower, upper, distance)
 
     @classmethod
     def none(cls) -> Volume:
         """Return no samples."""
-        return cls(np.zeros((0, 3)), *np.zeros((3, 0)))
+        return cls(np.zeros((0, 3)), *np.zeros((4, 0)))
 
-    def rows(self) -> tuple[Float, Float, Float, Float]:
-        """Return all four arrays."""
-        return self.points, self.lower, self.upper, self.distance
+    def rows(self) -> tuple[Float, Float, Float, Float, Float]:
+        """Return all five arrays."""
+        return self.points, self.wanted, self.lower, self.upper, self.distance
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from gnrecon.fit.choose import Int, Leftover, Mask, Volume
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
-from gnrecon.sampling import CoarseDistance
+from gnrecon.sampling import CoarseDistance, is_certain, side_of
 
 _log = logging.getLogger(__name__)
 
@@ -166,11 +166,13 @@ class _Cubes:
         x = x.reshape(-1, 3)
         inside = ((x > sdf.box.lower) & (x < sdf.box.upper)).all(axis=1)
         x, cube = x[inside], cube[inside]
-        clear, signed, distance = coarse.at(x, CLEAR)
+        clear, size, distance = coarse.size(x, CLEAR)
         x, cube = x[clear], cube[clear]
+        winding = coarse.winding_number(x)
+        signed = side_of(winding) * size
         if self.shaping is not None:
             signed = self.shaping.told(x, signed)
         own = sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
         ends = np.searchsorted(cube, np.arange(1, len(keys)))
-        parts = (np.split(values, ends) for values in (x, own, signed, distance))
-        return [Volume.apart(*of_cube) for of_cube in zip(*parts, strict=True)]
+        parts = (np.split(values, ends) for values in (x, own, signed, is_certain(winding), distance))
+        return [Volume.around(*of_cube) for of_cube in zip(*parts, strict=True)]

@@ -21,6 +21,7 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.smoothness import global_smoothness, smooth_spectrum
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Solution
+from gnrecon.sampling import is_certain
 
 _log = logging.getLogger(__name__)
 
@@ -28,9 +29,6 @@ UNITS = 1000
 
 FEW = 4e-3
 """Share of the free space by which normals that weigh more may spoil its sign."""
-
-CERTAIN = 0.25
-"""How far from one half a winding number is beyond doubt: across a hole it passes through one half slowly."""
 
 
 @dataclass(frozen=True)
@@ -95,5 +93,5 @@ def wrong_sign(sdf: NeuralSDF, scene: Scene, rng: np.random.Generator) -> float:
     """Return the share of the free space where the field has the wrong sign beyond doubt, in [0, 1]."""
     x, distance = scene.volume(scene.volume_count, rng)
     other = sdf.sdf(sdf.frame.to_world(x)) * distance < 0
-    certain = np.abs(scene.coarse.winding_number(x[other]) - 0.5) > CERTAIN
+    certain = is_certain(scene.coarse.winding_number(x[other]))
     return float(certain.sum() / max(len(x), 1))

@@ -2,10 +2,9 @@
 
 A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) has, with independent normal a_j of variance 2 s^2 / m, the
 distribution of a smooth random function of size s and length l. Given points where f + c = 0 and grad(f + c) = n, up to
-a noise of the positions and one of the normals, and samples of the volume where c is what comes nearest to zero within
-bounds, up to a share of the distance, its most probable amplitudes solve one linear system. It smooths as much as the
-noise asks for, and free space keeps its sign: where the correction leaves its bounds, the samples are asked for again,
-with more weight.
+a noise of the positions and one of the normals, and samples of the volume where f + c is about the coarse distance, up
+to a share of it, its most probable amplitudes solve one linear system. It smooths as much as the noise asks for, and
+free space keeps its sign: where the correction leaves its bounds, the samples are asked for again, with more weight.
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 2.1, with the features of Rahimi
 and Recht (2007) and observations of the gradient.
 """
@@ -61,8 +60,9 @@ class Patch:
     ----------
     points : of shape (N, 3), unit coordinates
     value, gradient : what c and grad c should be there, of shape (N,) and (N, 3)
-    volume, lower, upper, distance : samples of shape (Q, 3), bounds of c there, and how far from the data they are, all
+    volume, wanted, distance : samples of shape (Q, 3), what c should be there, and how far from the data they are, both
         of shape (Q,)
+    lower, upper : of shape (Q,), what c must be at least and at most at the samples
     center : of shape (3,), origin of the features' coordinates
     """
 
@@ -70,15 +70,11 @@ class Patch:
     value: Tensor
     gradient: Tensor
     volume: Tensor
+    wanted: Tensor
     lower: Tensor
     upper: Tensor
     distance: Tensor
     center: Tensor
-
-    @property
-    def wanted(self) -> Tensor:
-        """What c should be at the samples, of shape (Q,): as little as its bounds allow."""
-        return self.distance.new_zeros(()).clamp(self.lower, self.upper)
 
     @property
     def size(self) -> float:

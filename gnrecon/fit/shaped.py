@@ -24,7 +24,6 @@ from gnrecon.errors import FitError
 from gnrecon.field.features import Features
 from gnrecon.fit.bend import Jet, Sines, Wish, bent
 from gnrecon.fit.choose import Mask
-from gnrecon.fit.global_field import CERTAIN
 from gnrecon.fit.loss import data_terms, distance_term
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.patch import Belief, PatchSystem
@@ -37,7 +36,7 @@ from gnrecon.fit.start import FINAL_POINTS, RIDGE
 from gnrecon.fit.terms import Term
 from gnrecon.linalg.cholesky import damped_factor
 from gnrecon.residuals import SecondOrder, free_space
-from gnrecon.sampling import Density, least_values
+from gnrecon.sampling import Density, is_certain, least_values
 
 GLOBAL_STEPS, CUBE_STEPS = 8, 3
 """Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""
@@ -79,7 +78,7 @@ class Free:
     def of(cls, scene: Scene, rng: np.random.Generator) -> Free:
         """Draw points of a scan's box."""
         x, distance = scene.volume(MORE * scene.volume_count, rng)
-        certain = np.abs(scene.coarse.winding_number(x) - 0.5) > CERTAIN
+        certain = is_certain(scene.coarse.winding_number(x))
         kept = certain & (np.abs(distance) > CLEAR)
         return cls(x[kept], least_values(distance[kept], DEEP))
 

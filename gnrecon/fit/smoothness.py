@@ -77,9 +77,8 @@ def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random
     points, normals = scene.points[seen], scene.normals[seen]
     signed = scene.tensor(distance)
     center = torch.zeros(3).to(points)
-    patch = Patch(
-        points, torch.zeros(len(points)).to(points), normals, scene.tensor(x), signed, signed, signed.abs(), center
-    )
+    volume = scene.tensor(x), signed, signed, signed, signed.abs()
+    patch = Patch(points, torch.zeros(len(points)).to(points), normals, *volume, center)
     features = Features.draw(FEATURES, rng, points)
     out = np.flatnonzero(held)[:POINTS]
     left, turned = scene.tensor(samples.points[out]), scene.tensor(samples.normals[out])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gnrecon.cloud import Float
-from gnrecon.fit.choose import ENOUGH, Volume
+from gnrecon.fit.choose import ABOUT, LEAST_SHARE, Volume
 from gnrecon.fit.ghosts import GhostSearch
 from gnrecon.sampling import CoarseDistance
 
@@ -60,11 +60,15 @@ def test_signs_that_were_found_are_remembered(coarse: CoarseDistance, rng: np.ra
     assert len(search.points) == before + len(ghosts)
 
 
-def test_bounds_ask_for_the_sign_and_a_share_of_the_size() -> None:
-    own, signed = np.array([-0.1, 0.01, 0.3, 0.2, -0.02, -0.9]), np.array([0.2, 0.2, 0.2, -0.2, -0.2, -0.2])
-    volume = Volume.apart(np.zeros((6, 3)), own, signed, np.abs(signed))
-    lower, upper = volume.lower + own, volume.upper + own
-    np.testing.assert_allclose(lower[:3], ENOUGH * 0.2)
-    np.testing.assert_allclose(upper[3:], -ENOUGH * 0.2)
-    assert np.isposinf(upper[:3]).all()
-    assert np.isneginf(lower[3:]).all()
+def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:
+    own = np.array([-0.1, 0.01, 0.2, 0.25, 0.9, 0.2, -0.02, -0.2, -0.9])
+    signed = np.repeat([0.2, -0.2], [5, 4])
+    certain = np.arange(9) != 1
+    volume = Volume.around(np.zeros((9, 3)), own, signed, certain, np.abs(signed))
+    near, far = (0.2 * share for share in ABOUT)
+    asked = [near, near, 0.2, 0.25, far, -near, -near, -0.2, -far]
+    np.testing.assert_allclose(own + volume.wanted, asked, atol=1e-15)
+    np.testing.assert_allclose((volume.lower + own)[:5], np.where(certain, LEAST_SHARE * 0.2, -np.inf)[:5])
+    np.testing.assert_allclose((volume.upper + own)[5:], -LEAST_SHARE * 0.2)
+    assert np.isposinf(volume.upper[:5]).all()
+    assert np.isneginf(volume.lower[5:]).all()
