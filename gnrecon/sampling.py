@@ -127,19 +127,21 @@ class CoarseDistance:
 
     def sample(self, x: Float) -> tuple[Float, Float]:
         """Return those of the points x, of shape (Q, 3), where the distance is known, and the distances there."""
-        known, signed, _ = self.at(x)
+        known, signed, *_ = self.at(x)
         return x[known], signed
 
-    def at(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float]:
+    def at(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float, Mask]:
         """Return which of the points x, of shape (Q, 3), lie more than `clear` disks' radii from their nearest point.
 
-        Of these, in their order, follow the signed distances, and those to the nearest point itself.
+        Of these, in their order, follow the signed distances, those to the nearest point itself, and where the sign is
+        beyond doubt.
         """
         known, size, nearest = self.size(x, clear)
-        return known, self.sign(x[known]) * size, nearest
+        winding = self.winding_number(x[known])
+        return known, side_of(winding) * size, nearest, is_certain(winding)
 
     def size(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float]:
-        """Return the same as `at`, but for the sign, which is what takes time."""
+        """Return the first three of `at`, but for the sign, which is what takes time."""
         # One worker: with several, Ctrl-C unwinds while scipy's threads still use the arrays, and the process crashes.
         nearest, rows = self._density.tree.query(x)
         disks = self._density.disks[rows]

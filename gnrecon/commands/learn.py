@@ -113,7 +113,6 @@ def run_learn(
             seed=options.seed,
             heard=(lambda found: _say(console, told(found))) if verbose else None,
         )
-        notes: list[str] = []
         rng = np.random.default_rng(options.seed)
         if design is None:
             mesh, notes = _mesh(learned, problem, options)

@@ -10,18 +10,14 @@ cavities (negative volume): dropping a shell may have changed which of the two a
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.nearest import nearest_on_surface
-from gnrecon.export.topology import face_components, submesh
-from gnrecon.mesh import Mesh
+from gnrecon.export.topology import Mask, face_components, submesh
+from gnrecon.mesh import Int, Mesh
 
 LEAST_VOTES, LEAST_SHARE = 3, 0.005
-
-Labels = npt.NDArray[np.integer]
-Mask = npt.NDArray[np.bool_]
 
 
 def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
@@ -68,7 +64,7 @@ def drop_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     return (mesh, []) if stays.all() else (submesh(mesh, stays[labels]), actions)
 
 
-def _judged(mesh: Mesh, points: Float) -> tuple[Labels, Mask, list[str]]:
+def _judged(mesh: Mesh, points: Float) -> tuple[Int, Mask, list[str]]:
     """Return each face's component, which components stay, and a sentence about those that do not."""
     if not len(points):
         raise UsageError("There are no points to tell stray components by.")

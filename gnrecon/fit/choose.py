@@ -139,9 +139,8 @@ class Volume:
         near, far = (share * signed for share in ABOUT)
         wanted = own.clip(np.minimum(near, far), np.maximum(near, far)) - own
         bound = LEAST_SHARE * signed - own
-        lower, upper = (
-            np.where(certain & side, bound, no) for side, no in ((signed > 0, -np.inf), (signed < 0, np.inf))
-        )
+        lower = np.where(certain & (signed > 0), bound, -np.inf)
+        upper = np.where(certain & (signed < 0), bound, np.inf)
         return cls(points, wanted, lower, upper, distance)
 
     @classmethod

@@ -27,7 +27,7 @@ from gnrecon.fit.choose import Int, Leftover, Mask, Volume
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
-from gnrecon.sampling import CoarseDistance, is_certain, side_of
+from gnrecon.sampling import CoarseDistance
 
 _log = logging.getLogger(__name__)
 
@@ -166,13 +166,11 @@ class _Cubes:
         x = x.reshape(-1, 3)
         inside = ((x > sdf.box.lower) & (x < sdf.box.upper)).all(axis=1)
         x, cube = x[inside], cube[inside]
-        clear, size, distance = coarse.size(x, CLEAR)
+        clear, signed, distance, certain = coarse.at(x, CLEAR)
         x, cube = x[clear], cube[clear]
-        winding = coarse.winding_number(x)
-        signed = side_of(winding) * size
         if self.shaping is not None:
             signed = self.shaping.told(x, signed)
         own = sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
         ends = np.searchsorted(cube, np.arange(1, len(keys)))
-        parts = (np.split(values, ends) for values in (x, own, signed, is_certain(winding), distance))
+        parts = (np.split(values, ends) for values in (x, own, signed, certain, distance))
         return [Volume.around(*of_cube) for of_cube in zip(*parts, strict=True)]

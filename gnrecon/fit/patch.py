@@ -95,13 +95,13 @@ class PatchSystem:
 
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         self._scale = size * (2.0 / len(features)) ** 0.5
-        self._patch, self._features, self._length = patch, features, length
         like, count = patch.value, len(features)
         parts = [_data_sums(patch, features, length, slice(n, n + ROWS)) for n in range(0, len(like), ROWS)]
         positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
         self._positions, self._angles = (positions, of_positions), (angles, of_angles)
-        free, wanted = _volume_rows(patch, features, length)
-        self._volume = gram([free], count, like), free.T @ wanted
+        self._patch = patch
+        self._free, wanted = _volume_rows(patch, features, length)
+        self._volume = gram([self._free], count, like), self._free.T @ wanted
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
@@ -121,15 +121,14 @@ class PatchSystem:
         was asked for stays in the system.
         """
         amplitudes, patch = self.solve(position, angle), self._patch
-        sines = self._features.phase(patch.volume, patch.center, self._length).sin()
+        deviation = SHARE * patch.distance
         for _ in range(AGAIN):
-            value = sines @ amplitudes
+            value = deviation * (self._free @ amplitudes)
             bound = value.clamp(patch.lower, patch.upper)
             beyond = bound != value
             if not beyond.any():
                 break
-            deviation = FIRMLY * patch.distance[beyond]
-            rows, wanted = sines[beyond] / deviation[:, None], bound[beyond] / deviation
+            rows, wanted = (SHARE / FIRMLY * rows[beyond] for rows in (self._free, bound / deviation))
             product, right = self._volume
             self._volume = product.addmm_(rows.T, rows), right + rows.T @ wanted
             amplitudes = self.solve(position, angle)

@@ -36,7 +36,7 @@ from gnrecon.fit.start import FINAL_POINTS, RIDGE
 from gnrecon.fit.terms import Term
 from gnrecon.linalg.cholesky import damped_factor
 from gnrecon.residuals import SecondOrder, free_space
-from gnrecon.sampling import Density, is_certain, least_values
+from gnrecon.sampling import Density, least_values
 
 GLOBAL_STEPS, CUBE_STEPS = 8, 3
 """Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""
@@ -77,10 +77,10 @@ class Free:
     @classmethod
     def of(cls, scene: Scene, rng: np.random.Generator) -> Free:
         """Draw points of a scan's box."""
-        x, distance = scene.volume(MORE * scene.volume_count, rng)
-        certain = is_certain(scene.coarse.winding_number(x))
+        x = scene.places(MORE * scene.volume_count, rng)
+        known, distance, _, certain = scene.coarse.at(x)
         kept = certain & (np.abs(distance) > CLEAR)
-        return cls(x[kept], least_values(distance[kept], DEEP))
+        return cls(x[known][kept], least_values(distance[kept], DEEP))
 
     def wishes(self, rows: Mask, known: Float, scale: float, like: Tensor) -> list[Wish]:
         """Return what is asked at some of the points.

@@ -116,7 +116,7 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
 def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler:
     """Return a sampler of the points whose sign the field has lost; the others are counted, not drawn."""
     pool = box.sample(POOL, rng)
-    known, signed, distance = coarse.at(pool, CLEAR_DISKS)
+    known, signed, distance, _ = coarse.at(pool, CLEAR_DISKS)
     clear = distance > CLEAR
     points = torch.as_tensor(pool[known][clear])
     least = torch.as_tensor(least_values(signed[clear], DEEP))
@@ -135,7 +135,7 @@ def _start(coarse: CoarseDistance) -> Start:
     """Return the coarse signed distance to a cloud, zero where it is too near to be known."""
 
     def start(x: Tensor) -> Tensor:
-        known, signed, _ = coarse.at(x.numpy())
+        known, signed, *_ = coarse.at(x.numpy())
         values = np.zeros(len(x))
         values[known] = signed
         return torch.as_tensor(values)

@@ -38,7 +38,7 @@ def test_all_wrong_signs_are_found_and_few_are_asked_for(
     asked.clear()
     x = rng.uniform(-1.6, 1.6, (20_000, 3))
     ghosts, distances = GhostSearch(coarse, known, np.sign(signed)).ghosts(x, haunted)
-    clear, true, _ = coarse.at(x)
+    clear, true, *_ = coarse.at(x)
     wrong = haunted(x[clear]) * true < 0
     assert 20 < len(ghosts) == wrong.sum()
     np.testing.assert_allclose(ghosts, x[clear][wrong])
