@@ -10,7 +10,7 @@ What is asked of the surface besides (`regulariser`) bends both, the global fiel
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from gnrecon.fit.options import FitOptions
 from gnrecon.fit.outlying import outlying
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Free, Shaping, bend_global
+from gnrecon.fit.sharp import Sharp
 from gnrecon.optim import Solution
 from gnrecon.sampling import Density
 
@@ -38,6 +39,45 @@ HELD_SHARE, HELD_MOST = 6, 2000
 
 SHARE = 0.25
 """Share of the time after which the global field is there."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is fitted.
+
+    Parameters
+    ----------
+    samples : of the scan, or of its faces continued to their edges
+    held : mask of shape (N,), of samples that the global field does not see
+    rows : of those that it sees
+    sharp : the faces, where they are continued
+    """
+
+    samples: Samples
+    held: Mask
+    rows: Int
+    sharp: Sharp | None
+
+    @classmethod
+    def of(cls, samples: Samples, by_blocks: bool, edges: bool, rng: np.random.Generator) -> _Task:
+        """Draw what is held out of a scan, whose faces are continued if `edges` says so and it has any."""
+        sharp = Sharp.of(samples) if edges else None
+        if sharp is not None:
+            samples = sharp.samples
+        order = rng.permutation(len(samples))
+        # Left-out points must lie near each other, so that those around a place tell of it alone.
+        out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
+        held: Mask = np.zeros(len(samples), dtype=bool)
+        held[order[:out]] = True
+        return cls(samples, held, np.sort(order[out:][:COARSE_POINTS]), sharp)
+
+    def without(self, off: Mask) -> _Task:
+        """Return what is left without some samples, of a scan whose faces are not continued."""
+        kept = ~off
+        seen = np.zeros(len(off), dtype=bool)
+        seen[self.rows] = True
+        rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
+        return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None)
 
 
 def fit_adaptive(
@@ -53,6 +93,8 @@ def fit_adaptive(
     The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given; then a
     Dask cluster can solve them, too.
 
+    The faces of a sharp shape are continued to their edges first (`sharp`).
+
     Normals that were estimated are turned around where a first field contradicts them, and points that lie off the
     surface of their neighbours are left out.
 
@@ -65,45 +107,46 @@ def fit_adaptive(
     FitError
         When a linear system cannot be solved.
     """
-    order = rng.permutation(len(samples))
     by_blocks = folder is not None or len(samples) >= LARGE
     if by_blocks and options.regularisers:
         raise UsageError(
             f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; "
             "thin the scan with --max-points."
         )
-    # Left-out points must lie near each other, so that those around a place tell of it alone.
-    out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
-    held: Mask = np.zeros(len(samples), dtype=bool)
-    held[order[:out]] = True
-    rows: Int = np.sort(order[out:][:COARSE_POINTS])
+    edges = not (by_blocks or options.regularisers)
+    task = _Task.of(samples, by_blocks, edges, rng)
     turned, left_out = 0.0, 0
     if samples.estimated:
-        samples, turned = reconciled(samples, rows, options)
-    first = fit_global(samples, held, rows, options, rng, part(advance, 0.0, SHARE / 2))
+        samples, turned = reconciled(samples, task.rows, options)
+        task = replace(task, samples=samples)
+    first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, 0.0, SHARE / 2))
     if not by_blocks:  # of so many points, distances alone tell the outliers
         off = outlying(first.sdf.sdf(samples.frame.to_world(samples.points)), Density(samples.points))
         left_out = int(off.sum())
         if left_out:
-            samples, held, rows = _without(off, samples, held, rows)
-            first = fit_global(samples, held, rows, options, rng, part(advance, SHARE / 2, SHARE))
+            samples = replace(samples, points=samples.points[~off], normals=samples.normals[~off])
+            task = _Task.of(samples, by_blocks, edges, rng) if task.sharp else task.without(off)
+            first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, SHARE / 2, SHARE))
     sdf = first.sdf
     shape = None
     if options.regularisers:
-        sdf, shape = _shaped(first, samples, options, rng)
+        sdf, shape = _shaped(first, task.samples, options, rng)
     rest = part(advance, SHARE, 1.0)
     averaging = None
     try:
         if by_blocks:
-            detail = fit_large(sdf, samples, held, options, rng, folder, rest, scheduler)
+            detail = fit_large(sdf, task.samples, task.held, options, rng, folder, rest, scheduler)
         else:
-            detail, averaging = fit_detail(sdf, samples, held, options.features, rng, options.device, rest, shape)
+            where = options.features, rng, options.device
+            detail, averaging = fit_detail(sdf, task.samples, task.held, *where, rest, shape, task.sharp)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
     chosen = detail.as_dict(samples.frame.scale)
     told = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
     told += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
+    if task.sharp is not None:
+        told += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
     if averaging is not None:
         told += f" Averaged noisy points over {averaging.width:g} of their disks' radii, where normals agree."
     status = (
@@ -118,15 +161,6 @@ def _asked(options: FitOptions) -> str:
     """Return a sentence about what was asked of the surface besides, after a blank, or nothing."""
     asked = ", ".join(f"{one.name} ({one.weight:g})" for one in options.regularisers)
     return f" Asked of the surface besides, with its weight: {asked}." if asked else ""
-
-
-def _without(off: Mask, samples: Samples, held: Mask, rows: Int) -> tuple[Samples, Mask, Int]:
-    """Return what is left without some samples: the others, which of them are held out, and the rows of those seen."""
-    kept = ~off
-    seen = np.zeros(len(samples), dtype=bool)
-    seen[rows] = True
-    rest = replace(samples, points=samples.points[kept], normals=samples.normals[kept])
-    return rest, held[kept], np.flatnonzero(seen[kept])
 
 
 def _shaped(

@@ -21,7 +21,7 @@ from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.choose import Choice, Leftover, Mask, Trials
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.sampling import Density
+from gnrecon.fit.sharp import has_edges
 
 _log = logging.getLogger(__name__)
 
@@ -32,16 +32,6 @@ OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4))
 
 NOISY = 0.05
 """Noise of the positions, in radii of a point's disk, above which points are averaged."""
-
-SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.6
-"""Lengths of the difference of two neighbours' normals: above the first there is an edge between them, up to the last,
-from which on they are the two sides of a sheet. Round shapes have more that differ by the second to the first."""
-
-EDGES, CLEARLY = 0.01, 3.0
-"""Least share of the neighbours with an edge between them where a shape has edges, and how often it is the others'."""
-
-BESIDE = 6
-"""Nearest neighbours of a point that are asked."""
 
 
 @dataclass(frozen=True)
@@ -95,14 +85,6 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, features: int, rng: np.ra
     samples = replace(samples, points=points, normals=normals)
     _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
     return Told(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
-
-
-def has_edges(points: Float, normals: Float) -> bool:
-    """Return whether faces meet at edges, by points and unit normals, both of shape (N, 3), that have been averaged."""
-    near = Density(points).tree.query(points, list(range(2, min(len(points), BESIDE + 1) + 1)))[1]
-    apart = np.linalg.norm(normals[near] - normals[:, None], axis=2)
-    sharp, bent = (((low < apart) & (apart < high)).mean() for low, high in ((SHARP, OPPOSED), (FLAT, SHARP)))
-    return bool(sharp > EDGES and sharp > CLEARLY * bent)
 
 
 def _best(

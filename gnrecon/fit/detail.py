@@ -21,12 +21,13 @@ from gnrecon.cloud import Float, Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
-from gnrecon.fit.averaged import told
+from gnrecon.fit.averaged import Told, told
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.choose import Int, Leftover, Mask, Volume
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
+from gnrecon.fit.sharp import Sharp
 from gnrecon.sampling import CoarseDistance
 
 _log = logging.getLogger(__name__)
@@ -60,6 +61,7 @@ def fit_detail(
     device: str,
     advance: Advance = unheard,
     shape: ShapingFor | None = None,
+    sharp: Sharp | None = None,
 ) -> tuple[Detail, Averaging | None]:
     """Return what to add to a global field, and how the samples were averaged for it, if they were.
 
@@ -73,8 +75,12 @@ def fit_detail(
     device : a torch device
     advance : told of the share that is done
     shape : gives what is asked of the surface besides, for the length of the detail
+    sharp : whose samples they are, if faces were continued; then length and noise are known
     """
-    found = told(sdf, samples, held, features, rng, device)
+    if sharp is None:
+        found = told(sdf, samples, held, features, rng, device)
+    else:
+        found = Told(samples, Leftover.of(sdf, samples), sharp.belief, sharp.averaging)
     samples, leftover, belief = found.samples, found.leftover, found.belief
     _log.info(
         "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",

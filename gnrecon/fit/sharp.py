@@ -1,0 +1,93 @@
+"""Sharp shapes: whether faces meet at edges, and then their samples with the faces continued to the edges (`creases`).
+
+What is left out of a scan hardly tells how sharp an edge is: few points lie near one, and patches that predict them
+have too few features for it. That a shape is sharp is plain from its normals, though, and what is then believed of its
+continued faces is always the same: they are nearly exact, and features are as short as their samples can tell apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gnrecon.cloud import Float, Samples
+from gnrecon.fit.bilateral import Averaging
+from gnrecon.fit.creases import Faces
+from gnrecon.fit.patch import Belief
+from gnrecon.sampling import Density
+
+SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.6
+"""Lengths of the difference of two neighbours' normals: above the first there is an edge between them, up to the last,
+from which on they are the two sides of a sheet. Round shapes have more that differ by the second to the first."""
+
+EDGES, CLEARLY = 0.01, 3.0
+"""Least share of the neighbours with an edge between them where a shape has edges, and how often it is the others'."""
+
+BESIDE = 6
+"""Nearest neighbours of a point that are asked."""
+
+MOST_POINTS = 30_000
+"""Points beyond which nothing is added: edges are rounded over the points' spacing, which is short then."""
+
+AVERAGING = Averaging(4.0, 0.4)
+"""How points are averaged whose faces are rough; left-out points hardly tell other widths apart."""
+
+ROUGH, SMOOTH = 0.05, 0.03
+"""Roughness of the faces beyond which points are averaged, and at most after that, see `Faces.roughness`."""
+
+AGREED = 0.9
+"""Least share of the samples near edges that no scanned point contradicts."""
+
+LENGTH, NOISE, ANGLE = 2.6, 0.02, 0.2
+"""What is believed of the samples: length and noise of positions in radii of a disk, noise of normals in radians."""
+
+
+@dataclass(frozen=True)
+class Sharp:
+    """The samples of a sharp shape.
+
+    Parameters
+    ----------
+    samples : of the scan first, which may be averaged, and then those that were added
+    averaging : how they were averaged, or None
+    """
+
+    samples: Samples
+    averaging: Averaging | None
+
+    @property
+    def belief(self) -> Belief:
+        """What is believed of them."""
+        radius = Density(self.samples.points).radius
+        return Belief(LENGTH * radius, NOISE * radius, ANGLE)
+
+    @classmethod
+    def of(cls, samples: Samples) -> Sharp | None:
+        """Return the samples of a scan with its faces continued, or None where no sharp edges are beyond doubt.
+
+        Estimated normals are means over edges, which tell too little of them.
+        """
+        if samples.estimated or len(samples) > MOST_POINTS or len(samples) <= BESIDE:
+            return None
+        points, normals, averaging = samples.points, samples.normals, None
+        faces = Faces(points, normals)
+        if faces.roughness > ROUGH:
+            averaging = AVERAGING
+            points, normals = averaging.of(points, normals)
+            faces = Faces(points, normals)
+        if faces.roughness > SMOOTH or not has_edges(points, normals):
+            return None
+        more, their_normals, agreed = faces.more()
+        if agreed < AGREED:
+            return None
+        joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])
+        return cls(replace(samples, points=joined[0], normals=joined[1]), averaging)
+
+
+def has_edges(points: Float, normals: Float) -> bool:
+    """Return whether faces meet at edges, by points and unit normals, both of shape (N, 3), that have been averaged."""
+    near = Density(points).tree.query(points, list(range(2, min(len(points), BESIDE + 1) + 1)))[1]
+    apart = np.linalg.norm(normals[near] - normals[:, None], axis=2)
+    sharp, bent = (((low < apart) & (apart < high)).mean() for low, high in ((SHARP, OPPOSED), (FLAT, SHARP)))
+    return bool(sharp > EDGES and sharp > CLEARLY * bent)

@@ -1,0 +1,158 @@
+"""Sharp shapes: samples that continue faces to their edges, and which scans are sharp."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Frame, Samples
+from gnrecon.fit import FitOptions, fit, sharp
+from gnrecon.fit.creases import Faces
+from gnrecon.fit.sharp import AVERAGING, Sharp
+from gnrecon.sampling import Density
+
+FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
+SIDE = 0.8
+
+
+def cube(count: int, noise: float = 0.0, tilt: float = 0.0, seed: int = 0) -> Samples:
+    rng = np.random.default_rng(seed)
+    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
+    x, normals = rng.uniform(-SIDE, SIDE, (count, 3)), np.zeros((count, 3))
+    x[rows, axis] = SIDE * side + noise * rng.standard_normal(count)
+    normals[rows, axis] = side
+    normals += tilt * rng.standard_normal((count, 3))
+    return Samples(x, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)
+
+
+def ball(count: int, noise: float = 0.0) -> Samples:
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((count, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return Samples(x * (SIDE + noise * rng.standard_normal((count, 1))), x, FRAME)
+
+
+def rounded(count: int, radius: float) -> Samples:
+    """Draw points of two planes at right angles, with a fillet between them, and the fillet's own points."""
+    rng = np.random.default_rng(1)
+    flat, bent = 1.0 - radius, np.pi / 2 * radius
+    s, y = rng.uniform(-flat, flat + bent, count), rng.uniform(-0.7, 0.7, count)
+    angle = np.clip(s / radius, 0.0, np.pi / 2)
+    x = np.minimum(s, 0.0) + radius * np.sin(angle)
+    z = radius * np.cos(angle) - np.maximum(s - bent, 0.0)
+    normals = np.stack([np.sin(angle), np.zeros(count), np.cos(angle)], axis=1)
+    return Samples(np.stack([x, y, z], axis=1), normals, FRAME)
+
+
+def off_cube(x: np.ndarray) -> np.ndarray:
+    outside = np.abs(x) - SIDE
+    return np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
+
+
+def from_edges(x: np.ndarray) -> np.ndarray:
+    """Return the distance along the faces from the cube's nearest edge."""
+    return SIDE - np.sort(np.abs(x), axis=1)[:, 1]
+
+
+def test_faces_of_a_cube_are_continued_to_its_edges_and_its_gaps_are_halved() -> None:
+    scan = cube(600)
+    found = Sharp.of(scan)
+    assert found is not None
+    assert found.averaging is None
+    x, normals = found.samples.points[600:], found.samples.normals[600:]
+    assert (found.samples.points[:600] == scan.points).all()
+    assert off_cube(x).max() < 1e-9
+    # Each sample's normal is that of a face that it lies on.
+    assert np.abs((x * normals).sum(axis=1) - SIDE).max() < 1e-9
+    disk = Density(scan.points).radius
+    places = cube(20_000, seed=3).points
+    at_edges = places[from_edges(places) < 0.3 * disk]
+    nearest = [Density(points).tree.query(at_edges)[0].mean() for points in (scan.points, found.samples.points)]
+    assert nearest[1] < 0.75 * nearest[0]
+    nearest = [Density(points).tree.query(places)[0].max() for points in (scan.points, found.samples.points)]
+    assert nearest[1] < nearest[0]
+    assert found.belief.length == pytest.approx(sharp.LENGTH * Density(found.samples.points).radius)
+
+
+def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:
+    """Halving the angle between two points of a circle takes the error of the sample between them to a sixteenth."""
+
+    def error(angle: float) -> float:
+        turns, heights = angle * np.arange(6), np.array([0.0, 0.1])
+        turn, height = (grid.ravel() for grid in np.meshgrid(turns, heights))
+        normals = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+        # The circle as large as needed for neighbours that are as far apart as the rows.
+        radius = 0.1 / angle
+        faces = Faces(radius * normals + np.stack([0 * turn, 0 * turn, height], axis=1), normals)
+        x, n, _ = faces.between()
+        radial = x[:, :2] / np.linalg.norm(x[:, :2], axis=1, keepdims=True)
+        assert (radial * n[:, :2]).sum(axis=1) == pytest.approx(np.ones(len(x)), abs=1e-9)
+        assert faces.roughness < 1e-12
+        return float(np.abs(np.linalg.norm(x[:, :2], axis=1) - radius).max() / radius)
+
+    assert error(0.1) / error(0.2) == pytest.approx(1 / 16, rel=0.05)
+
+
+def test_noisy_faces_are_averaged_first() -> None:
+    scan = cube(3000, noise=0.01, tilt=0.1)
+    found = Sharp.of(scan)
+    assert found is not None
+    assert found.averaging == AVERAGING
+    assert off_cube(found.samples.points).mean() < 0.4 * off_cube(scan.points).mean()
+
+
+@pytest.mark.parametrize("samples", [ball(60), ball(1500), ball(1500, 0.01), rounded(3000, 0.3)])
+def test_smooth_shapes_have_no_edges(samples: Samples) -> None:
+    assert Sharp.of(samples) is None
+
+
+def test_where_two_faces_meet_in_a_fillet_nothing_is_added_beyond_it() -> None:
+    """The planes on both sides of a fillet that has a few points of its own meet outside the shape."""
+    samples = rounded(3000, 0.04)
+    faces = Faces(samples.points, samples.normals)
+    x, *_, agreed = faces.towards_edges()
+    assert agreed < sharp.AGREED
+    assert Sharp.of(samples) is None
+    # Without those points nothing contradicts.
+    flat = np.abs(samples.normals).max(axis=1) > 1 - 1e-9
+    *_, agreed = Faces(samples.points[flat], samples.normals[flat]).towards_edges()
+    assert agreed == 1.0
+
+
+def test_estimated_normals_and_many_points_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = cube(600)
+    assert Sharp.of(replace(samples, estimated=True)) is None
+    assert Sharp.of(replace(samples, points=samples.points[:5], normals=samples.normals[:5])) is None
+    monkeypatch.setattr(sharp, "MOST_POINTS", 599)
+    assert Sharp.of(samples) is None
+
+
+def test_points_that_are_there_twice_do_no_harm() -> None:
+    samples = cube(400)
+    twice = replace(samples, **{n: np.concatenate([getattr(samples, n)] * 2) for n in ("points", "normals")})
+    with np.errstate(all="raise"):
+        found = Sharp.of(twice)
+    assert found is None or np.isfinite(found.samples.points).all()
+
+
+def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against the same fit without: the mean distance of its zero level from the cube's edges and faces."""
+    scan, options = cube(500), FitOptions(quality="draft")
+    exact = cube(3000, seed=5)
+    # Beside the edges, where |f| of a signed distance is the distance.
+    places = exact.points[from_edges(exact.points) < 0.1]
+
+    def error() -> tuple[float, str]:
+        sdf, solution = fit(scan, options)
+        value, gradient = sdf.sdf_and_gradient(FRAME.to_world(places))
+        slope = np.linalg.norm(gradient, axis=1).clip(0.3)
+        return float(np.mean(np.abs(value) / slope)) / FRAME.scale, solution.status
+
+    continued, status = error()
+    assert "Continued faces to their edges by" in status
+    monkeypatch.setattr(Sharp, "of", classmethod(lambda *_: None))
+    plain, status = error()
+    assert "Continued" not in status
+    assert continued < 0.7 * plain
