@@ -112,7 +112,7 @@ def test_where_two_faces_meet_in_a_fillet_nothing_is_added_beyond_it() -> None:
     """The planes on both sides of a fillet that has a few points of its own meet outside the shape."""
     samples = rounded(3000, 0.04)
     faces = Faces(samples.points, samples.normals)
-    x, *_, agreed = faces.towards_edges()
+    *_, agreed = faces.towards_edges()
     assert agreed < sharp.AGREED
     assert Sharp.of(samples) is None
     # Without those points nothing contradicts.
