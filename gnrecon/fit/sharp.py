@@ -39,8 +39,9 @@ ROUGH, SMOOTH = 0.05, 0.03
 AGREED = 0.9
 """Least share of the samples near edges that no scanned point contradicts."""
 
-LENGTH, NOISE, ANGLE = 2.6, 0.02, 0.2
-"""What is believed of the samples: length and noise of positions in radii of a disk, noise of normals in radians."""
+LENGTH, NOISE, ANGLE, ANGLE_AVERAGED = 2.6, 0.02, 0.2, 0.5
+"""What is believed of the samples: length and noise of positions in radii of a disk, noise of normals in radians. Noisy
+points close to an edge may lie beyond it, and have the other face's normal; that of averaged ones says less there."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Sharp:
     def belief(self) -> Belief:
         """What is believed of them."""
         radius = Density(self.samples.points).radius
-        return Belief(LENGTH * radius, NOISE * radius, ANGLE)
+        return Belief(LENGTH * radius, NOISE * radius, ANGLE if self.averaging is None else ANGLE_AVERAGED)
 
     @classmethod
     def of(cls, samples: Samples) -> Sharp | None:
