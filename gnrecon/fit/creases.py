@@ -88,6 +88,28 @@ class Faces:
         return float((self._bent[row, rank] / self.disks[row]).mean()) if len(row) else np.inf
 
     @cached_property
+    def on_faces(self) -> Mask:
+        """Which points lie on a face with some of their neighbours, of shape (N,); outliers do not."""
+        face = self._close & (self.cosine > _cos(ONE_FACE))
+        alike = face.sum(axis=1)
+        rough = np.where(face, np.abs(self.height), 0.0).sum(axis=1) / np.maximum(alike, 1)
+        on_faces: Mask = (alike >= LEAST_FACE) & (rough < FLAT * self.disks)
+        return on_faces
+
+    @cached_property
+    def bend(self) -> float:
+        """Median angle between the normals of a point and its nearest neighbour on its face, in degrees."""
+        row, rank = np.nonzero(self._within)
+        first = np.unique(row, return_index=True)[1]
+        cosine = self.cosine[row[first], rank[first]].clip(-1.0, 1.0)
+        return float(np.degrees(np.median(np.arccos(cosine)))) if len(row) else np.inf
+
+    @cached_property
+    def _close(self) -> Mask:
+        close: Mask = self.distance < REACH * self.disks[:, None]
+        return close
+
+    @cached_property
     def _within(self) -> Mask:
         """Which neighbours are near and of one face, of shape (N, k)."""
         apart = (self.distance > 0) & (self.distance < WITHIN * self.disks[:, None])
@@ -114,14 +136,10 @@ class Faces:
 
     def towards_edges(self) -> tuple[Float, Float, Float, float]:
         """Return samples near edges, normals, disks of the points continued to them, and the share that is kept."""
-        close = self.distance < REACH * self.disks[:, None]
-        face = close & (self.cosine > _cos(ONE_FACE))
-        alike = face.sum(axis=1)
-        rough = np.where(face, np.abs(self.height), 0.0).sum(axis=1) / np.maximum(alike, 1)
-        on_face = (alike >= LEAST_FACE) & (rough < FLAT * self.disks)
         # Both points are in front of the other's plane, or both behind: else the faces do not meet between them.
-        meet = close & (self.cosine < _cos(APART)) & (self.cosine > _cos(OPPOSED)) & (self.height * self.own > 0)
-        i, rank = np.nonzero(meet & on_face[:, None] & on_face[self.near])
+        turned = (self.cosine < _cos(APART)) & (self.cosine > _cos(OPPOSED))
+        meet = self._close & turned & (self.height * self.own > 0)
+        i, rank = np.nonzero(meet & self.on_faces[:, None] & self.on_faces[self.near])
         j = self.near[i, rank]
         x, n, y, m = self.points[i], self.normals[i], self.points[j], self.normals[j]
         along = np.cross(n, m)

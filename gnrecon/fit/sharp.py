@@ -36,6 +36,9 @@ AVERAGING = Averaging(4.0, 0.4)
 ROUGH, SMOOTH = 0.05, 0.03
 """Roughness of the faces beyond which points are averaged, and at most after that, see `Faces.roughness`."""
 
+PLANE = 1.0
+"""Median bend of the faces, in degrees, up to which single points, as on a plate's sides, tell of edges, too."""
+
 AGREED = 0.9
 """Least share of the samples near edges that no scanned point contradicts."""
 
@@ -77,13 +80,21 @@ class Sharp:
             averaging = AVERAGING
             points, normals = averaging.of(points, normals)
             faces = Faces(points, normals)
-        if faces.roughness > SMOOTH or not has_edges(points, normals):
+        if faces.roughness > SMOOTH or not _sharp(faces):
             return None
         more, their_normals, agreed = faces.more()
         if agreed < AGREED:
             return None
         joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])
         return cls(replace(samples, points=joined[0], normals=joined[1]), averaging)
+
+
+def _sharp(faces: Faces) -> bool:
+    """Return whether faces meet at edges. Outliers look as if they did, if those that lie on no face are asked, too."""
+    if not has_edges(faces.points, faces.normals):
+        return False
+    kept = faces.on_faces
+    return faces.bend < PLANE or (int(kept.sum()) > BESIDE and has_edges(faces.points[kept], faces.normals[kept]))
 
 
 def has_edges(points: Float, normals: Float) -> bool:

@@ -108,6 +108,26 @@ def test_smooth_shapes_have_no_edges(samples: Samples) -> None:
     assert Sharp.of(samples) is None
 
 
+def test_outliers_are_no_edges() -> None:
+    """Whichever way an outlier looks, it lies on no face. Yet single points on a plate's sides tell of its edges."""
+    rng = np.random.default_rng(2)
+    smooth = ball(1500)
+    normals = smooth.normals.copy()
+    out = rng.choice(1500, 75, replace=False)
+    aside = np.cross(normals[out], rng.standard_normal((75, 3)))
+    normals[out] = 0.5 * normals[out] + aside / np.linalg.norm(aside, axis=1, keepdims=True)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = smooth.points + 0.1 * (normals - smooth.normals)
+    assert sharp.has_edges(points, normals)
+    assert Sharp.of(replace(smooth, points=points, normals=normals)) is None
+    plate = cube(500, seed=4)
+    plate = replace(plate, points=plate.points * [1.0, 1.0, 0.02])
+    sides = np.abs(plate.normals[:, 2]) < 0.5
+    few = ~sides | (np.cumsum(sides) % 10 == 0)
+    plate = replace(plate, points=plate.points[few], normals=plate.normals[few])
+    assert Sharp.of(plate) is not None
+
+
 def test_where_two_faces_meet_in_a_fillet_nothing_is_added_beyond_it() -> None:
     """The planes on both sides of a fillet that has a few points of its own meet outside the shape."""
     samples = rounded(3000, 0.04)
