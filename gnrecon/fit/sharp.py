@@ -42,9 +42,12 @@ PLANE = 1.0
 AGREED = 0.9
 """Least share of the samples near edges that no scanned point contradicts."""
 
-LENGTH, NOISE, ANGLE, ANGLE_AVERAGED = 2.6, 0.02, 0.2, 0.5
-"""What is believed of the samples: length and noise of positions in radii of a disk, noise of normals in radians. Noisy
-points close to an edge may lie beyond it, and have the other face's normal; that of averaged ones says less there."""
+NOISE = 0.02
+"""Noise of the samples' positions that is believed, in radii of a disk."""
+
+EXACT, AVERAGED = (2.6, 0.2), (3.2, 0.5)
+"""Length, in radii of a disk, and noise of normals, in radians, that are believed of exact samples and of averaged ones:
+noisy points close to an edge may lie beyond it and have the other face's normal, which says less there."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,8 @@ class Sharp:
     def belief(self) -> Belief:
         """What is believed of them."""
         radius = Density(self.samples.points).radius
-        return Belief(LENGTH * radius, NOISE * radius, ANGLE if self.averaging is None else ANGLE_AVERAGED)
+        length, angle = EXACT if self.averaging is None else AVERAGED
+        return Belief(length * radius, NOISE * radius, angle)
 
     @classmethod
     def of(cls, samples: Samples) -> Sharp | None:
