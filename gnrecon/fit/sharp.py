@@ -46,8 +46,8 @@ NOISE = 0.02
 """Noise of the samples' positions that is believed, in radii of a disk."""
 
 EXACT, AVERAGED = (2.6, 0.2), (3.2, 0.5)
-"""Length, in radii of a disk, and noise of normals, in radians, that are believed of exact samples and of averaged ones:
-noisy points close to an edge may lie beyond it and have the other face's normal, which says less there."""
+"""Length, in radii of a disk, and noise of normals, in radians, that are believed of exact samples and of averaged
+ones: noisy points close to an edge may lie beyond it and have the other face's normal, which says less there."""
 
 
 @dataclass(frozen=True)
