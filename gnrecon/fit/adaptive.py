@@ -145,14 +145,17 @@ def fit_adaptive(
     chosen = detail.as_dict(samples.frame.scale)
     told = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
     told += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
-    if task.sharp is not None:
-        told += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
     if averaging is not None:
         told += f" Averaged noisy points over {averaging.width:g} of their disks' radii, where normals agree."
+    if task.sharp is not None:
+        told += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
+    if task.sharp is None:
+        beside = f"noise {chosen['position_noise']:.2g} in position and {chosen['angle_noise']:.2g} degrees in normals"
+    else:
+        beside = "as short as its sharp faces can tell apart"
     status = (
         f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
-        f"length {chosen['length']:.3g}, noise {chosen['position_noise']:.2g} in position and "
-        f"{chosen['angle_noise']:.2g} degrees in normals.{told}{_asked(options)}"
+        f"length {chosen['length']:.3g}, {beside}.{told}{_asked(options)}"
     )
     return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
 

@@ -172,6 +172,7 @@ def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.Mon
 
     continued, status = error()
     assert "Continued faces to their edges by" in status
+    assert "degrees in normals" not in status
     monkeypatch.setattr(Sharp, "of", classmethod(lambda *_: None))
     plain, status = error()
     assert "Continued" not in status
