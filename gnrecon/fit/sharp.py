@@ -95,7 +95,7 @@ class Sharp:
 
 def _sharp(faces: Faces) -> bool:
     """Return whether faces meet at edges. Outliers look as if they did, if those that lie on no face are asked, too."""
-    if not has_edges(faces.points, faces.normals):
+    if not _edged(faces.cosine[:, :BESIDE]):
         return False
     kept = faces.on_faces
     return faces.bend < PLANE or (int(kept.sum()) > BESIDE and has_edges(faces.points[kept], faces.normals[kept]))
@@ -104,6 +104,11 @@ def _sharp(faces: Faces) -> bool:
 def has_edges(points: Float, normals: Float) -> bool:
     """Return whether faces meet at edges, by points and unit normals, both of shape (N, 3), that have been averaged."""
     near = Density(points).tree.query(points, list(range(2, min(len(points), BESIDE + 1) + 1)))[1]
-    apart = np.linalg.norm(normals[near] - normals[:, None], axis=2)
+    return _edged(np.einsum("ikd,id->ik", normals[near], normals))
+
+
+def _edged(cosine: Float) -> bool:
+    """Return the same, by the cosines of the angles between the normals of each point and its neighbours'."""
+    apart = np.sqrt((2.0 - 2.0 * cosine).clip(0.0))
     sharp, bent = (((low < apart) & (apart < high)).mean() for low, high in ((SHARP, OPPOSED), (FLAT, SHARP)))
     return bool(sharp > EDGES and sharp > CLEARLY * bent)
