@@ -211,6 +211,7 @@ class Trials:
     predicted : rows of the left-out points that each patch predicts
     held : mask of shape (N,), of the points that are left out
     device : a torch device
+    known : noise of positions and normals, where it is known; then no other is tried
     """
 
     leftover: Leftover
@@ -221,6 +222,7 @@ class Trials:
     predicted: Sequence[Int]
     held: Mask
     device: str
+    known: tuple[float, float] | None = None
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
@@ -266,9 +268,27 @@ class Trials:
         position, angle = self.noises[noise]
         return Choice(Belief(LENGTHS[number] * self.radius, position, angle), scores[number])
 
+    def shortest(self) -> Belief:
+        """Return the belief in the shortest length whose next is not better beyond its standard error.
+
+        A clean scan tells all that its points tell by the shortest length, which the finest data needs; only where a
+        cube's features, or the points, are too few for it are longer ones clearly better.
+        """
+        number = 0
+        while number + 1 < len(LENGTHS) and self._clearly_better(number + 1, number):
+            number += 1
+        return Belief(LENGTHS[number] * self.radius, *self.noises[0])
+
+    def _clearly_better(self, number: int, than: int) -> bool:
+        """Return whether a length's score is better than another's by more than the standard error."""
+        gain = self.scores(LENGTHS[than] * self.radius)[:, 0] - self.scores(LENGTHS[number] * self.radius)[:, 0]
+        return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
+
     @cached_property
     def noises(self) -> list[tuple[float, float]]:
         """Return the noises to try, of positions and normals; points are no noisier than what is left over says."""
+        if self.known is not None:
+            return [self.known]
         most = max(float(np.sqrt(np.mean(self.leftover.value**2))), LEAST_NOISE * self.radius)
         return [(min(position * self.radius, most), angle) for position, angle in CHOICES]
 

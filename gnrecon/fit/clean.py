@@ -1,0 +1,71 @@
+"""Scans so clean that their noise need not be chosen.
+
+Two neighbours of a smooth surface lie nearly as high over each other's tangent planes, with opposite signs: half the
+sum of both heights is nothing on planes, spheres and round cylinders, and of third order in their distance elsewhere.
+Noise is of order zero there, and that of the normals of order one. So points tell by themselves, without a surface,
+how noisy they are. Left-out points tell it of clean scans hardly at all: they lie a spacing away from the others, where
+the shape that is not known matters far more than a noise of a hundredth of that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gnrecon.cloud import Float
+from gnrecon.fit.choose import Leftover
+
+NEIGHBOURS, DISKS = 5, 2.0
+"""Neighbours of a point that are asked, and how far they are at most, in radii of its disk."""
+
+ALIKE = np.cos(np.radians(25.0))
+"""Cosine of the angle between two normals up to which they may belong to one smooth piece of surface."""
+
+CLEAN = 0.04
+"""Median of the heights, in radii of a disk or over the distance where that is longer, up to which a scan is clean.
+Vertices of scanned meshes have 0.017 to 0.024, a noise of 0.08 radii 0.06, range scans 0.14 and more."""
+
+LEAST_PAIRS = 20
+
+LEAST_OVER = 0.01
+"""Root mean square of what the global field leaves over, in radii of a disk, below which there is nothing to gain."""
+
+POSITION, ANGLE, TURNED = 0.005, 0.01, 1.5
+"""Least noise that is believed of positions, in radii of a disk, and of normals, in radians, and the latter over the
+former: where neighbours stand a radius apart, noise of the normals alone would make such heights."""
+
+ESTIMATED = 0.1
+"""Noise of normals that were estimated, in radians: their error, which no neighbours tell, as theirs is about the same.
+"""
+
+
+def clean_noise(leftover: Leftover) -> tuple[float, float] | None:
+    """Return the noise of positions, unit coordinates, and normals, radians, of a clean scan; None of any other.
+
+    It is also None where the global field itself leaves nothing over at the points.
+    """
+    radius = leftover.density.radius
+    if float(np.sqrt(np.mean(leftover.value**2))) < LEAST_OVER * radius:
+        return None
+    height = heights(leftover)
+    if not height <= CLEAN:
+        return None
+    if leftover.estimated:
+        return POSITION * radius, ESTIMATED
+    return max(height, POSITION) * radius, max(TURNED * height, ANGLE)
+
+
+def heights(leftover: Leftover) -> float:
+    """Return the median height of neighbours over the surface that both their normals tell; NaN of too few pairs.
+
+    It is half the sum of both heights over each other's planes, over the larger of their distance and a disk's radius.
+    """
+    points, normals = leftover.points, leftover.normals
+    ranks = list(range(2, min(NEIGHBOURS + 1, len(points)) + 1))
+    distance, near = leftover.density.tree.query(points, ranks)
+    beyond, other = points[near] - points[:, None], normals[near]
+    disks = leftover.density.disks[:, None]
+    paired = (distance > 0) & (distance < DISKS * disks) & (np.einsum("ikd,id->ik", other, normals) > ALIKE)
+    if paired.sum() < LEAST_PAIRS:
+        return np.nan
+    height: Float = np.abs(np.einsum("ikd,ikd->ik", beyond, other + normals[:, None])) / 2
+    return float(np.median((height / np.maximum(distance, disks))[paired]))
