@@ -19,7 +19,6 @@ import numpy as np
 from gnrecon.cloud import Float, Samples
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.choose import Choice, Leftover, Mask, Trials
-from gnrecon.fit.clean import clean_noise
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.sharp import has_edges
@@ -68,9 +67,9 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, features: int, rng: np.ra
     leftover = Leftover.of(sdf, samples)
     radius = leftover.density.radius
     trials = Trials.draw(leftover, held, radius, rng, device, features)
-    noise = clean_noise(leftover)
-    if noise is not None:
-        return Told(samples, leftover, replace(trials, known=noise).shortest())
+    clean = trials.clean()
+    if clean is not None:
+        return Told(samples, leftover, clean)
     choice = trials.choice()
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.features import Features
+from gnrecon.fit.clean import clean_noise
 from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
@@ -162,7 +163,7 @@ class Choice:
 
 
 def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
-    """Return the belief that predicts left-out points best.
+    """Return the belief that a clean scan tells by itself, and of any other that which predicts left-out points best.
 
     Parameters
     ----------
@@ -172,7 +173,8 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     rng : draws patches, features and what is left out
     device : a torch device
     """
-    return Trials.draw(leftover, held, radius, rng, device).choice().belief
+    trials = Trials.draw(leftover, held, radius, rng, device)
+    return trials.clean() or trials.choice().belief
 
 
 def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
@@ -249,6 +251,23 @@ class Trials:
         centers = leftover.points[chosen]
         return cls(leftover, leftover, radius, features, centers, list(out[near]), held, device)
 
+    def clean(self) -> Belief | None:
+        """Return the belief of a scan so clean that its points tell their noise by themselves, or None.
+
+        Its length is the shortest whose next is not better beyond its standard error. All that clean points tell asks
+        for that; only where they, or a cube's features, are too few for it are longer ones clearly better.
+        """
+        left = self.leftover
+        over = float(np.sqrt(np.mean(left.value**2)))
+        noise = clean_noise(left.points, left.normals, left.density, over, left.estimated)
+        if noise is None:
+            return None
+        known = replace(self, known=noise)
+        number = 0
+        while number + 1 < len(LENGTHS) and known._clearly_better(number + 1, number):
+            number += 1
+        return Belief(LENGTHS[number] * self.radius, *noise)
+
     def choice(self) -> Choice:
         """Return the belief that predicts best."""
         scores: dict[int, Float] = {}
@@ -267,17 +286,6 @@ class Trials:
         number, noise = _smoothest(scores)
         position, angle = self.noises[noise]
         return Choice(Belief(LENGTHS[number] * self.radius, position, angle), scores[number])
-
-    def shortest(self) -> Belief:
-        """Return the belief in the shortest length whose next is not better beyond its standard error.
-
-        A clean scan tells all that its points tell by the shortest length, which the finest data needs; only where a
-        cube's features, or the points, are too few for it are longer ones clearly better.
-        """
-        number = 0
-        while number + 1 < len(LENGTHS) and self._clearly_better(number + 1, number):
-            number += 1
-        return Belief(LENGTHS[number] * self.radius, *self.noises[0])
 
     def _clearly_better(self, number: int, than: int) -> bool:
         """Return whether a length's score is better than another's by more than the standard error."""

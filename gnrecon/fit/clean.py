@@ -12,7 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.cloud import Float
-from gnrecon.fit.choose import Leftover
+from gnrecon.sampling import Density
+
+Noise = tuple[float, float]
 
 NEIGHBOURS, DISKS = 5, 2.0
 """Neighbours of a point that are asked, and how far they are at most, in radii of its disk."""
@@ -24,7 +26,8 @@ CLEAN = 0.04
 """Median of the heights, in radii of a disk or over the distance where that is longer, up to which a scan is clean.
 Vertices of scanned meshes have 0.017 to 0.024, a noise of 0.08 radii 0.06, range scans 0.14 and more."""
 
-LEAST_PAIRS = 20
+LEAST_PAIRS, MOST_POINTS = 20, 50_000
+"""Fewest pairs that tell anything, and points whose neighbours are asked at most."""
 
 LEAST_OVER = 0.01
 """Root mean square of what the global field leaves over, in radii of a disk, below which there is nothing to gain."""
@@ -38,34 +41,41 @@ ESTIMATED = 0.1
 """
 
 
-def clean_noise(leftover: Leftover) -> tuple[float, float] | None:
+def clean_noise(points: Float, normals: Float, density: Density, over: float, estimated: bool) -> Noise | None:
     """Return the noise of positions, unit coordinates, and normals, radians, of a clean scan; None of any other.
 
-    It is also None where the global field itself leaves nothing over at the points.
+    It is also None where a field that is to be corrected leaves nothing over at the points.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3), unit normals
+    density : of the points
+    over : root mean square of what is left over, unit coordinates
+    estimated : whether the normals were found from the points
     """
-    radius = leftover.density.radius
-    if float(np.sqrt(np.mean(leftover.value**2))) < LEAST_OVER * radius:
+    if over < LEAST_OVER * density.radius:
         return None
-    height = heights(leftover)
+    height = heights(points, normals, density)
     if not height <= CLEAN:
         return None
-    if leftover.estimated:
-        return POSITION * radius, ESTIMATED
-    return max(height, POSITION) * radius, max(TURNED * height, ANGLE)
+    if estimated:
+        return POSITION * density.radius, ESTIMATED
+    return max(height, POSITION) * density.radius, max(TURNED * height, ANGLE)
 
 
-def heights(leftover: Leftover) -> float:
+def heights(points: Float, normals: Float, density: Density) -> float:
     """Return the median height of neighbours over the surface that both their normals tell; NaN of too few pairs.
 
     It is half the sum of both heights over each other's planes, over the larger of their distance and a disk's radius.
+    The parameters are those of `clean_noise`.
     """
-    points, normals = leftover.points, leftover.normals
+    asked = slice(None, None, -(-len(points) // MOST_POINTS))
+    own, disks = normals[asked], density.disks[asked, None]
     ranks = list(range(2, min(NEIGHBOURS + 1, len(points)) + 1))
-    distance, near = leftover.density.tree.query(points, ranks)
-    beyond, other = points[near] - points[:, None], normals[near]
-    disks = leftover.density.disks[:, None]
-    paired = (distance > 0) & (distance < DISKS * disks) & (np.einsum("ikd,id->ik", other, normals) > ALIKE)
+    distance, near = density.tree.query(points[asked], ranks)
+    beyond, other = points[near] - points[asked, None], normals[near]
+    paired = (distance > 0) & (distance < DISKS * disks) & (np.einsum("ikd,id->ik", other, own) > ALIKE)
     if paired.sum() < LEAST_PAIRS:
         return np.nan
-    height: Float = np.abs(np.einsum("ikd,ikd->ik", beyond, other + normals[:, None])) / 2
+    height: Float = np.abs(np.einsum("ikd,ikd->ik", beyond, other + own[:, None])) / 2
     return float(np.median((height / np.maximum(distance, disks))[paired]))

@@ -1,0 +1,111 @@
+"""Clean scans: whose noise their neighbours tell, and what is then believed of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.fit import FitOptions, fit
+from gnrecon.fit.choose import LENGTHS, Leftover, Trials
+from gnrecon.fit.clean import ANGLE, ESTIMATED, POSITION, clean_noise, heights
+from gnrecon.sampling import Density
+
+FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
+STEP = 1e-6
+
+
+def level(x: Float) -> Float:
+    """Return |x| less the radius of a bumpy ball in that direction, of shape (N,)."""
+    r = np.linalg.norm(x, axis=1)
+    u = x / r[:, None]
+    level: Float = r - 0.7 * (1 + 0.1 * np.sin(5 * u[:, 0] + 1) * np.cos(4 * u[:, 1]) + 0.08 * np.sin(16 * u[:, 2]))
+    return level
+
+
+def bumpy(count: int, noise: float = 0.0, tilt: float = 0.0, seed: int = 0) -> Samples:
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    x = u * (1.0 - level(u))[:, None]
+    slope = [(level(x + STEP * e) - level(x - STEP * e)) / (2 * STEP) for e in np.eye(3)]
+    normals = np.stack(slope, axis=1) + tilt * rng.standard_normal((count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Samples(x + noise * normals * rng.standard_normal((count, 1)), normals, FRAME)
+
+
+def leftover(samples: Samples, over: float = 0.1) -> Leftover:
+    """Return what a field leaves over that is off by a part of the radius of a disk."""
+    off = np.full(len(samples.points), over * Density(samples.points).radius)
+    return Leftover(samples.points, samples.normals, off, samples.normals)
+
+
+def told(samples: Samples) -> tuple[Float, Float, Density]:
+    return samples.points, samples.normals, Density(samples.points)
+
+
+def off_truth(samples: Samples) -> float:
+    """Return how far the surface is from points that were not fitted, on the mean, in radii of a scanned one's disk."""
+    sdf, _ = fit(samples, FitOptions(quality="draft"))
+    fresh = bumpy(2000, seed=1)
+    value, gradient = sdf.sdf_and_gradient(FRAME.to_world(fresh.points))
+    distance = np.abs(value) / np.einsum("nd,nd->n", gradient, fresh.normals).clip(0.2)
+    return float(distance.mean() / FRAME.scale / Density(samples.points).radius)
+
+
+def test_neighbours_tell_the_noise_of_positions() -> None:
+    radius = Density(bumpy(1500).points).radius
+    assert heights(*told(bumpy(1500))) < 0.01
+    for share in (0.1, 0.2):
+        # Half of the sum of two heights, each of both points' noise: its median is 0.95 of that noise, and less of
+        # pairs that are more than a radius apart.
+        assert heights(*told(bumpy(1500, share * radius))) == pytest.approx(0.75 * share, rel=0.2)
+
+
+def test_a_clean_scan_has_the_noise_that_its_neighbours_tell() -> None:
+    scan, radius = told(bumpy(1500)), Density(bumpy(1500).points).radius
+    position, angle = clean_noise(*scan, radius, estimated=False) or pytest.fail("the scan is clean")
+    assert POSITION * radius <= position < 0.01 * radius
+    assert ANGLE <= angle < 0.015
+    assert clean_noise(*scan, radius, estimated=True) == (POSITION * radius, ESTIMATED)
+
+
+@pytest.mark.parametrize(
+    ("scan", "over"),
+    [
+        pytest.param(bumpy(1500, noise=0.003), 0.1, id="noisy points"),
+        pytest.param(bumpy(1500, tilt=0.15), 0.1, id="noisy normals"),
+        pytest.param(bumpy(1500), 0.005, id="nothing left over"),
+        pytest.param(bumpy(8), 0.1, id="too few pairs"),
+    ],
+)
+def test_of_other_scans_the_noise_is_chosen(scan: Samples, over: float) -> None:
+    points, normals, density = told(scan)
+    assert clean_noise(points, normals, density, over * density.radius, estimated=False) is None
+
+
+def test_points_that_were_scanned_twice_are_no_pairs() -> None:
+    scan = bumpy(600)
+    twice = replace(scan, points=np.repeat(scan.points, 2, axis=0), normals=np.repeat(scan.normals, 2, axis=0))
+    assert heights(*told(twice)) == pytest.approx(heights(*told(scan)), rel=0.6)
+
+
+def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    scan = leftover(bumpy(200))
+    trials = Trials.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
+    even = np.linspace(-1.0, 1.0, 10)[:, None]
+    scores = {LENGTHS[0]: 3.0 + even, LENGTHS[1]: 2.0 + even, LENGTHS[2]: 1.99 - even, LENGTHS[3]: 0.0 * even}
+    monkeypatch.setattr(Trials, "scores", lambda _, length: scores[length])
+    belief = trials.clean()
+    assert belief is not None
+    assert belief.length == LENGTHS[1]
+
+
+def test_clean_scans_are_fitted_nearer_than_by_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    scan = bumpy(500)
+    by_neighbours = off_truth(scan)
+    monkeypatch.setattr(Trials, "clean", lambda _: None)
+    by_choice = off_truth(scan)
+    assert by_neighbours < min(0.6 * by_choice, 0.12), (by_neighbours, by_choice)
