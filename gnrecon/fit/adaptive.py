@@ -138,7 +138,7 @@ def fit_adaptive(
             detail = fit_large(sdf, task.samples, task.held, options, rng, folder, rest, scheduler)
         else:
             where = options.features, rng, options.device
-            detail, averaging = fit_detail(sdf, task.samples, task.held, *where, rest, shape, task.sharp)
+            detail, averaging = fit_detail(sdf, task.samples, task.held, *where, rest, shape, task.sharp, left_out > 0)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)

@@ -52,7 +52,15 @@ class Told:
     averaging: Averaging | None = None
 
 
-def told(sdf: NeuralSDF, samples: Samples, held: Mask, features: int, rng: np.random.Generator, device: str) -> Told:
+def told(
+    sdf: NeuralSDF,
+    samples: Samples,
+    held: Mask,
+    features: int,
+    rng: np.random.Generator,
+    device: str,
+    outliers: bool = False,
+) -> Told:
     """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
 
     Parameters
@@ -63,11 +71,12 @@ def told(sdf: NeuralSDF, samples: Samples, held: Mask, features: int, rng: np.ra
     features : number of features a cube
     rng : draws patches and features
     device : a torch device
+    outliers : whether some were found; those that are left would make horns on what is fitted as clean
     """
     leftover = Leftover.of(sdf, samples)
     radius = leftover.density.radius
     trials = Trials.draw(leftover, held, radius, rng, device, features)
-    clean = trials.clean()
+    clean = None if outliers else trials.clean()
     if clean is not None:
         return Told(samples, leftover, clean)
     choice = trials.choice()

@@ -32,7 +32,7 @@ LEAST_PAIRS, MOST_POINTS = 20, 50_000
 LEAST_OVER = 0.01
 """Root mean square of what the global field leaves over, in radii of a disk, below which there is nothing to gain."""
 
-POSITION, ANGLE, TURNED = 0.005, 0.01, 1.5
+POSITION, ANGLE, TURNED = 0.005, 0.01, 2.0
 """Least noise that is believed of positions, in radii of a disk, and of normals, in radians, and the latter over the
 former: where neighbours stand a radius apart, noise of the normals alone would make such heights."""
 

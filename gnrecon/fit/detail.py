@@ -62,6 +62,7 @@ def fit_detail(
     advance: Advance = unheard,
     shape: ShapingFor | None = None,
     sharp: Sharp | None = None,
+    outliers: bool = False,
 ) -> tuple[Detail, Averaging | None]:
     """Return what to add to a global field, and how the samples were averaged for it, if they were.
 
@@ -76,9 +77,10 @@ def fit_detail(
     advance : told of the share that is done
     shape : gives what is asked of the surface besides, for the length of the detail
     sharp : whose samples they are, if faces were continued; then length and noise are known
+    outliers : whether some were found, so that others may be left
     """
     if sharp is None:
-        found = told(sdf, samples, held, features, rng, device)
+        found = told(sdf, samples, held, features, rng, device, outliers)
     else:
         found = Told(samples, Leftover.of(sdf, samples), sharp.belief, sharp.averaging)
     samples, leftover, belief = found.samples, found.leftover, found.belief
