@@ -99,6 +99,9 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
         choice = Choice(Belief(0.1, position * leftover.density.radius, 0.1), np.zeros((2, 2)))
 
         class Canned:
+            def clean(self) -> None:
+                return None
+
             def choice(self) -> Choice:
                 return choice
 
