@@ -63,6 +63,8 @@ def told(
 ) -> Told:
     """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
 
+    A clean scan is not averaged, and its belief is what its points tell by themselves.
+
     Parameters
     ----------
     sdf : the global field, in the samples' frame

@@ -95,6 +95,11 @@ class Leftover:
         """How densely the points lie."""
         return Density(self.points)
 
+    @cached_property
+    def over(self) -> float:
+        """Root mean square of the values that are left over."""
+        return float(np.sqrt(np.mean(self.value**2)))
+
     def within(self, center: Float, reach: float) -> Int:
         """Return the rows of the points in the cube of half an edge `reach` about a centre, in order."""
         return np.sort(np.array(self.density.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64))
@@ -258,8 +263,7 @@ class Trials:
         for that; only where they, or a cube's features, are too few for it are longer ones clearly better.
         """
         left = self.leftover
-        over = float(np.sqrt(np.mean(left.value**2)))
-        noise = clean_noise(left.points, left.normals, left.density, over, left.estimated)
+        noise = clean_noise(left.points, left.normals, left.density, left.over, left.estimated)
         if noise is None:
             return None
         known = replace(self, known=noise)
@@ -297,7 +301,7 @@ class Trials:
         """Return the noises to try, of positions and normals; points are no noisier than what is left over says."""
         if self.known is not None:
             return [self.known]
-        most = max(float(np.sqrt(np.mean(self.leftover.value**2))), LEAST_NOISE * self.radius)
+        most = max(self.leftover.over, LEAST_NOISE * self.radius)
         return [(min(position * self.radius, most), angle) for position, angle in CHOICES]
 
     def scores(self, length: float) -> Float:
