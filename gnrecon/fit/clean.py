@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.cloud import Float
+from gnrecon.fit.creases import over_planes
 from gnrecon.sampling import Density
 
 Noise = tuple[float, float]
@@ -70,12 +71,12 @@ def heights(points: Float, normals: Float, density: Density) -> float:
     The parameters are those of `clean_noise`.
     """
     asked = slice(None, None, -(-len(points) // MOST_POINTS))
-    own, disks = normals[asked], density.disks[asked, None]
+    disks = density.disks[asked, None]
     ranks = list(range(2, min(NEIGHBOURS + 1, len(points)) + 1))
     distance, near = density.tree.query(points[asked], ranks)
-    beyond, other = points[near] - points[asked, None], normals[near]
-    paired = (distance > 0) & (distance < DISKS * disks) & (np.einsum("ikd,id->ik", other, own) > ALIKE)
+    cosine = np.einsum("ikd,id->ik", normals[near], normals[asked])
+    paired = (distance > 0) & (distance < DISKS * disks) & (cosine > ALIKE)
     if paired.sum() < LEAST_PAIRS:
         return np.nan
-    height: Float = np.abs(np.einsum("ikd,ikd->ik", beyond, other + own[:, None])) / 2
-    return float(np.median((height / np.maximum(distance, disks))[paired]))
+    height, own = over_planes(points, normals, asked, near)
+    return float(np.median((np.abs(height - own) / 2 / np.maximum(distance, disks))[paired]))

@@ -58,6 +58,19 @@ WITHIN, BETWEEN, CURVED = 2.0, 25.0, 0.2
 other's planes, halved, at most, for a sample between them."""
 
 
+def over_planes(points: Float, normals: Float, rows: slice, near: Int) -> tuple[Float, Float]:
+    """Return the height of each neighbour over a point's plane, and of the point over the neighbour's, of shape (R, k).
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3), unit normals
+    rows : which R of the points
+    near : array of shape (R, k), rows of their neighbours
+    """
+    beyond = points[near] - points[rows, None]
+    return np.einsum("ikd,id->ik", beyond, normals[rows]), -np.einsum("ikd,ikd->ik", beyond, normals[near])
+
+
 class Faces:
     """The faces of a scan, as its points and their neighbours tell them.
 
@@ -73,10 +86,7 @@ class Faces:
         ranks = list(range(2, min(NEAREST + 1, len(points)) + 1))
         self.distance, self.near = self.density.tree.query(points, ranks)
         self.cosine = np.einsum("ikd,id->ik", normals[self.near], normals)
-        # Height of each neighbour over a point's plane, and of the point over the neighbour's.
-        beyond = points[self.near] - points[:, None]
-        self.height = np.einsum("ikd,id->ik", beyond, normals)
-        self.own = -np.einsum("ikd,ikd->ik", beyond, normals[self.near])
+        self.height, self.own = over_planes(points, normals, slice(None), self.near)
 
     @cached_property
     def roughness(self) -> float:
