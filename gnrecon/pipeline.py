@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +58,7 @@ from gnrecon.options import Options
 from gnrecon.region import Region
 from gnrecon.report import Stages, plain, versions
 from gnrecon.schema import SCHEMA_VERSION
+from gnrecon.threads import set_threads
 from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)
@@ -203,7 +203,7 @@ def limited(threads: int | None) -> Iterator[None]:
     before = torch.get_num_threads()
     try:
         if threads is not None:
-            _set_here(threads)
+            set_threads(threads)
         yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
         raise
@@ -216,15 +216,7 @@ def limited(threads: int | None) -> Iterator[None]:
         raise
     finally:
         if threads is not None:
-            _set_here(before)
-
-
-def _set_here(threads: int) -> None:
-    """Set how many threads torch has for this thread's calls alone; torch sets it for threads that begin later, too."""
-    with ThreadPoolExecutor(1) as apart:
-        default = apart.submit(torch.get_num_threads).result()
-        torch.set_num_threads(threads)
-        apart.submit(torch.set_num_threads, default).result()
+            set_threads(before)
 
 
 def _run(

@@ -34,6 +34,7 @@ ROWS = [
         "region",
         "scheduler",
     },
+    {"threads"},
     {"linalg"},
     {"optim"},
     {"field"},

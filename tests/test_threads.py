@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,11 +14,13 @@ from threading import Barrier
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from scan_files import box, torus
 
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, limited, reconstruct
+from gnrecon.threads import abreast
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
@@ -98,6 +101,40 @@ def test_a_limit_of_threads_is_that_of_one_run() -> None:
     with limited(before[0] + 2):
         assert counts() == (before[0] + 2, before[1])
     assert counts() == before
+
+
+def test_pieces_of_work_keep_their_order_and_have_one_thread_each() -> None:
+    def piece(number: int) -> tuple[int, int]:
+        time.sleep(0.02 * (number == 0))  # the first is done last
+        return number, torch.get_num_threads()
+
+    def default() -> int:
+        with ThreadPoolExecutor(1) as fresh:
+            return fresh.submit(torch.get_num_threads).result()
+
+    told: list[float] = []
+    before = default()
+    with limited(3):
+        assert abreast(piece, range(5), advance=told.append) == [(number, 1) for number in range(5)]
+        assert abreast(piece, []) == []
+        assert torch.get_num_threads() == 3
+        assert default() == before
+    assert told == [0.2, 0.4, 0.6, 0.8, 1.0]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_the_first_piece_that_fails_ends_the_work(count: int) -> None:
+    begun: list[int] = []
+
+    def piece(number: int) -> None:
+        begun.append(number)
+        time.sleep(0.005)
+        if number == 2:
+            raise ValueError("no")
+
+    with limited(count), pytest.raises(ValueError, match="no"):
+        abreast(piece, range(200))
+    assert len(begun) < 100
 
 
 def test_importing_gnrecon_imports_no_heavy_library() -> None:

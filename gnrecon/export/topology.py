@@ -67,8 +67,9 @@ def split_vertices(mesh: Mesh, edges: Edges) -> Int:
     Edges with other than two half-edges link nothing, so that only vertices of closed meshes are told apart well.
     """
     fans = corner_fans(mesh, edges)
-    pairs = np.unique(np.stack([mesh.faces.reshape(-1), fans], axis=1), axis=0)
-    vertices, count = np.unique(pairs[:, 0], return_counts=True)
+    # A pair as one number is sorted many times as fast as a row of two.
+    pairs = np.unique(mesh.faces.reshape(-1) * max(len(fans), 1) + fans)
+    vertices, count = np.unique(pairs // max(len(fans), 1), return_counts=True)
     return np.asarray(vertices[count > 1], dtype=np.int64)
 
 

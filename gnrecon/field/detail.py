@@ -18,9 +18,14 @@ from torch import Tensor
 from gnrecon.cloud import Float
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Int, Partition
+from gnrecon.field.siren import batches
+from gnrecon.threads import abreast
 
 ROWS = 512
-"""Points that are evaluated together: their features stay in the processor's cache."""
+"""Pairs of a point and a cube whose features are made at once: they stay in the processor's cache."""
+
+TOGETHER = 16_384
+"""Points that one thread evaluates at a time."""
 
 
 @dataclass(frozen=True)
@@ -86,36 +91,86 @@ class Detail:
         """Return the second derivatives of d, of shape (N, 3, 3), at x, of shape (N, 3)."""
         return self._blended(x, 2)[2]
 
-    @cached_property
-    def _numbers(self) -> dict[tuple[int, ...], int]:
-        """The row of each cube, by its key."""
-        return {tuple(key): number for number, key in enumerate(self.keys.tolist())}
-
     def _blended(self, x: Float, order: int) -> list[Float]:
         """Return d and its derivatives up to an order."""
-        sums = [np.zeros((len(x), *(order_ * [3]))) for order_ in range(order + 1)]
-        keys, members = self.partition.members(x)
-        for key, rows in zip(keys.tolist(), members, strict=True):
-            number = self._numbers.get(tuple(key))
-            if number is None:
-                continue
-            for start in range(0, len(rows), ROWS):
-                some = rows[start : start + ROWS]
-                for total, part in zip(sums, self._weighted(x[some], number, order), strict=True):
-                    total[some] += part.double().cpu().numpy()
+        sums = [np.empty((len(x), *(order_ * [3]))) for order_ in range(order + 1)]
+
+        def fill(rows: slice) -> None:
+            for total, part in zip(sums, self._blend(x[rows], order), strict=True):
+                total[rows] = part
+
+        abreast(fill, list(batches(len(x), TOGETHER)), self.amplitudes.device)
         return sums
 
-    def _weighted(self, x: Float, number: int, order: int) -> list[Tensor]:
-        """Return w_b times cube b's own function, with derivatives by the product rule."""
-        center = torch.as_tensor(self.partition.center(self.keys[number]))
-        points = torch.as_tensor(x)
-        weight = list(self.partition.weight(points, center, order))
-        sums = self.features.sums(self.amplitudes[number], points, center, float(self.lengths[number]), order)
-        own = [part.double().cpu() for part in sums]
+    def _blend(self, x: Float, order: int) -> list[Float]:
+        """Return what `_blended` does for points of which all may be held at once, with all of their cubes."""
+        keys, rows = self.partition.pairs(x)
+        cubes = self._cubes(keys)
+        order_of = np.flatnonzero(cubes >= 0)
+        order_of = order_of[np.argsort(cubes[order_of], kind="stable")]
+        rows, cubes = rows[order_of], cubes[order_of]
+        points, centers = torch.as_tensor(x[rows]), torch.as_tensor(self.partition.center(self.keys[cubes]))
+        own = self._own(points, centers, cubes, order)
+        weight = list(self.partition.weight(points, centers, order))
         parts = [weight[0] * own[0]]
         if order >= 1:
             parts.append(weight[0][:, None] * own[1] + own[0][:, None] * weight[1])
         if order >= 2:
             cross = weight[1][:, :, None] * own[1][:, None, :]
             parts.append(weight[0][:, None, None] * own[2] + cross + cross.mT + own[0][:, None, None] * weight[2])
-        return parts
+        to = torch.as_tensor(rows)
+        return [part.new_zeros(len(x), *part.shape[1:]).index_add_(0, to, part).numpy() for part in parts]
+
+    def _own(self, points: Tensor, centers: Tensor, cubes: Int, order: int) -> list[Tensor]:
+        """Return cubes' own functions with derivatives, each at one point, in double precision.
+
+        Parameters
+        ----------
+        points, centers : of shape (P, 3)
+        cubes : array of shape (P,), in order
+        order : int
+        """
+        lengths = torch.as_tensor(self.lengths[cubes])[:, None]
+        local, amplitudes = self.features.local(points, centers, lengths), self.amplitudes
+        numbers = torch.as_tensor(cubes, device=amplitudes.device)
+        own = [amplitudes.new_empty(len(points), *(order_ * [3])) for order_ in range(order + 1)]
+        for rows in batches(len(points), ROWS):
+            sums = self.features.sums_of(local[rows], amplitudes[numbers[rows]], order)
+            for whole, part in zip(own, sums, strict=True):
+                whole[rows] = part
+        # Derivatives are along x over the length so far.
+        own = [part.double().cpu() for part in own]
+        return [part / lengths.reshape(-1, *(k * [1])) ** k for k, part in enumerate(own)]
+
+    def _cubes(self, keys: Int) -> Int:
+        """Return the row of each cube by its key, of shape (P, 3), and -1 where no cube has it."""
+        low, extent = self._extent
+        inside = ((keys >= low) & (keys < low + extent)).all(axis=1)
+        codes = _codes(keys[inside] - low, extent)
+        at = np.minimum(np.searchsorted(self._sorted, codes), len(self) - 1)
+        rows = np.full(len(keys), -1)
+        rows[inside] = np.where(self._sorted[at] == codes, self._order[at], -1)
+        return rows
+
+    @cached_property
+    def _extent(self) -> tuple[Int, Int]:
+        """The least key, and how many there might be along each axis."""
+        return self.keys.min(axis=0), np.ptp(self.keys, axis=0) + 1
+
+    @cached_property
+    def _order(self) -> Int:
+        """The cubes' rows by their codes."""
+        low, extent = self._extent
+        return np.argsort(_codes(self.keys - low, extent), kind="stable")
+
+    @cached_property
+    def _sorted(self) -> Int:
+        """The cubes' codes, in order."""
+        low, extent = self._extent
+        return _codes(self.keys - low, extent)[self._order]
+
+
+def _codes(keys: Int, extent: Int) -> Int:
+    """Return one number for each key, of shape (N, 3), of a lattice of so many cells along each axis."""
+    codes: Int = (keys[:, 0] * extent[1] + keys[:, 1]) * extent[2] + keys[:, 2]
+    return codes

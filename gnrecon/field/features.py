@@ -8,6 +8,7 @@ Frequencies F are drawn for a length of one, so that one draw serves functions o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -39,11 +40,26 @@ class Features:
         """Return the same features in another precision."""
         return Features(self.frequencies.to(dtype), self.phases.to(dtype))
 
+    @cached_property
+    def _affine(self) -> Tensor:
+        """Frequencies and phases in one matrix, of shape (4, m); a product with it is faster than one and a sum."""
+        return torch.cat([self.frequencies.T, self.phases[None]])
+
+    def local(self, x: Tensor, center: Tensor, length: float | Tensor) -> Tensor:
+        """Return (x - center) / length with a column of ones, of shape (N, 4), in the features' precision.
+
+        Parameters
+        ----------
+        x : of shape (N, 3)
+        center : of shape (3,), or (N, 3)
+        length : one, or of shape (N, 1)
+        """
+        # Relative to the centre first: in single precision nothing is lost then.
+        return torch.nn.functional.pad(((x - center) / length).to(self.frequencies), (0, 1), value=1.0)
+
     def phase(self, x: Tensor, center: Tensor, length: float) -> Tensor:
         """Return F . (x - center) / length + p, of shape (N, m), in the features' precision."""
-        # Relative to the centre first: in single precision nothing is lost then.
-        local = ((x - center) / length).to(self.frequencies)
-        return torch.addmm(self.phases, local, self.frequencies.T)
+        return self.local(x, center, length) @ self._affine
 
     def sums(self, amplitudes: Tensor, x: Tensor, center: Tensor, length: float, order: int) -> list[Tensor]:
         """Return c at x, of shape (N, 3), and its derivatives in space up to an order of at most two.
@@ -53,12 +69,25 @@ class Features:
         list of Tensor
             Of shapes (N,), (N, 3) and (N, 3, 3).
         """
-        # The amplitudes go with the frequencies, of which there are few, and not with a matrix of a column a feature.
-        z = self.phase(x, center, length)
-        columns = [amplitudes[:, None]]
-        if order >= 2:
-            waves = self.frequencies / length
-            columns.append(-amplitudes[:, None] * (waves[:, :, None] * waves[:, None, :]).reshape(-1, 9))
-        along = [z.cos() @ (self.frequencies * (amplitudes / length)[:, None])] if order >= 1 else []
-        sums = z.sin() @ torch.cat(columns, dim=1)
-        return [sums[:, 0], *along, *([sums[:, 1:].reshape(-1, 3, 3)] if order >= 2 else [])]
+        sums = self.sums_of(self.local(x, center, length), amplitudes, order)
+        return [part / length**k for k, part in enumerate(sums)]
+
+    def sums_of(self, local: Tensor, amplitudes: Tensor, order: int) -> list[Tensor]:
+        """Return what `sums` does, with derivatives along x / length.
+
+        Parameters
+        ----------
+        local : of shape (N, 4), points as `local` gives them
+        amplitudes : of shape (m,), or (N, m) of each point its own
+        order : int
+        """
+        z = local @ self._affine
+        along = [(z.cos().mul_(amplitudes)) @ self.frequencies] if order >= 1 else []
+        weighted = z.sin_().mul_(amplitudes)
+        bent = [-(weighted @ self._squares).reshape(-1, 3, 3)] if order >= 2 else []
+        return [weighted.sum(dim=1), *along, *bent]
+
+    @cached_property
+    def _squares(self) -> Tensor:
+        """Products of each frequency's components, of shape (m, 9)."""
+        return (self.frequencies[:, :, None] * self.frequencies[:, None, :]).reshape(-1, 9)

@@ -20,6 +20,8 @@ from gnrecon.cloud import Float
 
 Int = npt.NDArray[np.int64]
 OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+_TURNS = np.array(list(itertools.product((False, True), repeat=3)))
+"""Along which axes a cube is the neighbour of a point's own cell."""
 
 
 @dataclass(frozen=True)
@@ -56,22 +58,24 @@ class Partition:
         ----------
         x : array of shape (N, 3)
         """
-        keys, rows = self._pairs(x)
+        keys, rows = self.pairs(x)
         order = np.lexsort((rows, keys[:, 2], keys[:, 1], keys[:, 0]))
         keys, rows = keys[order], rows[order]
         first = np.flatnonzero(np.r_[True, (np.diff(keys, axis=0) != 0).any(axis=1)] if len(keys) else [])
         return keys[first], np.split(rows, first[1:]) if len(first) else []
 
-    def _pairs(self, x: Float) -> tuple[Int, Int]:
-        """Return every pair of a cube's key, of shape (P, 3), and a row that it holds, of shape (P,)."""
+    def pairs(self, x: Float) -> tuple[Int, Int]:
+        """Return every pair of a cube's key, of shape (P, 3), and a row of x that it holds, of shape (P,), by rows.
+
+        Along each axis a point lies in its own cell, and in the zone of overlap of at most one neighbour.
+        """
         u = (x - self.origin) / self.cell
         own = np.floor(u).astype(np.int64)
-        keys, rows = [np.empty((0, 3), dtype=np.int64)], [np.empty(0, dtype=np.int64)]
-        for offset in OFFSETS:
-            inside = np.flatnonzero((np.abs(u - (own + offset + 0.5)) < (1.0 + self.overlap) / 2).all(axis=1))
-            keys.append(own[inside] + offset)
-            rows.append(inside)
-        return np.concatenate(keys), np.concatenate(rows)
+        beside = np.where(u - own < 0.5, -1, 1)
+        overlaps = np.abs(u - (own + beside + 0.5)) < (1.0 + self.overlap) / 2
+        held = np.stack([(overlaps | ~turn).all(axis=1) for turn in _TURNS], axis=1)
+        rows, turns = np.nonzero(held)
+        return own[rows] + _TURNS[turns] * beside[rows], rows
 
     def weight(self, x: Tensor, center: Tensor, order: int) -> Iterator[Tensor]:
         """Yield the weight of the cube around `center`, and its derivatives up to an order of at most two.
@@ -79,7 +83,7 @@ class Partition:
         Parameters
         ----------
         x : of shape (N, 3), within the widened cube
-        center : of shape (3,)
+        center : of shape (3,), or (N, 3) of a cube for each point
         order : int
 
         Yields

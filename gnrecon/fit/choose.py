@@ -26,6 +26,7 @@ from gnrecon.fit.clean import clean_noise
 from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
+from gnrecon.threads import abreast
 
 Mask = npt.NDArray[np.bool_]
 Int = npt.NDArray[np.integer]
@@ -307,8 +308,8 @@ class Trials:
     def scores(self, length: float) -> Float:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
         if length not in self._scored:
-            found = np.array([self._scores(number, length) for number in range(len(self.centers))])
-            self._scored[length] = found / self.radius
+            found = abreast(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
+            self._scored[length] = np.array(found) / self.radius
         return self._scored[length]
 
     def _scores(self, number: int, length: float) -> list[float]:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.advance import Advance, unheard
+from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
@@ -29,6 +29,7 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
 from gnrecon.fit.sharp import Sharp
 from gnrecon.sampling import CoarseDistance
+from gnrecon.threads import abreast
 
 _log = logging.getLogger(__name__)
 
@@ -143,22 +144,24 @@ class _Cubes:
         keys, _ = self.partition.members(self.leftover.points)
         volumes = self._volumes(sdf, coarse, keys, rng)
         reach = self.partition.reach + BEYOND * self.leftover.density.radius
-        kept, lengths, amplitudes = [], [], []
-        for number, key in enumerate(keys):
-            center = self.partition.center(key)
+        radius, disks = self.leftover.density.radius, self.leftover.density.disks
+
+        def solved(number: int) -> tuple[float, Tensor] | None:
+            """Return the length and amplitudes of a cube, or None where it holds too few points."""
+            center = self.partition.center(keys[number])
             rows = self.leftover.within(center, reach)
-            if len(rows) >= LEAST_POINTS:
-                length = cube_length(self.belief, self.leftover.density.disks[rows], self.leftover.density.radius)
-                patch = self.leftover.patch(rows, center, volumes[number], self.device)
-                system = PatchSystem(patch, self.features, length, patch.size)
-                kept.append(key)
-                lengths.append(length)
-                amplitudes.append(self._solved(system, length, center))
-            advance(CHOSEN + (1.0 - CHOSEN) * (number + 1) / len(keys))
-        solved = torch.stack(amplitudes)
+            if len(rows) < LEAST_POINTS:
+                return None
+            length = cube_length(self.belief, disks[rows], radius)
+            patch = self.leftover.patch(rows, center, volumes[number], self.device)
+            return length, self._solved(PatchSystem(patch, self.features, length, patch.size), length, center)
+
+        cubes = abreast(solved, range(len(keys)), self.device, part(advance, CHOSEN, 1.0))
+        kept = [number for number, cube in enumerate(cubes) if cube is not None]
+        lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
         noise = self.belief.position, self.belief.angle
-        return Detail(self.partition, np.array(kept), np.array(lengths), self.features, solved, *noise)
+        return Detail(self.partition, keys[kept], np.array(lengths), self.features, torch.stack(amplitudes), *noise)
 
     def _solved(self, system: PatchSystem, length: float, center: Float) -> Tensor:
         """Return the amplitudes of the cube about a centre, of shape (m,)."""

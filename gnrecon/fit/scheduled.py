@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from gnrecon.advance import Advance
 from gnrecon.errors import FitError
 from gnrecon.fit.block import solve_block
-from gnrecon.fit.threads import one_thread
 from gnrecon.fit.work import Work
 from gnrecon.scheduler import connected, require_distributed
+from gnrecon.threads import one_thread
 
 RETRIES = 2
 """How often a block is begun again that raised an error, as where a network file system shows files late."""

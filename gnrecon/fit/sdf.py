@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
@@ -17,6 +17,7 @@ from gnrecon.cloud import Float, Frame
 from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren, batches
 from gnrecon.sampling import Box
+from gnrecon.threads import abreast
 
 _BATCH_BYTES = 4_000_000
 # What stays in the processor's cache is twice as fast as what does not.
@@ -94,8 +95,11 @@ class NeuralSDF:
         x = self._unit(points)
         # Written in place: results kept apart would lie between the batches' large arrays, and hold their memory.
         values = np.empty(len(x))
-        for rows in self._batches(len(x)):
+
+        def fill(rows: slice) -> None:
             values[rows] = self.field.value(self.theta, self._tensor(x[rows])).cpu().numpy()
+
+        self._each_batch(fill, len(x))
         if self.detail is not None:
             values += self.detail.value(x)
         return self.frame.scale * values
@@ -109,9 +113,12 @@ class NeuralSDF:
         x = self._unit(points)
         # The frame's scale enters value and coordinate alike and cancels in the gradient.
         values, gradients = np.empty(len(x)), np.empty((len(x), 3))
-        for rows in self._batches(len(x)):
+
+        def fill(rows: slice) -> None:
             value, gradient = self.field.value_and_gradient(self.theta, self._tensor(x[rows]))
             values[rows], gradients[rows] = value.cpu().numpy(), gradient.cpu().numpy()
+
+        self._each_batch(fill, len(x))
         if self.detail is not None:
             more = self.detail.value_and_gradient(x)
             values, gradients = values + more[0], gradients + more[1]
@@ -125,8 +132,11 @@ class NeuralSDF:
         x = self._unit(points)
         theta = self.theta.to(torch.float64)
         hessians = np.empty((len(x), 3, 3))
-        for rows in self._batches(len(x)):
+
+        def fill(rows: slice) -> None:
             hessians[rows] = self.field.jet(theta, torch.as_tensor(x[rows]).to(theta)).hessian().cpu().numpy()
+
+        self._each_batch(fill, len(x))
         if self.detail is not None:
             hessians += self.detail.to(torch.float64).hessian(x)
         return hessians / self.frame.scale
@@ -144,5 +154,7 @@ class NeuralSDF:
     def _tensor(self, x: Float) -> Tensor:
         return torch.as_tensor(x).to(self.theta)
 
-    def _batches(self, count: int) -> list[slice]:
-        return list(batches(count, max(256, _BATCH_BYTES // (8 * max(self.field.widths)))))
+    def _each_batch(self, fill: Callable[[slice], None], count: int) -> None:
+        """Have `count` rows filled, so many at a time as the cache holds."""
+        size = max(256, _BATCH_BYTES // (8 * max(self.field.widths)))
+        abreast(fill, list(batches(count, size)), self.theta.device)

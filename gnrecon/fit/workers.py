@@ -18,9 +18,9 @@ from pathlib import Path
 from gnrecon.advance import Advance
 from gnrecon.errors import FitError, MemoryLimitError
 from gnrecon.fit.block import solve_block
-from gnrecon.fit.threads import one_thread
 from gnrecon.fit.work import Work
 from gnrecon.fit.worker import DONE
+from gnrecon.threads import one_thread
 
 NEED = 1.2e9
 """Bytes that a process needs at most, with Python and torch; no more processes are started than have room."""

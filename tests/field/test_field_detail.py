@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
-from gnrecon.field.detail import Detail
+from gnrecon.field.detail import TOGETHER, Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
+from gnrecon.pipeline import limited
 
 
 def detail(rng: np.random.Generator, cubes: int = 5, features: int = 7) -> Detail:
@@ -60,6 +63,27 @@ def test_derivatives_are_those_of_differences(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(gradient, slopes, atol=1e-6)
     bends = [(of.value_and_gradient(x + step)[1] - of.value_and_gradient(x - step)[1]) / (2 * h) for step in steps]
     np.testing.assert_allclose(of.hessian(x), np.stack(bends, axis=2), atol=1e-3)
+
+
+def test_many_points_are_what_each_is_alone_with_any_number_of_threads(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    x = points(of, rng, 2 * TOGETHER + 5)
+    found = []
+    for count in (1, 2):
+        with limited(count):
+            found.append(of.value_and_gradient(x))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    some = [0, TOGETHER - 1, TOGETHER, len(x) - 1]
+    np.testing.assert_allclose(found[0][0][some], [plainly(of, point) for point in x[some]], atol=1e-12)
+
+
+def test_a_key_that_no_cube_has_is_zero_there(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    x = points(of, rng)
+    gone = replace(of, keys=np.delete(of.keys, 2, axis=0), lengths=np.delete(of.lengths, 2))
+    gone = replace(gone, amplitudes=of.amplitudes[[0, 1, 3, 4]])
+    np.testing.assert_allclose(gone.value(x), [plainly(gone, point) for point in x], atol=1e-12)
 
 
 def test_single_precision_is_near_and_counts_are_right(rng: np.random.Generator) -> None:

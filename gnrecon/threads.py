@@ -1,0 +1,75 @@
+"""Threads: how many of torch's a stretch of work has, and pieces of work side by side, each with one.
+
+The matrices of a fit are small. Threads that share every product of theirs wait for each other longer than they work,
+so that a piece of work keeps to one, and several pieces are done at a time. What does the work must release Python's
+lock while it does, as torch, numpy and scipy do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from threading import Lock
+from typing import TypeVar
+
+import torch
+
+from gnrecon.advance import Advance, unheard
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+_SETTING = Lock()
+
+
+def set_threads(count: int) -> None:
+    """Set how many threads torch has for this thread's calls alone; torch sets it for threads that begin later, too."""
+    with _SETTING, ThreadPoolExecutor(1) as apart:
+        default = apart.submit(torch.get_num_threads).result()
+        torch.set_num_threads(count)
+        apart.submit(torch.set_num_threads, default).result()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute with one thread: sums by several differ in their last digits."""
+    before = torch.get_num_threads()
+    set_threads(1)
+    try:
+        yield
+    finally:
+        set_threads(before)
+
+
+def abreast(
+    work: Callable[[Item], Answer],
+    items: Sequence[Item],
+    device: str | torch.device = "cpu",
+    advance: Advance = unheard,
+) -> list[Answer]:
+    """Return the answers to items, in their order, found as many at a time as torch has threads, each by one of them.
+
+    So an answer does not depend on how many there are.
+
+    Parameters
+    ----------
+    work : a function of its item, which must not depend on the order of the calls
+    items : sequence
+    device : that the work is done on; a GPU does one thing at a time, and for it so does this function
+    advance : told of the share that is done
+    """
+    threads = min(torch.get_num_threads(), len(items))
+    if threads <= 1 or torch.device(device).type != "cpu":
+        return [_told(work(item), number, len(items), advance) for number, item in enumerate(items, 1)]
+    pool = ThreadPoolExecutor(threads, initializer=set_threads, initargs=(1,))
+    try:
+        answers = [pool.submit(work, item) for item in items]
+        return [_told(answer.result(), number, len(items), advance) for number, answer in enumerate(answers, 1)]
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _told(answer: Answer, number: int, count: int, advance: Advance) -> Answer:
+    advance(number / count)
+    return answer
