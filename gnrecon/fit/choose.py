@@ -134,7 +134,8 @@ class Volume:
         """Return samples at which a field is to be about the coarse distance, and of its sign where that is certain.
 
         A field that is somewhat steeper or flatter than a distance needs no correction: one that brought it to the
-        distance would go too far between samples, and make a horn.
+        distance would go too far between samples, and make a horn. Nor does one of the other sign where neither sign is
+        beyond doubt, as in a cavity of which little was seen: the field there is smooth, and closes it no worse.
 
         Parameters
         ----------
@@ -144,7 +145,8 @@ class Volume:
         distance : array of shape (Q,), of the data
         """
         near, far = (share * signed for share in ABOUT)
-        wanted = own.clip(np.minimum(near, far), np.maximum(near, far)) - own
+        agreed = certain | (own * signed > 0)
+        wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
         bound = LEAST_SHARE * signed - own
         lower = np.where(certain & (signed > 0), bound, -np.inf)
         upper = np.where(certain & (signed < 0), bound, np.inf)

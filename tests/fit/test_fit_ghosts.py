@@ -72,3 +72,12 @@ def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:
     np.testing.assert_allclose((volume.upper + own)[5:], -LEAST_SHARE * 0.2)
     assert np.isposinf(volume.upper[:5]).all()
     assert np.isneginf(volume.lower[5:]).all()
+
+
+def test_free_space_of_a_doubtful_sign_is_left_to_the_field() -> None:
+    own, signed = np.array([-0.1, -0.9, 0.1, 0.01, 0.9]), np.array([0.2, 0.2, -0.2, 0.2, 0.2])
+    volume = Volume.around(np.zeros((5, 3)), own, signed, np.zeros(5, dtype=bool), np.abs(signed))
+    near, far = (0.2 * share for share in ABOUT)
+    np.testing.assert_allclose(own + volume.wanted, [-0.1, -0.9, 0.1, near, far], atol=1e-15)
+    assert np.isneginf(volume.lower).all()
+    assert np.isposinf(volume.upper).all()
