@@ -106,9 +106,9 @@ class Detail:
         """Return what `_blended` does for points of which all may be held at once, with all of their cubes."""
         keys, rows = self.partition.pairs(x)
         cubes = self._cubes(keys)
-        order_of = np.flatnonzero(cubes >= 0)
-        order_of = order_of[np.argsort(cubes[order_of], kind="stable")]
-        rows, cubes = rows[order_of], cubes[order_of]
+        by_cube = np.flatnonzero(cubes >= 0)
+        by_cube = by_cube[np.argsort(cubes[by_cube], kind="stable")]
+        rows, cubes = rows[by_cube], cubes[by_cube]
         points, centers = torch.as_tensor(x[rows]), torch.as_tensor(self.partition.center(self.keys[cubes]))
         own = self._own(points, centers, cubes, order)
         weight = list(self.partition.weight(points, centers, order))
@@ -144,6 +144,8 @@ class Detail:
 
     def _cubes(self, keys: Int) -> Int:
         """Return the row of each cube by its key, of shape (P, 3), and -1 where no cube has it."""
+        if not len(self):
+            return np.full(len(keys), -1)
         low, extent = self._extent
         inside = ((keys >= low) & (keys < low + extent)).all(axis=1)
         codes = _codes(keys[inside] - low, extent)

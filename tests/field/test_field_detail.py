@@ -86,6 +86,13 @@ def test_a_key_that_no_cube_has_is_zero_there(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(gone.value(x), [plainly(gone, point) for point in x], atol=1e-12)
 
 
+def test_without_cubes_it_is_nothing(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    none = replace(of, keys=of.keys[:0], lengths=of.lengths[:0], amplitudes=of.amplitudes[:0])
+    for part in none.value_and_gradient(points(of, rng)):
+        assert (part == 0).all()
+
+
 def test_single_precision_is_near_and_counts_are_right(rng: np.random.Generator) -> None:
     of = detail(rng)
     x = points(of, rng)
