@@ -58,7 +58,7 @@ from gnrecon.options import Options
 from gnrecon.region import Region
 from gnrecon.report import Stages, plain, versions
 from gnrecon.schema import SCHEMA_VERSION
-from gnrecon.threads import set_threads
+from gnrecon.threads import having_threads
 from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)
@@ -200,11 +200,9 @@ def limited(threads: int | None) -> Iterator[None]:
     MemoryLimitError
         When an allocation in the block failed.
     """
-    before = torch.get_num_threads()
     try:
-        if threads is not None:
-            set_threads(threads)
-        yield
+        with having_threads(threads):
+            yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
         raise
     except MemoryError as error:
@@ -214,9 +212,6 @@ def limited(threads: int | None) -> Iterator[None]:
         if isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error):
             raise _out_of_memory(error) from error
         raise
-    finally:
-        if threads is not None:
-            set_threads(before)
 
 
 def _run(

@@ -32,14 +32,19 @@ def set_threads(count: int) -> None:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute with one thread: sums by several differ in their last digits."""
+def having_threads(count: int | None) -> Iterator[None]:
+    """Run a block with so many of torch's threads, and set them back; None: as many as before.
+
+    With one, sums do not depend on how many there are; by several they differ in their last digits.
+    """
     before = torch.get_num_threads()
-    set_threads(1)
     try:
+        if count is not None:
+            set_threads(count)
         yield
     finally:
-        set_threads(before)
+        if count is not None:
+            set_threads(before)
 
 
 def abreast(

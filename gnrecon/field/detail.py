@@ -146,30 +146,21 @@ class Detail:
         """Return the row of each cube by its key, of shape (P, 3), and -1 where no cube has it."""
         if not len(self):
             return np.full(len(keys), -1)
-        low, extent = self._extent
+        low, extent, known, row = self._lookup
         inside = ((keys >= low) & (keys < low + extent)).all(axis=1)
         codes = _codes(keys[inside] - low, extent)
-        at = np.minimum(np.searchsorted(self._sorted, codes), len(self) - 1)
+        at = np.minimum(np.searchsorted(known, codes), len(self) - 1)
         rows = np.full(len(keys), -1)
-        rows[inside] = np.where(self._sorted[at] == codes, self._order[at], -1)
+        rows[inside] = np.where(known[at] == codes, row[at], -1)
         return rows
 
     @cached_property
-    def _extent(self) -> tuple[Int, Int]:
-        """The least key, and how many there might be along each axis."""
-        return self.keys.min(axis=0), np.ptp(self.keys, axis=0) + 1
-
-    @cached_property
-    def _order(self) -> Int:
-        """The cubes' rows by their codes."""
-        low, extent = self._extent
-        return np.argsort(_codes(self.keys - low, extent), kind="stable")
-
-    @cached_property
-    def _sorted(self) -> Int:
-        """The cubes' codes, in order."""
-        low, extent = self._extent
-        return _codes(self.keys - low, extent)[self._order]
+    def _lookup(self) -> tuple[Int, Int, Int, Int]:
+        """The least key, how many there might be along each axis, the cubes' codes in order, and the row of each."""
+        low, extent = self.keys.min(axis=0), np.ptp(self.keys, axis=0) + 1
+        codes = _codes(self.keys - low, extent)
+        order = np.argsort(codes, kind="stable")
+        return low, extent, codes[order], order
 
 
 def _codes(keys: Int, extent: Int) -> Int:

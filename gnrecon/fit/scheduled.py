@@ -14,7 +14,7 @@ from gnrecon.errors import FitError
 from gnrecon.fit.block import solve_block
 from gnrecon.fit.work import Work
 from gnrecon.scheduler import connected, require_distributed
-from gnrecon.threads import one_thread
+from gnrecon.threads import having_threads
 
 RETRIES = 2
 """How often a block is begun again that raised an error, as where a network file system shows files late."""
@@ -58,5 +58,5 @@ def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: Ad
 
 def on_worker(folder: str, block: int) -> None:
     """Solve a block on a worker, with one thread, because sums by several differ in their last digits."""
-    with one_thread():
+    with having_threads(1):
         solve_block(folder, block)

@@ -20,7 +20,7 @@ from gnrecon.errors import FitError, MemoryLimitError
 from gnrecon.fit.block import solve_block
 from gnrecon.fit.work import Work
 from gnrecon.fit.worker import DONE
-from gnrecon.threads import one_thread
+from gnrecon.threads import having_threads
 
 NEED = 1.2e9
 """Bytes that a process needs at most, with Python and torch; no more processes are started than have room."""
@@ -50,7 +50,7 @@ def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str,
     if processes > 1 and device == "cpu":
         _solve_beside(work.folder, blocks, processes, advance)
         return
-    with one_thread():
+    with having_threads(1):
         for number, block in enumerate(blocks, 1):
             solve_block(work.folder, block, device)
             advance(number / len(blocks))
