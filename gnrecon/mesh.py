@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.slices import slices
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -65,7 +66,7 @@ class Mesh:
     def face_vectors(self) -> Float:
         """Area vectors of the faces, of shape (F, 3): along the normal, as long as the area."""
         vectors = np.empty((len(self.faces), 3))
-        for rows in parts(len(self.faces)):
+        for rows in slices(len(self.faces)):
             vectors[rows] = area_vectors(self.vertices, self.faces[rows])
         return vectors
 
@@ -80,7 +81,7 @@ class Mesh:
         if not len(self.faces):
             return 0.0
         total = 0.0
-        for rows in parts(len(self.faces)):
+        for rows in slices(len(self.faces)):
             # Measured from the mesh's own corner, because far-off coordinates would cancel badly.
             a, b, c = np.moveaxis(self.vertices[self.faces[rows]] - self.vertices[0], 1, 0)
             total += float(np.einsum("ij,ij->", a, np.cross(b, c)))
@@ -117,8 +118,3 @@ def area_vectors(vertices: Float, faces: Int) -> Float:
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     vectors: Float = 0.5 * np.cross(b - a, c - a)
     return vectors
-
-
-def parts(count: int, size: int = 1 << 18) -> Iterator[slice]:
-    """Yield slices that cover `count` rows: by parts, what is computed of millions takes little memory beside them."""
-    return (slice(start, min(start + size, count)) for start in range(0, count, size))

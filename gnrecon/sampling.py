@@ -21,7 +21,7 @@ import numpy.typing as npt
 import torch
 
 from gnrecon.cloud import Float
-from gnrecon.field.siren import batches
+from gnrecon.slices import slices
 from gnrecon.threads import abreast
 
 Mask = npt.NDArray[np.bool_]
@@ -200,7 +200,7 @@ def winding_number(
         flux = (some[:, [0, 1, 2, 4]] @ to_flux).mul_(near).mul_(near).mul_(near)
         found[rows] = flux.sum(dim=1).numpy()
 
-    abreast(fill, list(batches(len(x), batch)))
+    abreast(fill, slices(len(x), batch))
     return found
 
 

@@ -18,6 +18,7 @@ from gnrecon.cloud import Float
 from gnrecon.export.lattice import Int, Lattice
 from gnrecon.export.leaves import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.export.search import Coarse, search
+from gnrecon.slices import slices
 
 NUDGE = 1e-4
 """Least magnitude of a node's value, in cells over the slope: no vertex falls on a node and makes faces degenerate."""
@@ -57,9 +58,9 @@ class Band:
     def evaluate(self, leaves: Int, advance: Advance = unheard) -> None:
         """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
         count = max(1, self.lattice.batch // len(_NODES))
-        for start in range(0, len(leaves), count):
-            advance(start / len(leaves))
-            some = leaves[start : start + count]
+        for rows in slices(len(leaves), count):
+            advance(rows.start / len(leaves))
+            some = leaves[rows]
             values = self.values((some[:, None] * LEAF + _NODES).reshape(-1, 3))
             self.leaves.keep(some, values.reshape(-1, LEAF, LEAF, LEAF))
 

@@ -15,6 +15,7 @@ from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.protocol import SignedDistance
+from gnrecon.slices import slices
 
 Int = npt.NDArray[np.int64]
 
@@ -88,10 +89,9 @@ class Lattice:
         inside = np.clip(nodes, 0, self.cells)
         depth = np.minimum(nodes, self.cells - nodes).min(axis=1)
         out = np.empty(len(nodes))
-        for start in range(0, len(nodes), self.batch):
-            rows = slice(start, start + self.batch)
+        for rows in slices(len(nodes), self.batch):
             out[rows] = self.field.sdf(self.world(inside[rows]))
-            advance(min(start + self.batch, len(nodes)) / len(nodes))
+            advance(rows.stop / len(nodes))
         if not np.isfinite(out).all():
             raise MeshError(f"The field is not finite at {np.count_nonzero(~np.isfinite(out))} of {len(out)} points.")
         closed: Float = np.maximum(out / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
@@ -101,7 +101,6 @@ class Lattice:
         """Gradient of the field, of shape (N, 3), at lattice coordinates of shape (N, 3)."""
         inside = np.clip(nodes, 0, self.cells)
         out = np.empty((len(nodes), 3))
-        for start in range(0, len(nodes), self.batch):
-            rows = slice(start, start + self.batch)
+        for rows in slices(len(nodes), self.batch):
             out[rows] = self.field.gradient(self.world(inside[rows]))
         return out

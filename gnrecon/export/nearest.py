@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gnrecon.cloud import Float
 from gnrecon.export.solid import centre_and_size
 from gnrecon.mesh import Int, Mesh
+from gnrecon.slices import slices
 
 RAYS = 5
 """Rays that vote on whether a point lies inside: one alone may graze an edge and count it twice, or not at all."""
@@ -49,7 +50,7 @@ class Surface:
         """Return the nearest points of the surface, of shape (N, 3), and their faces, for points of shape (N, 3)."""
         feet = np.empty((len(points), 3))
         faces = np.empty(len(points), dtype=np.int64)
-        for rows in self._batches(len(points)):
+        for rows in slices(len(points), self._batch):
             answer = self._scene.compute_closest_points(self._queries(points[rows]))
             faces[rows] = answer["primitive_ids"].numpy()
             u, v = np.moveaxis(answer["primitive_uvs"].numpy().astype(np.float64), 1, 0)
@@ -60,7 +61,7 @@ class Surface:
     def inside(self, points: Float) -> npt.NDArray[np.bool_]:
         """Return which points, of shape (N, 3), a closed surface encloses, to about 1e-7 of its size."""
         inside = np.empty(len(points), dtype=bool)
-        for rows in self._batches(len(points)):
+        for rows in slices(len(points), self._batch):
             answer = self._scene.compute_occupancy(self._queries(points[rows]), nsamples=RAYS)
             inside[rows] = answer.numpy() > 0
         return inside
@@ -69,9 +70,6 @@ class Surface:
         from open3d import core
 
         return core.Tensor.from_numpy(((points - self._centre) / self._size).astype(np.float32))
-
-    def _batches(self, count: int) -> list[slice]:
-        return [slice(start, start + self._batch) for start in range(0, count, self._batch)]
 
 
 def nearest_on_surface(mesh: Mesh, points: Float, batch: int = 1_000_000) -> tuple[Float, Int]:

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.cloud import Float
 from gnrecon.mesh import Int
+from gnrecon.slices import slices
 
 COUNT = 8
 """Points that are averaged: about the first ring around a point of an even scan."""
@@ -90,8 +91,7 @@ class Neighbourhood:
     def near(self, places: Float, count: int = COUNT) -> Iterator[Neighbours]:
         """Yield the nearest points of places, of shape (V, 3), some places at a time."""
         most = self._tree.n
-        for start in range(0, len(places), BATCH):
-            batch = slice(start, min(start + BATCH, len(places)))
+        for batch in slices(len(places), BATCH):
             found = self._tree.query(places[batch] - self._centre, list(range(1, min(count + 1, most) + 1)))
             distances, rows = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
             kept = slice(None, min(count, most))

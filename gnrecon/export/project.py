@@ -15,7 +15,8 @@ from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.protocol import SignedDistance, sdf_and_gradient
-from gnrecon.mesh import Mesh, area_vectors, parts
+from gnrecon.mesh import Mesh, area_vectors
+from gnrecon.slices import slices
 
 Mask = npt.NDArray[np.bool_]
 
@@ -77,15 +78,14 @@ def project(
     moved = np.empty_like(mesh.vertices)
     value = np.empty(len(moved))
     gradient = np.empty_like(moved)
-    for start in range(0, len(moved), batch):
-        rows = slice(start, start + batch)
+    for rows in slices(len(moved), batch):
         moved[rows], value[rows], gradient[rows] = newton(mesh.vertices[rows], field, steps, limit, rough)
-        advance(min(start + batch, len(moved)) / len(moved))
+        advance(rows.stop / len(moved))
     back = _undo_turned(mesh, moved)
     moved[back] = mesh.vertices[back]
     result = Mesh(moved, mesh.faces)
     normals = result.vertex_normals()
-    for rows in parts(len(moved)):
+    for rows in slices(len(moved)):
         unit = gradient[rows] / np.maximum(np.linalg.norm(gradient[rows], axis=1, keepdims=True), _TINY)
         # On a cap, and where the field folds, the gradient is not the surface's normal.
         fit = (np.abs(value[rows]) <= limit) & (np.einsum("ij,ij->i", unit, normals[rows]) > 0)
@@ -96,7 +96,7 @@ def project(
 def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     """Lengths of the faces' sides, of shape (3 F,)."""
     lengths = np.empty((len(mesh.faces), 3), dtype=np.float32)
-    for rows in parts(len(mesh.faces)):
+    for rows in slices(len(mesh.faces)):
         corners = mesh.vertices[mesh.faces[rows]]
         lengths[rows] = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     return lengths.reshape(-1)
@@ -151,7 +151,7 @@ def _undo_turned(mesh: Mesh, moved: Float) -> Mask:
     while True:
         now = np.where(back[:, None], mesh.vertices, moved)
         again = np.zeros_like(back)
-        for rows in parts(len(mesh.faces)):
+        for rows in slices(len(mesh.faces)):
             faces = mesh.faces[rows]
             again[faces[_spoilt(area_vectors(mesh.vertices, faces), area_vectors(now, faces))]] = True
         if not (again & ~back).any():

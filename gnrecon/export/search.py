@@ -22,6 +22,7 @@ import numpy.typing as npt
 from gnrecon.cloud import Float
 from gnrecon.export.lattice import Int, Lattice
 from gnrecon.export.leaves import LEAF, Leaves
+from gnrecon.slices import slices
 
 MOST_BLOCKS = 96
 """Most coarse blocks along the longest side."""
@@ -156,9 +157,8 @@ def search(lattice: Lattice, coarse: Coarse, leaves: Leaves, data: Float | None)
     kept &= blocks.may_vanish(values, slopes)
     leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
     blocks, slopes = blocks[kept], slopes[kept]
-    for start in range(0, len(slopes), BATCH):
-        rows = slice(start, start + BATCH)
-        yield min(1.0, rows.stop / len(slopes)), _descend(lattice, leaves, blocks[rows], slopes[rows])
+    for rows in slices(len(slopes), BATCH):
+        yield rows.stop / len(slopes), _descend(lattice, leaves, blocks[rows], slopes[rows])
 
 
 def _descend(lattice: Lattice, leaves: Leaves, blocks: Blocks, slopes: Float) -> Int:

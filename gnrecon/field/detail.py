@@ -18,7 +18,7 @@ from torch import Tensor
 from gnrecon.cloud import Float
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Int, Partition
-from gnrecon.field.siren import batches
+from gnrecon.slices import slices
 from gnrecon.threads import abreast
 
 ROWS = 512
@@ -99,7 +99,7 @@ class Detail:
             for total, part in zip(sums, self._blend(x[rows], order), strict=True):
                 total[rows] = part
 
-        abreast(fill, list(batches(len(x), TOGETHER)), self.amplitudes.device)
+        abreast(fill, slices(len(x), TOGETHER), self.amplitudes.device)
         return sums
 
     def _blend(self, x: Float, order: int) -> list[Float]:
@@ -134,7 +134,7 @@ class Detail:
         local, amplitudes = self.features.local(points, centers, lengths), self.amplitudes
         numbers = torch.as_tensor(cubes, device=amplitudes.device)
         own = [amplitudes.new_empty(len(points), *(order_ * [3])) for order_ in range(order + 1)]
-        for rows in batches(len(points), ROWS):
+        for rows in slices(len(points), ROWS):
             sums = self.features.sums_of(local[rows], amplitudes[numbers[rows]], order)
             for whole, part in zip(own, sums, strict=True):
                 whole[rows] = part

@@ -11,7 +11,6 @@ networks for shape reconstruction are ``Siren((32, 32, 32))``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -68,9 +67,3 @@ class Siren:
         for slope, (weights, _) in zip(reversed(slopes), reversed(layers[1:]), strict=True):
             adjoints.insert(0, (adjoints[0] @ weights).mul_(slope))
         return Jet(layers, activations, slopes, adjoints, value, adjoints[0] @ layers[0][0])
-
-
-def batches(count: int, size: int) -> Iterator[slice]:
-    """Yield slices that cover `count` rows, at most `size` at a time."""
-    for start in range(0, count, size):
-        yield slice(start, min(start + size, count))

@@ -18,9 +18,10 @@ import numpy as np
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.errors import UsageError
+from gnrecon.fit.averaged import Told, told
 from gnrecon.fit.choose import Int, Mask
 from gnrecon.fit.contradict import reconciled
-from gnrecon.fit.detail import ShapingFor, fit_detail
+from gnrecon.fit.detail import CHOSEN, ShapingFor, fit_detail
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.large import LARGE, fit_large
 from gnrecon.fit.options import FitOptions
@@ -138,24 +139,30 @@ def fit_adaptive(
             detail = fit_large(sdf, task.samples, task.held, options, rng, folder, rest, scheduler)
         else:
             where = options.features, rng, options.device
-            detail, averaging = fit_detail(sdf, task.samples, task.held, *where, rest, shape, task.sharp, left_out > 0)
+            if task.sharp is None:
+                known = told(sdf, task.samples, task.held, *where, outliers=left_out > 0)
+            else:
+                known = Told.of_faces(sdf, task.sharp)
+            rest(CHOSEN)
+            averaging = known.averaging
+            detail = fit_detail(sdf, known, *where, rest, shape)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
     chosen = detail.as_dict(samples.frame.scale)
-    told = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
-    told += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
+    also = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
+    also += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
     if averaging is not None:
-        told += f" Averaged noisy points over {averaging.width:g} of their disks' radii, where normals agree."
+        also += f" Averaged noisy points over {averaging.width:g} of their disks' radii, where normals agree."
     if task.sharp is not None:
-        told += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
+        also += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
     if task.sharp is None:
         beside = f"noise {chosen['position_noise']:.2g} in position and {chosen['angle_noise']:.2g} degrees in normals"
     else:
         beside = "as short as its sharp faces can tell apart"
     status = (
         f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
-        f"length {chosen['length']:.3g}, {beside}.{told}{_asked(options)}"
+        f"length {chosen['length']:.3g}, {beside}.{also}{_asked(options)}"
     )
     return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
 

@@ -21,7 +21,7 @@ from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.choose import Choice, Leftover, Mask, Trials
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.sdf import NeuralSDF
-from gnrecon.fit.sharp import has_edges
+from gnrecon.fit.sharp import Sharp, has_edges
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +50,11 @@ class Told:
     leftover: Leftover
     belief: Belief
     averaging: Averaging | None = None
+
+    @classmethod
+    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> Told:
+        """Return what faces that were continued to their edges tell by themselves, beside a global field."""
+        return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
 
 
 def told(

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.sampling import Density
+from gnrecon.slices import slices
 
 Int = npt.NDArray[np.integer]
 
@@ -65,8 +66,7 @@ class Averaging:
         # In disks of radius r there are (R / r)^2 points within R.
         count = min(len(points), MOST, int(np.ceil((REACH * self.width) ** 2)) + 1)
         near = density.tree.query(points, list(range(1, count + 1)))[1]
-        parts = [slice(start, start + ROWS) for start in range(0, len(points), ROWS)]
-        return [(rows, near[rows], self.width * density.disks[rows, None]) for rows in parts]
+        return [(rows, near[rows], self.width * density.disks[rows, None]) for rows in slices(len(points), ROWS)]
 
     def _weights(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float) -> Float:
         """Return the neighbours' weights, of shape (rows, k), whose sums are one."""

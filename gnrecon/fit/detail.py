@@ -17,17 +17,15 @@ import torch
 from torch import Tensor
 
 from gnrecon.advance import Advance, part, unheard
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Float
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
-from gnrecon.fit.averaged import Told, told
-from gnrecon.fit.bilateral import Averaging
-from gnrecon.fit.choose import Int, Leftover, Mask, Volume
+from gnrecon.fit.averaged import Told
+from gnrecon.fit.choose import Int, Leftover, Volume
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
-from gnrecon.fit.sharp import Sharp
 from gnrecon.sampling import CoarseDistance
 from gnrecon.threads import abreast
 
@@ -55,36 +53,26 @@ LONGER = 4.0
 
 def fit_detail(
     sdf: NeuralSDF,
-    samples: Samples,
-    held: Mask,
+    told: Told,
     features: int,
     rng: np.random.Generator,
     device: str,
     advance: Advance = unheard,
     shape: ShapingFor | None = None,
-    sharp: Sharp | None = None,
-    outliers: bool = False,
-) -> tuple[Detail, Averaging | None]:
-    """Return what to add to a global field, and how the samples were averaged for it, if they were.
+) -> Detail:
+    """Return what to add to a global field.
 
     Parameters
     ----------
     sdf : the global field, in the samples' frame
-    samples : all of them
-    held : mask of shape (N,), of samples that the global field has not seen
+    told : the samples, what the field leaves over at them, and what is believed about them
     features : number of features a cube
     rng : draws features and samples of the volume
     device : a torch device
     advance : told of the share that is done
     shape : gives what is asked of the surface besides, for the length of the detail
-    sharp : whose samples they are, if faces were continued; then length and noise are known
-    outliers : whether some were found, so that others may be left
     """
-    if sharp is None:
-        found = told(sdf, samples, held, features, rng, device, outliers)
-    else:
-        found = Told(samples, Leftover.of(sdf, samples), sharp.belief, sharp.averaging)
-    samples, leftover, belief = found.samples, found.leftover, found.belief
+    samples, leftover, belief = told.samples, told.leftover, told.belief
     _log.info(
         "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",
         belief.length,
@@ -92,11 +80,9 @@ def fit_detail(
         belief.angle,
         features,
     )
-    advance(CHOSEN)
     coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
     shaping = None if shape is None else shape(belief.length)
-    cubes = _Cubes.of(leftover, belief, features, rng, device, shaping)
-    return cubes.detail(sdf, coarse, rng, advance), found.averaging
+    return _Cubes.of(leftover, belief, features, rng, device, shaping).detail(sdf, coarse, rng, advance)
 
 
 def cube_length(belief: Belief, disks: Float, radius: float) -> float:

@@ -34,6 +34,7 @@ from gnrecon.fit.scheduled import solve_scheduled
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.work import Work
 from gnrecon.fit.workers import solve_blocks
+from gnrecon.slices import slices
 
 LARGE = 200_000
 """Points from which a scan is fitted by blocks."""
@@ -153,8 +154,8 @@ def _cells(partition: Partition, points: Float) -> Int:
 
 def _cubes(partition: Partition, points: Float) -> Int:
     """Return the keys, of shape (B, 3), of all cubes that hold points; by parts, for a point is in several cubes."""
-    stretches = range(0, len(points), ROWS)
-    return np.unique(np.concatenate([partition.members(points[n : n + ROWS])[0] for n in stretches]), axis=0)
+    stretches = slices(len(points), ROWS)
+    return np.unique(np.concatenate([partition.members(points[rows])[0] for rows in stretches]), axis=0)
 
 
 def _blocks(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) -> tuple[Int, Int]:

@@ -21,6 +21,7 @@ from torch import Tensor
 from gnrecon.cloud import Float
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import Laplace
+from gnrecon.slices import slices
 
 PATCHES = {1: 200, 8: 40, 40: 12}
 """Number of patches of each number of points."""
@@ -54,8 +55,7 @@ def left_out_scores(data: DataRows, posterior: Laplace, size: int, count: int, r
     centres = rng.permutation(len(points))[:count]
     patches = cKDTree(points).query(points[centres], list(range(1, size + 1)))[1]
     several = max(1, BATCH_POINTS // size)
-    parts = [_scores(data, posterior, patches[start : start + several]) for start in range(0, len(patches), several)]
-    return np.concatenate(parts)
+    return np.concatenate([_scores(data, posterior, patches[rows]) for rows in slices(len(patches), several)])
 
 
 def _scores(data: DataRows, posterior: Laplace, patches: npt.NDArray[np.intp]) -> Float:

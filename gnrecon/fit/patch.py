@@ -20,6 +20,7 @@ from torch import Tensor
 from gnrecon.field.features import Features
 from gnrecon.linalg.cholesky import damped_factor, solve_factored
 from gnrecon.linalg.gram import gram
+from gnrecon.slices import slices
 
 SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""
@@ -96,7 +97,7 @@ class PatchSystem:
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         self._scale = size * (2.0 / len(features)) ** 0.5
         like, count = patch.value, len(features)
-        parts = [_data_sums(patch, features, length, slice(n, n + ROWS)) for n in range(0, len(like), ROWS)]
+        parts = [_data_sums(patch, features, length, rows) for rows in slices(len(like), ROWS)]
         positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
         self._positions, self._angles = (positions, of_positions), (angles, of_angles)
         self._patch = patch

@@ -14,11 +14,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gnrecon.field.siren import Siren, batches
+from gnrecon.field.siren import Siren
 from gnrecon.fit.terms import Term, groups
 from gnrecon.linalg.jacobian import Block, LayeredJacobian
 from gnrecon.linalg.rows import LayerRows
 from gnrecon.residuals.first_order import Linearised
+from gnrecon.slices import slices
 
 CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000
 """Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""
@@ -117,10 +118,10 @@ class FieldProblem:
         shapes = self.field.layout.shapes
         return tuple(out * (into + 1) for out, (_, into) in zip(self._free_outs(), shapes, strict=True))
 
-    def _chunks(self, group: list[Term]) -> Iterator[slice]:
-        """Yield slices of the group's points, of which the activations take at most `CHUNK_BYTES` a layer."""
+    def _chunks(self, group: list[Term]) -> list[slice]:
+        """Return slices of the group's points, of which the activations take at most `CHUNK_BYTES` a layer."""
         size = max(256, min(CHUNK_POINTS, CHUNK_BYTES // (8 * max(self.field.widths))))
-        return batches(len(group[0].points), size)
+        return slices(len(group[0].points), size)
 
     def _factor_bytes(self, whole: Tensor) -> int:
         """Memory of all factors: inputs and adjoints once a point, lefts and tangents for each residual."""

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from gnrecon.cloud import Float, Frame
 from gnrecon.field.detail import Detail
-from gnrecon.field.siren import Siren, batches
+from gnrecon.field.siren import Siren
 from gnrecon.sampling import Box
+from gnrecon.slices import slices
 from gnrecon.threads import abreast
 
 _BATCH_BYTES = 4_000_000
@@ -157,4 +158,4 @@ class NeuralSDF:
     def _each_batch(self, fill: Callable[[slice], None], count: int) -> None:
         """Have `count` rows filled, so many at a time as the cache holds."""
         size = max(256, _BATCH_BYTES // (8 * max(self.field.widths)))
-        abreast(fill, list(batches(count, size)), self.theta.device)
+        abreast(fill, slices(count, size), self.theta.device)

@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from gnrecon.cloud import Float, Samples
-from gnrecon.field.siren import batches
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
@@ -34,6 +33,7 @@ from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
+from gnrecon.slices import slices
 
 MOST_POINTS = 20_000
 """Data points that count; more of them are thinned at random, so that sigma is rather too large."""
@@ -59,7 +59,7 @@ class NetworkDeviation:
     def at(self, x: Float) -> Float:
         """Return the standard deviation of the network's value, of shape (N,), at x, of shape (N, 3)."""
         points = torch.as_tensor(x).to(self.rows.theta)
-        parts = [self._at(points[rows]) for rows in batches(len(points), BATCH)]
+        parts = [self._at(points[rows]) for rows in slices(len(points), BATCH)]
         return np.concatenate([np.zeros(0), *parts])
 
     def _at(self, x: Tensor) -> Float:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.ingest.outliers import thickness
+from gnrecon.slices import slices
 
 Float = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
@@ -46,9 +47,9 @@ def surface_variation(points: Float) -> Float:
 
     tree = cKDTree(points)
     found = np.zeros(len(points))
-    for start in range(0, len(points), _AT_A_TIME):
-        rows = tree.query(points[start : start + _AT_A_TIME], min(_NEIGHBOURS, len(points)))[1]
-        found[start : start + len(rows)] = thickness(points[rows.reshape(len(rows), -1)])
+    for some in slices(len(points), _AT_A_TIME):
+        rows = tree.query(points[some], min(_NEIGHBOURS, len(points)))[1]
+        found[some] = thickness(points[rows.reshape(len(rows), -1)])
     return found
 
 

@@ -16,6 +16,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.slices import slices
+
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 
@@ -51,7 +53,7 @@ def directions(points: Float) -> Float:
     sizes = _sizes(len(points))
     distances = np.empty((len(points), around), np.float32)
     rows = np.empty((len(points), around), np.int32)
-    for chunk in _chunks(len(points)):
+    for chunk in slices(len(points), _CHUNK):
         distances[chunk], rows[chunk] = tree.query(points[chunk], around)
     noise = _noise(points, rows, distances)
     found, left = np.empty_like(points), np.arange(len(points))
@@ -71,16 +73,13 @@ def tangent_planes(points: Float, neighbours: int) -> Float:
     from scipy.spatial import cKDTree
 
     tree, size = cKDTree(points), min(neighbours, max(4, len(points) // _FIRST))
-    return np.concatenate([_planes(points, tree.query(points[chunk], size)[1])[1] for chunk in _chunks(len(points))])
+    chunks = slices(len(points), _CHUNK)
+    return np.concatenate([_planes(points, tree.query(points[chunk], size)[1])[1] for chunk in chunks])
 
 
 def _sizes(count: int) -> list[int]:
     first = min(_NEIGHBOURS[0], max(4, count // _FIRST))
     return [first, *(size for size in _NEIGHBOURS[1:] if size <= count // _MORE)]
-
-
-def _chunks(count: int) -> list[slice]:
-    return [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
 
 
 def _planes(points: Float, rows: npt.NDArray[np.integer]) -> tuple[Float, Float, Float]:
@@ -95,11 +94,11 @@ def _planes(points: Float, rows: npt.NDArray[np.integer]) -> tuple[Float, Float,
 def _noise(points: Float, rows: Int, distances: npt.NDArray[np.float32]) -> Float:
     """Return the standard deviation along the normal, of shape (N,)."""
     own = np.empty(len(points))
-    for chunk in _chunks(len(points)):
+    for chunk in slices(len(points), _CHUNK):
         own[chunk] = _off_quadric(points[rows[chunk]]) * distances[chunk, -1]
     least = np.empty(len(points))
     rank = min(_RANK, rows.shape[1] - 1)
-    for chunk in _chunks(len(points)):
+    for chunk in slices(len(points), _CHUNK):
         least[chunk] = np.partition(own[rows[chunk]], rank, axis=1)[:, rank]
     return least
 
@@ -125,11 +124,11 @@ def _beside_edges(points: Float, rows: Int, found: Float) -> Float:
     """Return the directions, those beside an edge replaced by a neighbour's that does not straddle it."""
     near = rows[:, : min(_NARROW, rows.shape[1], max(4, len(points) // _FIRST))]
     centroids, normals, variances = (np.empty(shape) for shape in (points.shape, points.shape, points.shape))
-    for chunk in _chunks(len(points)):
+    for chunk in slices(len(points), _CHUNK):
         centroids[chunk], normals[chunk], variances[chunk] = _planes(points, near[chunk])
     flatness, across = variances[:, 0], np.maximum(variances[:, 1], _LEAST)
     result = found.copy()
-    for chunk in _chunks(len(points)):
+    for chunk in slices(len(points), _CHUNK):
         beside = near[chunk]
         off = np.einsum("gci,gci->gc", points[chunk, None] - centroids[beside], normals[beside])
         score = (flatness[beside] + _OFF_PLANE * off**2) / across[beside]

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.ingest.spacing import neighbour_spacing
+from gnrecon.slices import slices
 
 Float = npt.NDArray[np.float64]
 
@@ -44,8 +45,7 @@ def smoothed(points: Float, normals: Float, width: float) -> tuple[Float, Float]
     count = int(min(_SURPLUS * expected + _LEAST, _MOST, len(points)))
     moved, turned = points.copy(), normals.copy()
     step = max(1, _VALUES // (6 * count))
-    for start in range(0, len(points), step):
-        rows = slice(start, start + step)
+    for rows in slices(len(points), step):
         distances, neighbours = tree.query(points[rows], count, distance_upper_bound=width)
         near = np.minimum(neighbours, len(points) - 1).reshape(-1, count)
         weights = _weights(distances.reshape(-1, count), width) * _facing(normals[near], normals[rows])

@@ -16,6 +16,8 @@ from typing import Generic, TypeVar
 
 import torch
 
+from gnrecon.threads import set_threads
+
 Input = TypeVar("Input")
 Answer = TypeVar("Answer")
 
@@ -31,7 +33,7 @@ class Beside(Generic[Input, Answer]):
     def __init__(self, work: Callable[[Input], Answer]) -> None:
         self._work = work
         # As many of torch's threads as the one that asks has.
-        self._pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(torch.get_num_threads(),))
+        self._pool = ThreadPoolExecutor(1, initializer=set_threads, initargs=(torch.get_num_threads(),))
         self._last: Future[Answer] | None = None
 
     def __call__(self, current: Input) -> Answer:

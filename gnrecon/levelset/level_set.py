@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gnrecon.cloud import Float
 from gnrecon.sampling import Box
+from gnrecon.slices import slices
 
 Value = Callable[[Tensor], Tensor]
 """Takes points, of shape (N, 3), and returns f there, of shape (N,)."""
@@ -64,7 +65,6 @@ class LevelSet:
         return ((points >= lower) & (points <= upper)).all(1)
 
 
-def _chunks(count: int) -> Iterator[slice]:
-    """Yield slices that cover `count` rows; one of no rows where there are none, so that shapes stay known."""
-    for start in range(0, max(count, 1), _CHUNK):
-        yield slice(start, min(start + _CHUNK, count))
+def _chunks(count: int) -> list[slice]:
+    """Return slices that cover `count` rows; one of no rows where there are none, so that shapes stay known."""
+    return slices(count, _CHUNK) or [slice(0, 0)]

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from gnrecon.field import CurvedJet, Network
-from gnrecon.field.siren import batches
 from gnrecon.levelset import derivative_along, transported
 from gnrecon.linalg import Block, LayeredJacobian
 from gnrecon.residuals import Linearised, Residual, SecondOrder
+from gnrecon.slices import slices
 
 CHUNK = 8192
 FOLLOWED, LONGEST = 2, 0.1
@@ -129,7 +129,7 @@ class FrozenProblem:
 
     def _pieces(self, free: Tensor, term: FrozenTerm) -> Iterator[tuple[Tensor, Tensor | None]]:
         """Yield points, and targets, chunk by chunk; surface points where they have gone at `free`."""
-        for rows in batches(len(term.points), CHUNK):
+        for rows in slices(len(term.points), CHUNK):
             points = term.points[rows]
             if term.moves and free is not self.theta:
                 points = self._followed(free, points)

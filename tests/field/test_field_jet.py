@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
-from gnrecon.field.siren import batches
 
 DEPTHS = [(7,), (1,), (5, 8), (8, 5), (6, 4, 7), (3, 9, 2)]
 EXACT = {"rtol": 1e-9, "atol": 1e-9}
@@ -158,13 +157,6 @@ def test_no_points_are_allowed() -> None:
     value, gradient = field.value_and_gradient(theta, x[:0])
     assert value.shape == (0,)
     assert gradient.shape == (0, 3)
-
-
-@pytest.mark.parametrize(("count", "size"), [(0, 5), (1, 5), (5, 5), (6, 5), (23, 7)])
-def test_batches_cover_every_row_once(count: int, size: int) -> None:
-    slices = list(batches(count, size))
-    assert [row for part in slices for row in range(count)[part]] == list(range(count))
-    assert all(part.stop - part.start <= size for part in slices)
 
 
 @each_field

@@ -146,13 +146,11 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
         scheduled.solve_scheduled(Work(tmp_path), [0], "tcp://127.0.0.1:9", unheard)
 
 
-def test_it_is_the_smaller_scans_fit(whole: Detail, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
     found = Told(samples, Leftover.of(sdf, samples), known())
-    monkeypatch.setattr("gnrecon.fit.detail.told", lambda *_: found)
-    single, averaging = fit_detail(sdf, samples, np.arange(COUNT) % 6 == 0, FEATURES, np.random.default_rng(0), "cpu")
-    assert averaging is None
+    single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
     by_single, by_blocks = (0.05 + d.value(samples.points) for d in (single, detail))
