@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,8 @@ from gnrecon.shapes import (
     mesh_of,
     on_surface,
 )
+
+learning = sys.modules["gnrecon.shapes.learn"]  # the package has a function of that name
 
 SMALL = Network((10, 10))
 
@@ -114,6 +117,26 @@ def test_a_vanished_surface_keeps_the_best_until_then() -> None:
     learned = learn(problem, budget=None, steps=40)
     assert "no zero level" in learned.solution.status
     assert np.isfinite(learned.best.loss)
+
+
+def test_the_mean_of_the_last_steps_is_returned_where_it_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[torch.Tensor] = []
+
+    def measured(run: object, step: int, theta: torch.Tensor) -> Measurement:
+        del run
+        seen.append(theta)
+        # Of each pair, the later one is the mean.
+        return Measurement(step, 0.0, 1.0 / len(seen), {}, None, None)
+
+    monkeypatch.setattr(learning._Run, "measured", measured)
+    learned = learn(half_ball(), budget=None, steps=4)
+    start, one, two = seen[0], learned.solution.theta, learned.field.theta
+    assert not torch.equal(one, two)
+    assert torch.equal(two, seen[-1])
+    assert torch.equal(one, seen[-2])
+    assert learned.best.loss == learned.history[-1].loss
+    # Nearer to the last parameters than to the first.
+    assert float((two - one).norm()) < 0.6 * float((start - one).norm())
 
 
 def test_what_makes_no_sense_is_refused() -> None:

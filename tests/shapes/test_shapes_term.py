@@ -25,7 +25,7 @@ from gnrecon.shapes import (
     rising,
     z_cylinder,
 )
-from gnrecon.shapes.term import LAST, falling
+from gnrecon.shapes.term import LAST, falling, growing
 
 
 def moment(value: object, box: Box, step: int = 1) -> Moment:
@@ -119,3 +119,11 @@ def test_known_solutions_satisfy_their_problems(name: str) -> None:
 def test_what_is_no_curve_is_refused(curve: np.ndarray) -> None:
     with pytest.raises(UsageError, match="curve"):
         minimal_surface(curve)
+
+
+def test_points_grow_quickly_and_then_slowly() -> None:
+    count = growing(100, 2.0, 800, 1.1)
+    assert [count(step) for step in (1, 2, 3, 4)] == [100, 200, 400, 800]
+    assert [count(step) for step in (5, 6)] == [880, 968]
+    assert count(LAST) == LAST, "a measurement takes all points"
+    assert count(LAST - 1) > 10**9
