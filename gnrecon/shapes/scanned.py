@@ -34,8 +34,10 @@ NETWORK = Network((32, 32, 32), SINE, (16.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
 
 POINTS, IN_BOX = growing(1500, 1.25, 5000, 1.008), 1000
-"""Points of each term at each step, and those in the box. The network fits 8,000 points of the bunny to a loss that is
-a quarter larger for all of them; at first that is little beside what a step gains, and in the end it would be all."""
+"""Points of each term at each step, and those in the box. With 8,000 points of the bunny a quarter of the loss is in
+the end owed to fitting those of the last steps better than the others; at first that is little beside what a step
+gains.
+"""
 
 MARGIN = 0.2
 """The paper's: how far the box reaches beyond the scan, in radii."""
