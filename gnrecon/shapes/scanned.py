@@ -33,10 +33,10 @@ from gnrecon.shapes.term import Drawn, Moment, Sampler, Term, at_points, falling
 NETWORK = Network((32, 32, 32), SINE, (16.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
 
-POINTS, IN_BOX = growing(1500, 1.25, 5000, 1.008, 12_000), 1000
+POINTS, IN_BOX = growing(1500, 1.25, 5000, 1.008), 1000
 """Points of each term at each step, and those in the box. With 8,000 points of the bunny a quarter of the loss is in
-the end owed to fitting those of the last steps better than the others, until the mean over steps takes most of that
-away; at first it is little beside what a step gains.
+the end owed to fitting those of the last steps better than the others; at first that is little beside what a step
+gains.
 """
 
 MARGIN = 0.2

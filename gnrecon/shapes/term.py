@@ -24,6 +24,9 @@ from gnrecon.sampling import Box
 LAST = 10**9
 """The number of a step that is never reached: weights have ended there."""
 
+MOST_GROWTH = 20.0
+"""Logarithm of the most by which a number of points grows: by then it is all points of any scan."""
+
 NODES = 30_000
 """Evaluations that the search for a surface costs at each step; see `gnrecon.levelset.sample_surface`."""
 
@@ -134,8 +137,8 @@ def on_surface(count: int, nodes: int = NODES) -> Sampler:
     return draw
 
 
-def growing(first: int, factor: float, many: int, slowly: float, most: int) -> Count:
-    """Return a number of points that grows by a factor a step, by a smaller one once there are many, up to the most.
+def growing(first: int, factor: float, many: int, slowly: float) -> Count:
+    """Return a number of points that grows by a factor a step, and by a smaller one once there are many.
 
     The fewer points, the sooner a step is done, and the farther what fits them is from what fits all: that matters the
     more, the less is left to gain. A measurement takes all points.
@@ -146,7 +149,7 @@ def growing(first: int, factor: float, many: int, slowly: float, most: int) -> C
         if step == LAST:
             return step
         growth = math.log(factor) * min(step - 1, quick) + math.log(slowly) * max(0.0, step - 1 - quick)
-        return round(first * math.exp(min(growth, math.log(most / first))))
+        return round(first * math.exp(min(growth, MOST_GROWTH)))
 
     return at
 

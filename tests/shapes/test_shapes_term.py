@@ -122,8 +122,8 @@ def test_what_is_no_curve_is_refused(curve: np.ndarray) -> None:
 
 
 def test_points_grow_quickly_and_then_slowly() -> None:
-    count = growing(100, 2.0, 800, 1.1, 5000)
+    count = growing(100, 2.0, 800, 1.1)
     assert [count(step) for step in (1, 2, 3, 4)] == [100, 200, 400, 800]
     assert [count(step) for step in (5, 6)] == [880, 968]
     assert count(LAST) == LAST, "a measurement takes all points"
-    assert count(10**6) == 5000
+    assert count(LAST - 1) > 10**9
