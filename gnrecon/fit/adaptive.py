@@ -80,6 +80,12 @@ class _Task:
         rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
         return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None)
 
+    def told(self, sdf: NeuralSDF, options: FitOptions, rng: np.random.Generator, outliers: bool) -> Told:
+        """Return what the samples tell beside a global field; `outliers` says whether some were found among them."""
+        if self.sharp is not None:
+            return Told.of_faces(sdf, self.sharp)
+        return told(sdf, self.samples, self.held, options.features, rng, options.device, outliers)
+
 
 def fit_adaptive(
     samples: Samples,
@@ -133,27 +139,22 @@ def fit_adaptive(
     if options.regularisers:
         sdf, shape = _shaped(first, task.samples, options, rng)
     rest = part(advance, SHARE, 1.0)
-    averaging = None
+    known = None
     try:
         if by_blocks:
             detail = fit_large(sdf, task.samples, task.held, options, rng, folder, rest, scheduler)
         else:
-            where = options.features, rng, options.device
-            if task.sharp is None:
-                known = told(sdf, task.samples, task.held, *where, outliers=left_out > 0)
-            else:
-                known = Told.of_faces(sdf, task.sharp)
+            known = task.told(sdf, options, rng, left_out > 0)
             rest(CHOSEN)
-            averaging = known.averaging
-            detail = fit_detail(sdf, known, *where, rest, shape)
+            detail = fit_detail(sdf, known, options.features, rng, options.device, rest, shape)
     except KeyboardInterrupt:
         status = "Interrupted before the detail was solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
     chosen = detail.as_dict(samples.frame.scale)
     also = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
     also += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
-    if averaging is not None:
-        also += f" Averaged noisy points over {averaging.width:g} of their disks' radii, where normals agree."
+    if known is not None and known.averaging is not None:
+        also += f" Averaged noisy points over {known.averaging.width:g} of their disks' radii, where normals agree."
     if task.sharp is not None:
         also += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
     if task.sharp is None:

@@ -118,6 +118,7 @@ class _Cubes:
         device: str,
         shaping: Shaping | None,
     ) -> _Cubes:
+        """Return the cubes of a belief's length, each of `count` features."""
         like = torch.zeros(0, dtype=torch.float64, device=device)
         cell = CELL * belief.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.

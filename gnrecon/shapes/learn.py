@@ -99,7 +99,7 @@ class _Run:
     def note(self, step: int, theta: Tensor) -> None:
         """Measure, also the mean, and keep the parameters where their loss is the least so far."""
         found = self.measured(step, theta)
-        if step and self.mean is not None:
+        if self.mean is not None:  # there is none at the start
             of_mean = self.measured(step, self.mean)
             if of_mean.loss < found.loss:
                 found, theta = of_mean, self.mean
