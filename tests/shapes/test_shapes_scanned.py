@@ -42,6 +42,13 @@ def test_the_eikonal_weight_falls_and_is_not_reported() -> None:
     assert eikonal.weight_at(LAST) == 0
 
 
+def test_the_eikonal_term_ends_where_the_points_determine_the_network() -> None:
+    eikonal = next(term for term in scanned(ball(5000)).terms if term.name == "eikonal")
+    assert eikonal.weight_at(1) > 1e-3
+    assert eikonal.weight_at(12) > 0
+    assert eikonal.weight_at(20) == 0
+
+
 def test_the_free_space_is_asked_for_where_the_field_has_lost_its_sign() -> None:
     problem = scanned(ball(400))
     (free,) = (term for term in problem.terms if term.name == "free space")
@@ -69,6 +76,29 @@ def test_the_free_space_is_asked_for_where_the_field_has_lost_its_sign() -> None
     assert not inside.all()
     assert ((lost.target < 0) == inside).all()
     assert free.weight_at(LAST) == 0
+
+
+def test_what_was_lost_once_is_looked_at_again_until_the_next_run() -> None:
+    problem = scanned(ball(400))
+    (free,) = (term for term in problem.terms if term.name == "free space")
+    axes = torch.tensor([0.9, 0.7, 0.6], dtype=torch.float64)
+
+    def body(x: torch.Tensor) -> torch.Tensor:
+        return (x / axes).norm(dim=1) - 1
+
+    def lost(step: int, value: Callable[[torch.Tensor], torch.Tensor], seed: int) -> set[tuple[float, ...]]:
+        level_set = LevelSet(value, lambda x: (value(x), torch.zeros_like(x)), problem.box)
+        drawn = free.sampler(Moment(step, level_set, np.random.default_rng(seed)))
+        return {tuple(point) for point in drawn.points.tolist()}
+
+    def inverted(x: torch.Tensor) -> torch.Tensor:
+        return -body(x)
+
+    first = lost(1, inverted, 0)
+    assert first
+    assert not lost(2, body, 1)
+    assert first < lost(3, inverted, 2)
+    assert first - lost(1, inverted, 3)
 
 
 def test_a_cloud_of_few_points_has_no_known_free_space() -> None:
