@@ -29,7 +29,19 @@ from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance, least_values
 from gnrecon.shapes.problem import ShapeProblem, Start
-from gnrecon.shapes.term import Drawn, Moment, Sampler, Term, Weight, at_points, fading, falling, growing, in_box
+from gnrecon.shapes.term import (
+    Drawn,
+    Moment,
+    Sampler,
+    Term,
+    Weight,
+    at_points,
+    fading,
+    falling,
+    growing,
+    in_box,
+    rising,
+)
 
 NETWORK = Network((32, 32, 32), SINE, (12.0,))
 """The paper's, with frequencies of the first layer that begin larger."""
@@ -50,10 +62,10 @@ DETERMINED = 4
 """Residuals of points and normals for each of the network's parameters, from which on the eikonal term is gone once it
 has its least weight."""
 
-FREE, POOL, IN_FREE = 10.0, 150_000, 20_000
+FREE, POOL, IN_FREE = rising(1.0, 60, 1.05, 10.0), 150_000, 20_000
 """Weight of the free space, points of the box whose sign may be known, and those that are drawn in each step to be
 looked at. Hardly any of them has a residual. Once the eikonal term is gone pockets open far from the points, with a
-weight of one five times as large ones, at the same loss."""
+weight of one five times as large ones, at the same loss; from the first step on, ten holds the surface up."""
 
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
