@@ -10,7 +10,7 @@ from gnrecon.linalg.iterative import Iterative
 from gnrecon.linalg.jacobian import Block, DenseJacobian, Jacobian, LayeredJacobian
 from gnrecon.linalg.kronecker import Kronecker
 from gnrecon.linalg.krylov import KrylovResult, conjugate_gradients
-from gnrecon.linalg.metric import Metric, identity, jacobian_scaled, layer_scaled
+from gnrecon.linalg.metric import Metric, identity, jacobian_layer_scaled, jacobian_scaled, layer_scaled
 from gnrecon.linalg.minres import minres
 from gnrecon.linalg.nystrom import Nystrom
 from gnrecon.linalg.preconditioner import BlockJacobi, Jacobi, Preconditioner, Prepared
@@ -68,6 +68,7 @@ __all__ = [
     "conjugate_gradients",
     "gmres",
     "identity",
+    "jacobian_layer_scaled",
     "jacobian_scaled",
     "layer_scaled",
     "minres",

@@ -15,6 +15,9 @@ from gnrecon.linalg.jacobian import Jacobian
 Metric = Callable[[Jacobian], Tensor]
 """Gives D's diagonal, of shape (p,), positive."""
 
+SHARE = 0.1
+"""What a parameter's unit has of its layer's, beside its own."""
+
 
 def identity(jacobian: Jacobian) -> Tensor:
     """Damp every parameter alike (Levenberg), as the paper does."""
@@ -32,12 +35,26 @@ def layer_scaled(jacobian: Jacobian) -> Tensor:
 
     Layers differ by orders of magnitude in how much the field answers to them, the parameters within a layer do not.
     """
+    return _bounded(_layer_means(jacobian, jacobian.diagonal()))
+
+
+def jacobian_layer_scaled(jacobian: Jacobian) -> Tensor:
+    """Damp in units of J^T J's diagonal, to each of which a tenth of its layer's mean is added.
+
+    In units of the diagonal alone, parameters that the residuals hardly see yet move beyond where the linear model
+    holds, and the damping must rise for all; with units of layers alone, late steps are shorter (docs/paper.md).
+    """
     diagonal = jacobian.diagonal()
-    metric = torch.ones_like(diagonal)
+    return _bounded(diagonal + SHARE * _layer_means(jacobian, diagonal))
+
+
+def _layer_means(jacobian: Jacobian, diagonal: Tensor) -> Tensor:
+    """Return the mean of its layer's part of the diagonal for each parameter, of shape (p,)."""
+    means = torch.ones_like(diagonal)
     for group in jacobian.groups:
         if group.stop > group.start:
-            metric[group] = diagonal[group].mean()
-    return _bounded(metric)
+            means[group] = diagonal[group].mean()
+    return means
 
 
 def _bounded(diagonal: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from damped_problems import layered
 
-from gnrecon.linalg import DenseJacobian, identity, jacobian_scaled, layer_scaled
+from gnrecon.linalg import DenseJacobian, identity, jacobian_layer_scaled, jacobian_scaled, layer_scaled
 
 
 def test_identity_is_one_everywhere() -> None:
@@ -28,6 +28,13 @@ def test_layer_scaled_is_the_mean_of_each_layer() -> None:
         torch.testing.assert_close(metric[group], diagonal[group].mean().expand_as(metric[group]))
 
 
+def test_jacobian_layer_scaled_adds_a_tenth_of_the_layer_to_the_diagonal() -> None:
+    jacobian, J = layered(4, units=((1,), None))
+    metric, diagonal = jacobian_layer_scaled(jacobian), J.square().sum(0)
+    for group in jacobian.groups:
+        torch.testing.assert_close(metric[group], diagonal[group] + 0.1 * diagonal[group].mean())
+
+
 def test_metrics_are_positive_where_there_is_nothing() -> None:
     for jacobian in (
         DenseJacobian(torch.zeros(5, 3)),
@@ -36,7 +43,7 @@ def test_metrics_are_positive_where_there_is_nothing() -> None:
         layered(3, units=((), None))[0],
         layered(3, units=((), ()))[0],
     ):
-        for metric in (identity, jacobian_scaled, layer_scaled):
+        for metric in (identity, jacobian_scaled, layer_scaled, jacobian_layer_scaled):
             D = metric(jacobian)
             assert D.shape == (jacobian.columns,)
             assert D.dtype == jacobian.dtype

@@ -20,11 +20,12 @@ from gnrecon.linalg import (
     Metric,
     Step,
     identity,
+    jacobian_layer_scaled,
     jacobian_scaled,
     layer_scaled,
 )
 
-METRICS = [identity, layer_scaled, jacobian_scaled]
+METRICS = [identity, layer_scaled, jacobian_scaled, jacobian_layer_scaled]
 each_solver = pytest.mark.parametrize("solver", SOLVERS)
 each_metric = pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.__name__)
 each_storage = pytest.mark.parametrize("stored", [torch.float64, torch.float32], ids=["f64", "f32"])
@@ -36,7 +37,7 @@ def suits(solver: str, jacobian: Jacobian, metric: Metric) -> bool:
     """Whether a solver is meant for such a system."""
     if solver == "cg-kronecker":
         return isinstance(jacobian, LayeredJacobian)
-    return not (solver == "row-space" and metric is jacobian_scaled)
+    return not (solver == "row-space" and metric in (jacobian_scaled, jacobian_layer_scaled))
 
 
 def oracle(J: Tensor, r: Tensor, D: Tensor, damping: float) -> Tensor:
