@@ -24,7 +24,7 @@ from torch import Tensor
 from gnrecon.cloud import Samples
 from gnrecon.field import Network
 from gnrecon.field.activation import SINE
-from gnrecon.linalg import jacobian_scaled
+from gnrecon.linalg import jacobian_layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance, least_values
@@ -40,7 +40,6 @@ from gnrecon.shapes.term import (
     falling,
     growing,
     in_box,
-    rising,
 )
 
 NETWORK = Network((32, 32, 32), SINE, (12.0,))
@@ -62,10 +61,10 @@ DETERMINED = 4
 """Residuals of points and normals for each of the network's parameters, from which on the eikonal term is gone once it
 has its least weight."""
 
-FREE, POOL, IN_FREE = rising(1.0, 60, 1.05, 10.0), 150_000, 20_000
+FREE, POOL, IN_FREE = 1.0, 150_000, 20_000
 """Weight of the free space, points of the box whose sign may be known, and those that are drawn in each step to be
-looked at. Hardly any of them has a residual. Once the eikonal term is gone pockets open far from the points, with a
-weight of one five times as large ones, at the same loss; from the first step on, ten holds the surface up."""
+looked at. Hardly any of them has a residual. Once the eikonal term is gone small pockets open far from the points; ten
+makes them a fifth as large, but holds the surface up."""
 
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
@@ -117,7 +116,7 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
         Term("free space", free_space, _free(coarse, box, np.random.default_rng(seed)), FREE, 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))
-    search = GainRatioDamping(initial_damping=1e-2, metric=jacobian_scaled, geodesic=True)
+    search = GainRatioDamping(initial_damping=1e-2, metric=jacobian_layer_scaled, geodesic=True)
     return ShapeProblem(
         name,
         terms,
