@@ -192,11 +192,12 @@ def test_estimated_normals_are_outward() -> None:
     assert np.einsum("ij,ij->i", points, normals).min() > 0.9
 
 
-def test_our_methods_differ_by_the_optimiser_and_all_have_their_settings() -> None:
+def test_all_methods_have_their_settings() -> None:
     protocol = Protocol(threads=1, depths=(7, 8), options={"resolution": 64})
     told = protocol.contestants(list(METHODS))
     assert [name for name, _ in told if name in OURS] == list(OURS)
-    assert dict(told)["Adam"] == {"resolution": 64, "optimiser": "adam"}
+    assert dict(told)["Adam"] == {"resolution": 64, "optimiser": "adam", "widths": (32, 32, 32)}
+    assert dict(told)["gnrecon"] == {"resolution": 64}
     assert [settings for name, settings in told if name == "MeshLab Poisson"] == [
         {"depth": 7, "threads": 1},
         {"depth": 8, "threads": 1},

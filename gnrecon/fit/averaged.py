@@ -30,6 +30,9 @@ FIRST = Averaging(2.5, 0.4)
 
 OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4))
 
+CLEARLY = 2.0
+"""Standard errors by which patches must be better for averaging where no edges are seen."""
+
 NOISY = 0.05
 """Noise of the positions, in radii of a point's disk, above which points are averaged."""
 
@@ -111,8 +114,8 @@ def _best(
 ) -> tuple[Averaging, Trials] | None:
     """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
 
-    Whether there are edges is asked where scatter hides the gain. All are compared at the length that suits the points
-    as they are; a better one is chosen afterwards.
+    Whether there are edges is asked where the patches alone do not decide. All are compared at the length that suits
+    the points as they are; a better one is chosen afterwards.
     """
     plain = _of_best_noise(choice.scores)
 
@@ -122,7 +125,7 @@ def _best(
 
     gain, trials = tried(FIRST)
     doubt = gain.std() / np.sqrt(len(gain))
-    if not (gain.mean() > doubt or (gain.mean() > -doubt and edges())):
+    if not (gain.mean() > CLEARLY * doubt or (gain.mean() > -doubt and edges())):
         return None
     best, averaging = float(gain.mean()), FIRST
     for other in OTHERS:

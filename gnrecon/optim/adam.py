@@ -2,10 +2,10 @@
 
 Each outer step freezes a problem, takes its gradient g = J^T r, and moves the parameters by the learning rate times
 m / (sqrt(v) + 1e-8), m and v being running means of g and of its squares. The learning rate falls along half a cosine
-from its first value at the first step to zero after the last. Where only some parameters are free, the others'
-gradients count as zero in the running means, and they stay where they are. Source: Kingma and Ba, Adam: a method for
-stochastic optimization (2015); Loshchilov and Hutter, SGDR (2017), without restarts; the paper's appendix on
-hyperparameters.
+from its first value at the first step to zero after the last of the limit's steps; in a run that time ends long before,
+it hardly falls. Where only some parameters are free, the others' gradients count as zero in the running means, and they
+stay where they are. Source: Kingma and Ba, Adam: a method for stochastic optimization (2015); Loshchilov and Hutter,
+SGDR (2017), without restarts; the paper's appendix on hyperparameters.
 
 A single step of Adam says little: many small ones, some of them uphill, make the progress, and the cosine plans all of
 them. So neither idle steps nor held-out residuals end a run, only the limits of steps and time; of the held-out

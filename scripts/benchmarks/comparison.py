@@ -20,7 +20,14 @@ from benchmarks.table import FIGURES
 from benchmarks.trial import Job, run_trial
 from gnrecon.options import Options
 
-FITS = {"gnrecon": {}, "Adam": {"optimiser": "adam"}, "L-BFGS": {"optimiser": "lbfgs"}}
+LAYERS = (32, 32, 32)
+"""Of the paper's network. One wide layer starts at its linear fit's minimum, which Adam can only leave."""
+
+FITS: dict[str, dict[str, Any]] = {
+    "gnrecon": {},
+    "Adam": {"optimiser": "adam", "widths": LAYERS},
+    "L-BFGS": {"optimiser": "lbfgs", "widths": LAYERS},
+}
 """Options of our own methods, beside those of the protocol."""
 
 

@@ -83,11 +83,11 @@ def chosen(gains: dict[Averaging, float], edges: bool) -> Averaging | None:
 def test_edges_decide_what_scatter_hides() -> None:
     # The doubt about a mean of a hundred is a thousandth.
     first, (wider, widest) = averaged.FIRST, averaged.OTHERS
-    for gain, without, with_edges in ((0.002, first, first), (0.0005, None, first), (-0.0005, None, first)):
+    for gain, without, with_edges in ((0.003, first, first), (0.0015, None, first), (-0.0005, None, first)):
         assert chosen({first: gain}, edges=False) == without
         assert chosen({first: gain}, edges=True) == with_edges
     assert chosen({first: -0.002}, edges=True) is None
-    assert chosen({first: 0.002, wider: 0.004, widest: 0.003}, edges=False) == wider
+    assert chosen({first: 0.003, wider: 0.005, widest: 0.004}, edges=False) == wider
 
 
 def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
