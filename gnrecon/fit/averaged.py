@@ -92,16 +92,18 @@ def told(
     choice = trials.choice()
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
-        return Told(samples, leftover, choice.belief)
+        return Told(samples, leftover, choice.best)
 
     def with_kept(averaging: Averaging) -> Trials:
         points, normals = samples.points.copy(), samples.normals.copy()
         points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
-        return replace(trials, leftover=Leftover.of(sdf, replace(samples, points=points, normals=normals)))
+        # The noise of averaged points is alike among neighbours, of which no evidence is made.
+        of_averaged = Leftover.of(sdf, replace(samples, points=points, normals=normals))
+        return replace(trials, leftover=of_averaged, evidence=None)
 
     found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
     if found is None:
-        return Told(samples, leftover, choice.belief)
+        return Told(samples, leftover, choice.best)
     averaging, better = found
     points, normals = averaging.of(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)

@@ -23,6 +23,8 @@ from torch import Tensor
 from gnrecon.cloud import Float, Samples
 from gnrecon.field.features import Features
 from gnrecon.fit.clean import clean_noise
+from gnrecon.fit.evidence import PATCHES as EVIDENT_PATCHES
+from gnrecon.fit.evidence import POINTS, Evidence
 from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.sampling import Density
@@ -164,14 +166,29 @@ class Volume:
 
 @dataclass(frozen=True)
 class Choice:
-    """A belief, and the score of its length at each patch with each noise, of shape (patches, noises), in radii."""
+    """What left-out points choose.
+
+    Parameters
+    ----------
+    belief : of the tabled noises
+    scores : of its length at each patch with each tabled noise, of shape (patches, noises), in radii
+    evident : belief of the noise that has most evidence at its length; None where points do not tell it
+    """
 
     belief: Belief
     scores: Float
+    evident: Belief | None = None
+
+    @property
+    def best(self) -> Belief:
+        """Return the belief for points as they were scanned."""
+        return self.evident or self.belief
 
 
 def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
     """Return the belief that a clean scan tells by itself, and of any other that which predicts left-out points best.
+
+    The noise is then that of most evidence (`evidence`), unless normals were estimated.
 
     Parameters
     ----------
@@ -182,7 +199,16 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     device : a torch device
     """
     trials = Trials.draw(leftover, held, radius, rng, device)
-    return trials.clean() or trials.choice().belief
+    return trials.clean() or trials.choice().best
+
+
+def _evidence(leftover: Leftover, radius: float, rng: np.random.Generator, device: str) -> Evidence:
+    """Return the evidence of points about places that are drawn; the other parameters as those of `choose`."""
+    centers = leftover.points[rng.choice(len(leftover), min(EVIDENT_PATCHES, len(leftover)), replace=False)]
+    near = leftover.density.tree.query(centers, list(range(1, min(POINTS, len(leftover)) + 1)))[1]
+    pairs = zip(np.sort(near), centers, strict=True)
+    patches = [leftover.patch(rows, center, Volume.none(), device) for rows, center in pairs]
+    return Evidence.of(patches, radius, rng, device)
 
 
 def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
@@ -222,6 +248,8 @@ class Trials:
     held : mask of shape (N,), of the points that are left out
     device : a torch device
     known : noise of positions and normals, where it is known; then no other is tried
+    evidence : which tells one more noise for each length; None of estimated normals, which are alike by what they are
+        means of, and not by the surface alone
     """
 
     leftover: Leftover
@@ -233,6 +261,8 @@ class Trials:
     held: Mask
     device: str
     known: tuple[float, float] | None = None
+    evidence: Evidence | None = None
+    _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
@@ -257,7 +287,8 @@ class Trials:
         near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = leftover.points[chosen]
-        return cls(leftover, leftover, radius, features, centers, list(out[near]), held, device)
+        evidence = None if leftover.estimated else _evidence(leftover, radius, rng.spawn(1)[0], device)
+        return cls(leftover, leftover, radius, features, centers, list(out[near]), held, device, evidence=evidence)
 
     def clean(self) -> Belief | None:
         """Return the belief of a scan so clean that its points tell their noise by themselves, or None.
@@ -290,26 +321,42 @@ class Trials:
         step = 1 if least(at + 1) < least(at) else -1
         while least(at + step) < least(at):
             at += step
-        number, noise = _smoothest(scores)
-        position, angle = self.noises[noise]
-        return Choice(Belief(LENGTHS[number] * self.radius, position, angle), scores[number])
+        tabled = {number: of_length[:, : len(CHOICES)] for number, of_length in scores.items()}
+        number, noise = _smoothest(tabled)
+        evident = None
+        if self.evidence is not None:
+            last, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
+            evident = self._belief(last, -1)
+        return Choice(self._belief(number, noise), tabled[number], evident)
+
+    def _belief(self, number: int, noise: int) -> Belief:
+        """Return the belief of the numbers of a length and of one of its noises."""
+        length = LENGTHS[number] * self.radius
+        return Belief(length, *self.noises(length)[noise])
 
     def _clearly_better(self, number: int, than: int) -> bool:
         """Return whether a length's score is better than another's by more than the standard error."""
         gain = self.scores(LENGTHS[than] * self.radius)[:, 0] - self.scores(LENGTHS[number] * self.radius)[:, 0]
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
-    @cached_property
-    def noises(self) -> list[tuple[float, float]]:
-        """Return the noises to try, of positions and normals; points are no noisier than what is left over says."""
+    def noises(self, length: float) -> list[tuple[float, float]]:
+        """Return the noises to try with a length, of positions and normals; that of most evidence is the last one.
+
+        Unless they are known, points are taken to be no noisier than what is left over says.
+        """
         if self.known is not None:
             return [self.known]
-        most = max(self.leftover.over, LEAST_NOISE * self.radius)
-        return [(min(position * self.radius, most), angle) for position, angle in CHOICES]
+        if length not in self._noises:
+            tried = [(position * self.radius, angle) for position, angle in CHOICES]
+            tried += [] if self.evidence is None else [self.evidence.noise(length)]
+            most = max(self.leftover.over, LEAST_NOISE * self.radius)
+            self._noises[length] = [(min(position, most), angle) for position, angle in tried]
+        return self._noises[length]
 
     def scores(self, length: float) -> Float:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
         if length not in self._scored:
+            self.noises(length)  # once, before the patches ask for them side by side
             found = abreast(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
             self._scored[length] = np.array(found) / self.radius
         return self._scored[length]
@@ -329,8 +376,9 @@ class Trials:
         target = self.told.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.told.normals[predicted], device=self.device)
         # Of a scan that is nearly exact, what is left over makes several noises one.
-        found = {each: self._score(system.solve(*each), target, normals, length) for each in set(self.noises)}
-        return [found[each] for each in self.noises]
+        noises = self.noises(length)
+        found = {each: self._score(system.solve(*each), target, normals, length) for each in set(noises)}
+        return [found[each] for each in noises]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
         value, gradient = self.features.sums(amplitudes, target.points, target.center, length, 1)

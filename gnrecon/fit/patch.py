@@ -178,6 +178,16 @@ class RowSystem:
         return self._spread @ (weights * solve_factored(factor, weights * self._wanted))
 
 
+def data_kernel(patch: Patch, features: Features, length: float, size: float) -> Tensor:
+    """Return the covariance of a correction's values and gradients at the points, of shape (4 N, 4 N).
+
+    Gradients follow the values, axis by axis; parameters are those of `PatchSystem`.
+    """
+    sines, slopes = _data_rows(patch, features, length, slice(None))
+    rows = torch.cat([sines, *slopes])
+    return size**2 * 2.0 / len(features) * (rows @ rows.T)
+
+
 def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | RowSystem:
     """Return the smaller one of the two systems that `solve` may use; parameters as those of `PatchSystem`."""
     rows = 4 * len(patch.points) + len(patch.volume)

@@ -1,0 +1,103 @@
+"""The noise of most evidence: the density of Gaussian processes, and noise that was drawn is found again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from gnrecon.field.features import Features
+from gnrecon.fit.choose import Leftover, Trials
+from gnrecon.fit.evidence import ANGLES, POINTS, POSITIONS, Evidence, log_density
+from gnrecon.fit.patch import SIZE, Patch, data_kernel
+
+LENGTH, RADIUS = 0.4, 0.05
+
+
+def patches(count: int, points: int, rng: np.random.Generator) -> tuple[list[Patch], Features]:
+    """Patches of random functions of size one, without noise, and the features that make them up."""
+    features = Features.draw(300, rng, torch.zeros(0, dtype=torch.float64))
+    center, none = torch.zeros(3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    made = []
+    for _ in range(count):
+        x = torch.as_tensor(np.append(rng.uniform(-0.5, 0.5, (points, 2)), np.zeros((points, 1)), axis=1))
+        amplitudes = torch.as_tensor(rng.standard_normal(300)) * (2 / 300) ** 0.5
+        value, gradient = features.sums(amplitudes, x, center, LENGTH, 1)
+        made.append(Patch(x, value, gradient, none.reshape(0, 3), none, none, none, none, center))
+    return made, features
+
+
+def noisy(patch: Patch, position: float, angle: float, rng: np.random.Generator) -> Patch:
+    """The same patch with noise of its values and gradients."""
+
+    def off(values: Tensor, deviation: float) -> Tensor:
+        return values + deviation * torch.as_tensor(rng.standard_normal(values.shape))
+
+    return replace(patch, value=off(patch.value, position), gradient=off(patch.gradient, angle))
+
+
+def test_log_density_is_that_of_a_normal_distribution(rng: np.random.Generator) -> None:
+    (patch,), features = patches(1, 12, rng)
+    kernel = data_kernel(patch, features, LENGTH, 0.7)
+    noise = torch.tensor([0.02**2] * 12 + [0.3**2] * 36, dtype=torch.float64)
+    whole = MultivariateNormal(torch.zeros(48, dtype=torch.float64), kernel + noise.diag())
+    seen = torch.cat([patch.value, patch.gradient.T.flatten()])
+    expected = float(whole.log_prob(seen)) + 24 * math.log(2 * math.pi)
+    assert log_density(patch, kernel, 0.02, 0.3) == pytest.approx(expected, rel=1e-9)
+    assert log_density(patch, -kernel, 1e-9, 1e-9) == -np.inf
+
+
+@pytest.mark.parametrize(("position", "angle"), [(0.01, 0.3), (0.3, 0.05), (0.1, 0.1), (0.4, 0.4)])
+def test_noise_is_found_again(position: float, angle: float, rng: np.random.Generator) -> None:
+    exact, features = patches(6, 60, rng)
+    drawn = [noisy(patch, position * RADIUS, angle, rng) for patch in exact]
+    found = Evidence(drawn, features, RADIUS, "cpu").noise(LENGTH)
+    # What the prior's size, which is not the functions' own, makes of it moves it by a place in the tables at most.
+    for value, wanted, table in ((found[0] / RADIUS, position, POSITIONS), (found[1], angle, ANGLES)):
+        nearest = int(np.argmin(np.abs(np.log(np.array(table) / wanted))))
+        assert table[max(nearest - 1, 0)] - 1e-9 <= value <= table[min(nearest + 1, len(table) - 1)] + 1e-9
+
+
+def test_exact_points_with_tilted_normals_are_believed(rng: np.random.Generator) -> None:
+    """Left-out points say little there, because the noise of their own normals hides what a fit adds to it."""
+    x = rng.standard_normal((1500, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    tilted = x + 0.3 * rng.standard_normal(x.shape)
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    # Left over are waves a tenth of the radius long, of which the normals tell nothing.
+    value = 0.01 * np.sin(20.0 * x[:, 0])
+    gradient = x + 0.2 * np.cos(20.0 * x[:, :1]) * np.array([1.0, 0.0, 0.0])
+    leftover = Leftover(x, tilted, value, gradient)
+    radius = leftover.density.radius
+    held = rng.random(1500) < 1 / 6
+    trials = Trials.draw(leftover, held, radius, rng, "cpu")
+    belief = trials.choice().best
+    assert belief.position <= 0.05 * radius
+    assert 0.17 <= belief.angle <= 0.4
+
+
+def test_few_points_and_estimated_normals_have_a_belief_too(rng: np.random.Generator) -> None:
+    x = rng.standard_normal((40, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    leftover = Leftover(x, x, 0.01 * x[:, 0], x)
+    assert len(x) < POINTS
+    held = np.arange(40) % 6 == 0
+    found = Trials.draw(leftover, held, leftover.density.radius, rng, "cpu").choice()
+    assert found.evident is not None
+    assert found.best == found.evident
+    of_estimated = Trials.draw(replace(leftover, estimated=True), held, leftover.density.radius, rng, "cpu").choice()
+    assert of_estimated.evident is None
+    assert of_estimated.best == of_estimated.belief
+
+
+def test_size_of_a_kernel(rng: np.random.Generator) -> None:
+    (patch,), features = patches(1, 200, rng)
+    kernel = data_kernel(patch, features, LENGTH, patch.size)
+    # The mean variance of its values is the square of the size that is taken for that of the patch's function.
+    assert float(kernel.diagonal()[:200].mean()) == pytest.approx(patch.size**2, rel=0.2)
+    assert patch.size == pytest.approx(SIZE * float(patch.value.square().mean().sqrt()))
