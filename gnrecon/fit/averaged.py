@@ -90,9 +90,11 @@ def told(
     if clean is not None:
         return Told(samples, leftover, clean)
     choice = trials.choice()
+    # Outliers that are left have no part in the noise that evidence tells.
+    plain = choice.belief if outliers else choice.best
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
-        return Told(samples, leftover, choice.best)
+        return Told(samples, leftover, plain)
 
     def with_kept(averaging: Averaging) -> Trials:
         points, normals = samples.points.copy(), samples.normals.copy()
@@ -103,7 +105,7 @@ def told(
 
     found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
     if found is None:
-        return Told(samples, leftover, choice.best)
+        return Told(samples, leftover, plain)
     averaging, better = found
     points, normals = averaging.of(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
