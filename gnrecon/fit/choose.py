@@ -5,6 +5,9 @@ several lengths and noises. The score of each is what the left-out points then s
 surface, |f| / (n . grad f), and how far the gradient there is from their normal n, as a height over the radius of the
 disk that a point stands for. The distance alone would not do: where noisy points are closer than they are exact, a
 field that is zero and flat around all of them has none.
+
+Left-out points are few, and have noise of their own. Where normals are given, all points tell the noise better, by its
+evidence (`evidence`), and the left-out ones choose the length for it.
 """
 
 from __future__ import annotations

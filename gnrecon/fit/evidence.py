@@ -104,7 +104,9 @@ def log_density(patch: Patch, kernel: Tensor, position: float, angle: float) -> 
     position, angle : standard deviations of the noise of positions, unit coordinates, and of normals, radians
     """
     count = len(patch.value)
-    noise = patch.value.new_tensor([position**2, angle**2]).repeat_interleave(torch.tensor([count, 3 * count]))
+    noise = torch.cat(
+        [patch.value.new_full((size,), deviation**2) for size, deviation in ((count, position), (3 * count, angle))]
+    )
     factor, failed = torch.linalg.cholesky_ex(kernel + noise.diag())
     if failed:
         return -np.inf
