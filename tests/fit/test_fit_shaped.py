@@ -78,14 +78,13 @@ def test_a_developable_can_is_whole_again() -> None:
 def test_strain_smooths() -> None:
     cloud = ball(700, ripple=0.03)
     strains, distances = [], []
-    for sdf in (fitted(cloud), fitted(cloud, smooth="strain=1e-3")):
+    for sdf in (fitted(cloud), fitted(cloud, smooth="strain=3e-4")):
         mean, gauss = bends(sdf, surface(sdf, cloud))
         strains.append(float(np.median(mean**2 - 2 * gauss)))
         distances.append(float(np.abs(sdf.sdf(cloud.points)).mean()))
     # A ball of radius one has a strain of two.
     assert abs(strains[1] - 2) < 0.5 * abs(strains[0] - 2)
-    # Without its ripples it is off by half their height at most.
-    assert distances[0] < distances[1] < 0.015
+    assert distances[0] < distances[1] < 0.01
 
 
 def test_the_same_again_is_the_same() -> None:
