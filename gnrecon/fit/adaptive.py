@@ -23,6 +23,7 @@ from gnrecon.fit.choose import Int, Mask
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.detail import CHOSEN, ShapingFor, fit_detail
 from gnrecon.fit.global_field import GlobalField, fit_global
+from gnrecon.fit.holes import Continued, continued
 from gnrecon.fit.large import LARGE, fit_large
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.outlying import outlying
@@ -51,13 +52,15 @@ class _Task:
     samples : of the scan, or of its faces continued to their edges
     held : mask of shape (N,), of samples that the global field does not see
     rows : of those that it sees
-    sharp : the faces, where they are continued
+    sharp : the faces, where they are continued to their edges
+    across : samples that were added across holes
     """
 
     samples: Samples
     held: Mask
     rows: Int
     sharp: Sharp | None
+    across: Continued
 
     @classmethod
     def of(cls, samples: Samples, by_blocks: bool, edges: bool, rng: np.random.Generator) -> _Task:
@@ -70,7 +73,21 @@ class _Task:
         out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
         held: Mask = np.zeros(len(samples), dtype=bool)
         held[order[:out]] = True
-        return cls(samples, held, np.sort(order[out:][:COARSE_POINTS]), sharp)
+        across = Continued.none() if sharp is None else sharp.across
+        return cls(samples, held, np.sort(order[out:][:COARSE_POINTS]), sharp, across)
+
+    def continued(self, rng: np.random.Generator) -> _Task:
+        """Return the task with samples across the holes; a scan whose faces are continued to their edges has them."""
+        across = Continued.none() if self.sharp else continued(self.samples.points, self.samples.normals)
+        if not len(across):
+            return self
+        points, normals = across.joined(self.samples.points, self.samples.normals)
+        held = np.concatenate([self.held, np.zeros(len(across), dtype=bool)])
+        # As many of them as of the points that are not held out.
+        share = len(self.rows) / max(len(self.samples) - int(self.held.sum()), 1)
+        seen = len(self.samples) + np.flatnonzero(rng.random(len(across)) < share)
+        rows = np.concatenate([self.rows, seen])
+        return _Task(replace(self.samples, points=points, normals=normals), held, rows, None, across)
 
     def without(self, off: Mask) -> _Task:
         """Return what is left without some samples, of a scan whose faces are not continued."""
@@ -78,7 +95,7 @@ class _Task:
         seen = np.zeros(len(off), dtype=bool)
         seen[self.rows] = True
         rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
-        return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None)
+        return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None, Continued.none())
 
     def told(self, sdf: NeuralSDF, options: FitOptions, rng: np.random.Generator, outliers: bool) -> Told:
         """Return what the samples tell beside a global field; `outliers` says whether some were found among them."""
@@ -100,7 +117,8 @@ def fit_adaptive(
     The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given; then a
     Dask cluster can solve them, too.
 
-    The faces of a sharp shape are continued to their edges first (`sharp`).
+    The faces of a sharp shape are continued to their edges first (`sharp`), and planes and cylinders of any across its
+    holes (`holes`).
 
     Normals that were estimated are turned around where a first field contradicts them, and points that lie off the
     surface of their neighbours are left out.
@@ -126,13 +144,17 @@ def fit_adaptive(
     if samples.estimated:
         samples, turned = reconciled(samples, task.rows, options)
         task = replace(task, samples=samples)
+    whole = task
+    closes = not options.regularisers  # which say themselves how holes are closed
+    task = task.continued(rng) if closes else task
     first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, 0.0, SHARE / 2))
     if not by_blocks:  # of so many points, distances alone tell the outliers
         off = outlying(first.sdf.sdf(samples.frame.to_world(samples.points)), Density(samples.points))
         left_out = int(off.sum())
         if left_out:
             samples = replace(samples, points=samples.points[~off], normals=samples.normals[~off])
-            task = _Task.of(samples, by_blocks, edges, rng) if task.sharp else task.without(off)
+            task = _Task.of(samples, by_blocks, edges, rng) if task.sharp else whole.without(off)
+            task = task.continued(rng) if closes else task
             first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, SHARE / 2, SHARE))
     sdf = first.sdf
     shape = None
@@ -156,7 +178,9 @@ def fit_adaptive(
     if known is not None and known.averaging is not None:
         also += f" Averaged noisy points over {known.averaging.width:g} of their disks' radii, where normals agree."
     if task.sharp is not None:
-        also += f" Continued faces to their edges by {len(task.samples) - len(samples)} samples."
+        also += f" Continued faces to their edges by {len(task.samples) - len(samples) - len(task.across)} samples."
+    if task.across.holes:
+        also += f" Continued planes and cylinders across {_holes(task.across.holes)} by {len(task.across)} samples."
     if task.sharp is None:
         beside = f"noise {chosen['position_noise']:.2g} in position and {chosen['angle_noise']:.2g} degrees in normals"
     else:
@@ -166,6 +190,10 @@ def fit_adaptive(
         f"length {chosen['length']:.3g}, {beside}.{also}{_asked(options)}"
     )
     return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
+
+
+def _holes(count: int) -> str:
+    return "one hole" if count == 1 else f"{count} holes"
 
 
 def _asked(options: FitOptions) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from gnrecon.cloud import Float, Samples
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.creases import Faces
+from gnrecon.fit.holes import Continued, continued
 from gnrecon.fit.patch import Belief
 from gnrecon.sampling import Density
 
@@ -59,10 +60,12 @@ class Sharp:
     ----------
     samples : of the scan first, which may be averaged, and then those that were added
     averaging : how they were averaged, or None
+    across : those that were added across holes
     """
 
     samples: Samples
     averaging: Averaging | None
+    across: Continued
 
     @property
     def belief(self) -> Belief:
@@ -87,11 +90,15 @@ class Sharp:
             faces = Faces(points, normals)
         if faces.roughness > SMOOTH or not _sharp(faces):
             return None
+        across = continued(points, normals)
+        if len(across):
+            points, normals = across.joined(points, normals)
+            faces = Faces(points, normals)
         more, their_normals, agreed = faces.more()
         if agreed < AGREED:
             return None
         joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])
-        return cls(replace(samples, points=joined[0], normals=joined[1]), averaging)
+        return cls(replace(samples, points=joined[0], normals=joined[1]), averaging, across)
 
 
 def _sharp(faces: Faces) -> bool:

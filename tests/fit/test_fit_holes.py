@@ -1,0 +1,211 @@
+"""Planes and cylinders found among points, minimal cuts, and faces continued across holes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.fit import FitOptions, fit
+from gnrecon.fit.holes import _shut_away, continued
+from gnrecon.fit.min_cut import minimal_inside
+from gnrecon.fit.primitives import Cylinder, Plane, agreed, surfaces
+
+SIDE = 0.6
+HEIGHT, BORE = 0.25, 0.4
+
+
+def cube(count: int, seed: int = 0) -> tuple[Float, Float]:
+    rng = np.random.default_rng(seed)
+    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
+    x, normals = rng.uniform(-SIDE, SIDE, (count, 3)), np.zeros((count, 3))
+    x[rows, axis] = SIDE * side
+    normals[rows, axis] = side
+    return x, normals
+
+
+def ball(count: int) -> tuple[Float, Float]:
+    x = np.random.default_rng(0).standard_normal((count, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return SIDE * x, x
+
+
+def bored(count: int, seed: int = 0) -> tuple[Float, Float]:
+    """Draw points of a square plate with a round bore through it."""
+    rng = np.random.default_rng(seed)
+    areas = np.array([2 * (4 * SIDE**2 - np.pi * BORE**2), 16 * SIDE * HEIGHT, 4 * np.pi * BORE * HEIGHT])
+    faces, rim, wall = rng.multinomial(count, areas / areas.sum())
+    x = rng.uniform(-SIDE, SIDE, (9 * faces, 3))
+    x = x[np.hypot(x[:, 0], x[:, 1]) > BORE][:faces]
+    normals = np.zeros_like(x)
+    normals[:, 2] = rng.choice([-1.0, 1.0], len(x))
+    x[:, 2] = HEIGHT * normals[:, 2]
+    angle = rng.uniform(0, 2 * np.pi, wall)
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(wall)], axis=1)
+    inner = BORE * around + [0, 0, 1] * rng.uniform(-HEIGHT, HEIGHT, (wall, 1))
+    outer, theirs = rng.uniform(-SIDE, SIDE, (rim, 3)), np.zeros((rim, 3))
+    outer[:, 2] *= HEIGHT / SIDE
+    side, axis = rng.choice([-1.0, 1.0], rim), rng.integers(2, size=rim)
+    theirs[np.arange(rim), axis] = side
+    outer[np.arange(rim), axis] = SIDE * side
+    return np.concatenate([x, inner, outer]), np.concatenate([normals, -around, theirs])
+
+
+def off_cube(x: Float) -> Float:
+    outside = np.abs(x) - SIDE
+    off: Float = np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
+    return off
+
+
+def without(points: Float, normals: Float, middle: list[float], reach: float) -> tuple[Float, Float]:
+    kept = np.linalg.norm(points - middle, axis=1) > reach
+    return points[kept], normals[kept]
+
+
+def noisy(points: Float, normals: Float, noise: float, tilt: float) -> tuple[Float, Float]:
+    rng = np.random.default_rng(1)
+    turned = normals + tilt * rng.standard_normal(normals.shape)
+    return points + noise * rng.standard_normal(points.shape), turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def found(points: Float, normals: Float, radius: float, off: float) -> list[Plane | Cylinder]:
+    everything = np.ones(len(points), dtype=bool)
+    return [one.surface for one in surfaces(points, normals, everything, radius, off, np.random.default_rng(0))]
+
+
+def test_a_plane_and_a_bore_are_found_among_points_that_lie_on_neither() -> None:
+    rng = np.random.default_rng(2)
+    points, normals = noisy(*bored(4000), 0.002, 0.05)
+    strays = rng.uniform(-SIDE, SIDE, (200, 3)), rng.standard_normal((200, 3))
+    strays[1][:] /= np.linalg.norm(strays[1], axis=1, keepdims=True)
+    there = found(np.concatenate([points, strays[0]]), np.concatenate([normals, strays[1]]), 0.02, 0.008)
+    heights = sorted(
+        round(float(one.center[2]), 2) for one in there if isinstance(one, Plane) and abs(one.direction[2]) > 0.99
+    )
+    assert heights == [-HEIGHT, HEIGHT]
+    bores = [one for one in there if isinstance(one, Cylinder)]
+    assert len(bores) == 1
+    assert bores[0].side == -1.0
+    assert bores[0].radius == pytest.approx(BORE, abs=2e-3)
+    assert abs(bores[0].axis[2]) > 0.9999
+
+
+def test_a_ball_has_neither_planes_nor_cylinders() -> None:
+    assert found(*ball(3000), 0.022, 0.007) == []
+
+
+def test_a_cylinder_of_two_sides() -> None:
+    for side in (-1.0, 1.0):
+        one = Cylinder(np.array([0.1, 0.0, 5.0]), np.array([0.0, 0.0, 1.0]), 2.0, side)
+        x = np.array([[3.1, 0.0, -7.0], [0.1, 1.0, 2.0]])
+        np.testing.assert_allclose(one.at(x), side * np.array([1.0, -1.0]))
+        np.testing.assert_allclose(one.normal(x), side * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+        on = np.array([[2.2, 0.0, 0.0]])
+        assert agreed(one, on, one.normal(on), 0.2).all()
+        assert not agreed(one, on, -one.normal(on), 0.2).any()
+        assert not agreed(one, on, one.normal(on), 0.05).any()
+
+
+def corner(size: int, hidden: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cells of a box's corner, those known but for a cube about it, and signed distances of its faces."""
+    half = size // 2 - 0.5
+    at = np.stack(np.meshgrid(*[np.arange(size) - half] * 3, indexing="ij"), axis=-1)
+    inside = (at < 0).all(axis=-1)
+    known = np.where(inside, 1, -1)
+    known[(np.abs(at) < hidden).all(axis=-1)] = 0
+    return inside, known, at
+
+
+def test_a_minimal_cut_runs_along_faces_to_a_corner_and_without_them_takes_the_short_way() -> None:
+    inside, known, signed = corner(16, 5)
+    believed = np.ones(signed.shape, dtype=bool)
+    np.testing.assert_array_equal(minimal_inside(known, signed, believed), inside)
+    cut = minimal_inside(known, signed, ~believed)
+    assert 0 < (cut != inside).sum() < (known == 0).sum()
+    assert not (cut & ~inside).any()
+    assert not cut[7, 7, 7]
+
+
+def test_what_a_cut_shuts_away_is_told() -> None:
+    sides = np.zeros((12, 12, 12), dtype=bool)
+    seen = np.zeros_like(sides)
+    seen[5:8, 5:8, 5:8] = True
+    assert not _shut_away(sides, seen)
+    sides[3:10, 3:10, 3:10] = True
+    sides[5:8, 5:8, 5:8] = False
+    assert _shut_away(sides, seen)
+    sides[5:, 6, 6] = False
+    assert not _shut_away(sides, seen)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("middle", [[SIDE, SIDE, SIDE], [SIDE, SIDE, 0.1], [SIDE, 0.1, 0.0]])
+def test_faces_go_on_across_a_hole_to_edge_and_corner(middle: list[float], seed: int) -> None:
+    whole = cube(2500, seed)
+    points, normals = without(*whole, middle, 0.35)
+    across = continued(points, normals)
+    assert across.holes == 1
+    off = off_cube(across.points)
+    assert (off < 1e-9).mean() > 0.97
+    # They lie in the hole, and fill it.
+    hidden = whole[0][np.linalg.norm(whole[0] - middle, axis=1) < 0.3]
+    apart = np.linalg.norm(hidden[:, None] - across.points, axis=2).min(axis=1)
+    assert np.quantile(apart, 0.95) < 0.1
+    assert np.linalg.norm(across.points - middle, axis=1).max() < 0.45
+
+
+def test_the_samples_are_as_dense_as_the_scan() -> None:
+    whole = cube(4000)
+    across = continued(*without(*whole, [SIDE, 0.0, 0.0], 0.4))
+    missing = 4000 - len(without(*whole, [SIDE, 0.0, 0.0], 0.3)[0])
+    near = np.linalg.norm(across.points - [SIDE, 0.0, 0.0], axis=1) < 0.3
+    assert 0.5 < near.sum() / missing < 1.5
+
+
+def test_a_bore_of_which_a_part_was_seen_goes_on() -> None:
+    points, normals = noisy(*bored(9000), 0.002, 0.05)
+    on_wall = np.abs(np.hypot(points[:, 0], points[:, 1]) - BORE) < 0.01
+    hidden = on_wall & (points[:, 0] > -0.15) & (np.abs(points[:, 2]) < 0.18)
+    across = continued(points[~hidden], normals[~hidden])
+    assert across.holes
+    wall = np.abs(np.hypot(across.points[:, 0], across.points[:, 1]) - BORE) < 0.01
+    faces = np.abs(np.abs(across.points) - [SIDE, SIDE, HEIGHT]).min(axis=1) < 0.01
+    assert (wall | faces).mean() > 0.98
+    # They fill what was hidden of the wall, and leave its mouths open.
+    apart = np.linalg.norm(points[hidden][:, None] - across.points[wall], axis=2).min(axis=1)
+    assert np.quantile(apart, 0.95) < 0.06
+    assert not (np.hypot(across.points[:, 0], across.points[:, 1]) < BORE - 0.02).any()
+
+
+@pytest.mark.parametrize("scan", [cube(2500), ball(2000), without(*ball(2000), [SIDE, 0.0, 0.0], 0.3), cube(40)])
+def test_whole_shapes_and_round_ones_have_nothing_to_go_on(scan: tuple[Float, Float]) -> None:
+    across = continued(*scan)
+    assert len(across) == across.holes == 0
+
+
+def test_noise_is_no_hole_and_an_open_side_no_place_for_samples() -> None:
+    assert not len(continued(*noisy(*cube(2500), 0.01, 0.2)))
+    points, normals = cube(2500)
+    seen = points[:, 2] > -0.5 * SIDE
+    across = continued(points[seen], normals[seen])
+    assert across.points[:, 2].min(initial=0.0) > -1.05 * SIDE
+
+
+FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
+
+
+@pytest.mark.parametrize(("tilt", "most"), [(0.0, 0.01), (0.06, 0.02)])
+def test_a_fit_closes_a_corner_that_nobody_saw(tilt: float, most: float) -> None:
+    middle = [SIDE, SIDE, SIDE]
+    whole = cube(2500)
+    points, normals = noisy(*without(*whole, middle, 0.35), 0.002 if tilt else 0.0, tilt)
+    hidden = whole[0][np.linalg.norm(whole[0] - middle, axis=1) < 0.3]
+    sdf, solution = fit(Samples(points, normals, FRAME), FitOptions())
+    assert "Continued planes and cylinders across one hole" in solution.status
+    assert np.abs(sdf.sdf(FRAME.to_world(hidden))).mean() < most * FRAME.scale
+
+
+def test_a_smooth_scan_is_closed_as_before() -> None:
+    scan = without(*ball(800), [SIDE, 0.0, 0.0], 0.3)
+    _, solution = fit(Samples(*scan, FRAME), FitOptions())
+    assert "across" not in solution.status
