@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from gnrecon.cloud import Float
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.min_cut import minimal_inside, shifted
-from gnrecon.fit.primitives import Seen, Surface, surfaces
+from gnrecon.fit.primitives import Seen, Surface, planar_share, surfaces
 from gnrecon.sampling import Box, CoarseDistance, Density
 
 Int = npt.NDArray[np.integer]
@@ -34,8 +34,9 @@ PASSES, FEW = 3, 0.05
 """How often holes are looked for, as what was continued shows where other surfaces go on; and the share that a pass
 must add for another."""
 
-FEWEST = 50
-"""Points below which nothing is said."""
+FEWEST, MADE = 50, 0.2
+"""Points below which nothing is said, and the least share of them on planes where a shape is a made one: 0.4 to 1 on
+machine parts, 0.1 at most on statues and castings of free form."""
 
 STEP, MARGIN = 2.0, 0.1
 """Cell of the lattice in which holes are looked for, in radii of a disk, and how far it reaches beyond the points."""
@@ -123,7 +124,10 @@ def _once(points: Float, normals: Float, rng: np.random.Generator) -> Continued:
     rows, closer = np.sort(drawn[:MOST_POINTS]), np.sort(drawn[:CLOSER])
     scan = _Scan.of(points[rows], normals[rows], points[closer], normals[closer], rng)
     spacing = SPACING * scan.density.radius * np.sqrt(len(rows) / len(points))
-    found = [some for places in scan.holes() if len((some := scan.across(places, spacing, rng))[0])]
+    holes = scan.holes()
+    if not holes or not scan.made(rng):
+        return Continued.none()
+    found = [some for places in holes if len((some := scan.across(places, spacing, rng))[0])]
     if not found:
         return Continued.none()
     samples, theirs = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
@@ -152,6 +156,15 @@ class _Scan:
         coarse = CoarseDistance(points, normals, rng, density)
         return cls(points, normals, closer, their_normals, density, coarse)
 
+    def made(self, rng: np.random.Generator) -> bool:
+        """Return whether the shape is one of planes at large, and not of a few that a grown one has by chance."""
+        radius = self.density.radius
+        return planar_share(self.points, self.normals, radius, self._off(radius), rng) > MADE
+
+    def _off(self, radius: float) -> float:
+        """Return how far off a surface its points lie at most, as disks of a radius tell."""
+        return radius * float(np.clip(NOISE * self.roughness, *OFF))
+
     def holes(self) -> list[Float]:
         """Return places within each hole, of shape (K, 3), the largest hole first."""
         box = Box.around(self.points, MARGIN)
@@ -171,8 +184,8 @@ class _Scan:
         distance = hole.query(self.closer)[0] / radius
         around = distance < AROUND
         disk = radius * float(np.sqrt(len(self.points) / len(self.closer)))
-        off = disk * float(np.clip(NOISE * self.roughness, *OFF))
-        faces = surfaces(self.closer[around], self.their_normals[around], distance[around] < TOUCH, disk, off, rng)
+        asked = distance[around] < TOUCH
+        faces = surfaces(self.closer[around], self.their_normals[around], asked, disk, self._off(disk), rng)
         faces = [face for face in faces if (hole.query(face.points)[0] < TOUCH * radius).sum() >= TOUCHING]
         lower, upper = places.min(axis=0) - ROOM * radius, places.max(axis=0) + ROOM * radius
         size = max(float((upper - lower).max()) / CELLS, FINEST * radius)

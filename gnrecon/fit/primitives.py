@@ -172,6 +172,13 @@ def surfaces(
     return found if any(isinstance(one.surface, Plane) for one in found) else []
 
 
+def planar_share(points: Float, normals: Float, radius: float, off: float, rng: np.random.Generator) -> float:
+    """Return the share of oriented points that lie on planes; the parameters are those of `surfaces`."""
+    search, everything = _Search(points, normals, radius, off, rng), np.arange(len(points))
+    found, _ = search.taken(everything, search.planes(everything))
+    return sum(len(one.points) for one in found) / max(len(points), 1)
+
+
 def agreed(surface: Surface, points: Float, normals: Float, off: float) -> Mask:
     """Return which points, of shape (N, 3), lie on a surface: no farther off it, and by their normals."""
     on = np.abs(surface.at(points)) < off
@@ -196,15 +203,15 @@ class _Search:
         left: Int = np.arange(len(self.points))
         for _ in range(ROUNDS):
             if len(left) >= LEAST:
-                taken, left = self._taken(left, self._planes(left[asked[left]]) + self._cylinders(left, asked[left]))
+                taken, left = self.taken(left, self.planes(left[asked[left]]) + self._cylinders(left, asked[left]))
                 found += taken
         return found
 
     def has_planes(self, asked: Mask) -> bool:
         """Return whether points, by a mask of shape (N,), propose planes that hold."""
-        return bool(self._taken(np.arange(len(self.points)), self._planes(np.flatnonzero(asked)))[0])
+        return bool(self.taken(np.arange(len(self.points)), self.planes(np.flatnonzero(asked)))[0])
 
-    def _planes(self, rows: Int) -> list[Plane | Cylinder]:
+    def planes(self, rows: Int) -> list[Plane | Cylinder]:
         """Return the planes of some points whose neighbours lie on them."""
         beside = list(range(2, BESIDE + 2))
         _, near = self._density.tree.query(self.points[rows], beside, distance_upper_bound=NEAR * self.radius)
@@ -239,7 +246,7 @@ class _Search:
         proper = np.flatnonzero((size > ROUND * self.radius) & (size < STRAIGHT * self.radius))
         return [Cylinder(center[k], axis[k], float(size[k]), float(-np.sign(reach[k]))) for k in proper]
 
-    def _taken(self, rows: Int, proposed: list[Plane | Cylinder]) -> tuple[list[Seen], Int]:
+    def taken(self, rows: Int, proposed: list[Plane | Cylinder]) -> tuple[list[Seen], Int]:
         """Return those of the proposed surfaces that hold, the largest first, and which of the rows are left."""
         found: list[Seen] = []
         points, normals = self.points[rows], self.normals[rows]
