@@ -28,14 +28,14 @@ ANGLE = 10.0
 LEAST, MOST = 12, 12
 """Least points of a surface, and most surfaces of a kind."""
 
-FLAT, BESIDE, NEAR = 0.5, 12, 3.0
+FLAT, BESIDE, NEAR = 0.3, 12, 3.0
 """Share of a point's neighbours that lie on its plane where there is one; how many are asked, and how near they are,
 in radii of a disk."""
 
 FITS, FITTED = 6, 60
 """How often a surface is fitted at most, while more points agree with it, and most evaluations of a cylinder's fit."""
 
-ROUNDS, PROPOSALS, APART = 2, 400, 16.0
+ROUNDS, PROPOSALS, APART = 3, 400, 16.0
 """How often surfaces are proposed by what is left then, the most proposals of a kind, and how far two points are that
 propose one, in radii of a disk."""
 

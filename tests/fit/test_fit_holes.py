@@ -183,6 +183,15 @@ def test_whole_shapes_and_round_ones_have_nothing_to_go_on(scan: tuple[Float, Fl
     assert len(across) == across.holes == 0
 
 
+def test_a_round_shape_with_one_flat_side_is_not_continued() -> None:
+    """Across a hole in its flat side a plane would go on; but what else is flat about it?"""
+    points, normals = ball(4000)
+    below = points[:, 2] < -0.8 * SIDE
+    points[below, 2], normals[below] = -0.8 * SIDE, [0.0, 0.0, -1.0]
+    assert 0.05 < below.mean() < 0.15
+    assert not len(continued(*without(points, normals, [0.0, 0.0, -0.8 * SIDE], 0.2)))
+
+
 def test_noise_is_no_hole_and_an_open_side_no_place_for_samples() -> None:
     assert not len(continued(*noisy(*cube(2500), 0.01, 0.2)))
     points, normals = cube(2500)
