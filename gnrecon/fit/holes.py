@@ -38,8 +38,9 @@ FEWEST, MADE = 50, 0.2
 """Points below which nothing is said, and the least share of them on planes where a shape is a made one: 0.4 to 1 on
 machine parts, 0.1 at most on statues and castings of free form."""
 
-STEP, MARGIN = 2.0, 0.1
-"""Cell of the lattice in which holes are looked for, in radii of a disk, and how far it reaches beyond the points."""
+STEP, MOST_CELLS, MARGIN = 2.0, 500_000, 0.1
+"""Cell of the lattice in which holes are looked for, in radii of a disk, about how many cells it has at most, and how
+far it reaches beyond the points."""
 
 FAR, DOUBTFUL = 3.0, 0.3
 """How far the points are from a hole, in radii of a disk, and its winding number from one half."""
@@ -72,8 +73,8 @@ WIDTH = 3.5
 UNSEEN = 2.0
 """How far from all points a sample is, in radii of a disk."""
 
-SPACING = 2.0
-"""Distance of samples, in radii of a scanned point's disk: as dense as those."""
+SPACING, MOST_ALONG = 2.0, 24
+"""Distance of samples, in radii of a scanned point's disk: as dense as those; and most of them along a cell's side."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,9 @@ class _Scan:
     def holes(self) -> list[Float]:
         """Return places within each hole, of shape (K, 3), the largest hole first."""
         box = Box.around(self.points, MARGIN)
-        lattice = _lattice(box.lower, box.upper, STEP * self.density.radius)
+        # Where most points crowd, their disks would ask for a lattice without end.
+        least = float(np.prod(box.upper - box.lower) / MOST_CELLS) ** (1 / 3)
+        lattice = _lattice(box.lower, box.upper, max(STEP * self.density.radius, least))
         places = lattice.reshape(-1, 3)
         known, _, _ = self.coarse.size(places, FAR)
         doubtful = np.zeros(len(places), dtype=bool)
@@ -187,13 +190,13 @@ class _Scan:
         asked = distance[around] < TOUCH
         faces = surfaces(self.closer[around], self.their_normals[around], asked, disk, self._off(disk), rng)
         faces = [face for face in faces if (hole.query(face.points)[0] < TOUCH * radius).sum() >= TOUCHING]
+        if not faces:
+            return np.zeros((0, 3)), np.zeros((0, 3))
         lower, upper = places.min(axis=0) - ROOM * radius, places.max(axis=0) + ROOM * radius
         size = max(float((upper - lower).max()) / CELLS, FINEST * radius)
         lattice = _lattice(lower, upper, size)
         cells = lattice.reshape(-1, 3)
-        signed = np.stack([face.surface.at(cells) for face in faces], axis=1) if faces else np.zeros((len(cells), 0))
-        if not faces:
-            return np.zeros((0, 3)), np.zeros((0, 3))
+        signed = np.stack([face.surface.at(cells) for face in faces], axis=1)
         believed = np.stack([_reached(face, cells, radius) for face in faces], axis=1)
         shape = lattice.shape[:3]
         known = self._known(cells, shape).reshape(shape)
@@ -266,7 +269,8 @@ def _along(
     cells, inner_cells = lattice.reshape(-1, 3), inside.ravel()
     numbers = np.arange(len(cells)).reshape(inside.shape)
     start, end, spread = [], [], []
-    fine = (np.arange(share := max(1, round(size / spacing))) + 0.5) / share - 0.5
+    share = min(max(1, round(size / spacing)), MOST_ALONG)
+    fine = (np.arange(share) + 0.5) / share - 0.5
     for axis in range(3):
         one, other = shifted(numbers, tuple(int(axis == k) for k in range(3)))
         across = np.zeros((share, share, 3))
@@ -284,10 +288,8 @@ def _along(
         some = some - face.at(some)[:, None] * face.normal(some)
         turned = face.normal(some)
         # Beyond an edge the cut goes on along another face: there both sides of this one are outside, or both inside.
-        kept = _sides(inside, lattice, size, some - size * turned) & ~_sides(
-            inside, lattice, size, some + size * turned
-        )
-        some, turned = some[kept], turned[kept]
+        below, above = (_sides(inside, lattice, size, some + by * size * turned) for by in (-1, 1))
+        some, turned = some[below & ~above], turned[below & ~above]
         _, first = np.unique(np.floor(some / spacing), axis=0, return_index=True)
         points.append(some[first])
         normals.append(turned[first])

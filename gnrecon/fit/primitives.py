@@ -26,7 +26,7 @@ ANGLE = 10.0
 """Degrees between a point's normal and the surface's that it lies on, at most."""
 
 LEAST, MOST = 12, 12
-"""Least points of a surface, and most surfaces of a kind."""
+"""Least points of a surface, and most surfaces of a round of proposals."""
 
 FLAT, BESIDE, NEAR = 0.3, 12, 3.0
 """Share of a point's neighbours that lie on its plane where there is one; how many are asked, and how near they are,
@@ -252,10 +252,10 @@ class _Search:
         points, normals = self.points[rows], self.normals[rows]
         agreeing = np.array([agreed(one, points, normals, self.off) for one in proposed])
         agreeing = agreeing.reshape(len(proposed), len(rows))
-        round_ones = np.array([isinstance(one, Cylinder) for one in proposed], dtype=bool)
-        free, open_ones = np.ones(len(rows), dtype=bool), np.ones(len(proposed), dtype=bool)
-        while open_ones.any() and len(found) < MOST:
-            count = np.where(open_ones, (agreeing & free).sum(axis=1), 0)
+        cylinders = np.array([isinstance(one, Cylinder) for one in proposed], dtype=bool)
+        free, wanted = np.ones(len(rows), dtype=bool), np.ones(len(proposed), dtype=bool)
+        while wanted.any() and len(found) < MOST:
+            count = np.where(wanted, (agreeing & free).sum(axis=1), 0)
             best = int(np.argmax(count))
             if count[best] < LEAST:
                 break
@@ -270,8 +270,8 @@ class _Search:
             # What mostly agrees with what is settled is no proposal any more; what no cylinder fits may be a plane.
             like = on if holds else agreeing[best] & free
             settled = (agreeing & like).sum(axis=1) >= SETTLED * count
-            open_ones &= ~(settled & (holds | (round_ones == round_ones[best])))
-            open_ones[best] = False
+            wanted &= ~(settled & (holds | (cylinders == cylinders[best])))
+            wanted[best] = False
             if holds:
                 found.append(Seen(surface, points[on]))
                 free &= ~on

@@ -192,6 +192,13 @@ def test_a_round_shape_with_one_flat_side_is_not_continued() -> None:
     assert not len(continued(*without(points, normals, [0.0, 0.0, -0.8 * SIDE], 0.2)))
 
 
+def test_points_that_crowd_in_a_corner_make_no_lattice_without_end() -> None:
+    points, normals = cube(3000)
+    crowd = np.random.default_rng(3).uniform(0.0, 1e-4, (4000, 3)) * [1, 1, 0] + [0.1, 0.1, SIDE]
+    up = np.tile([0.0, 0.0, 1.0], (len(crowd), 1))
+    assert len(continued(np.concatenate([points, crowd]), np.concatenate([normals, up]))) < 3000
+
+
 def test_noise_is_no_hole_and_an_open_side_no_place_for_samples() -> None:
     assert not len(continued(*noisy(*cube(2500), 0.01, 0.2)))
     points, normals = cube(2500)
