@@ -30,7 +30,7 @@ Mask = npt.NDArray[np.bool_]
 MOST_POINTS, CLOSER = 6000, 15_000
 """Points that are looked at for holes, and for surfaces; holes that so many do not show are small."""
 
-PASSES, FEW = 5, 0.05
+PASSES, FEW = 3, 0.05
 """How often holes are looked for, as what was continued shows where other surfaces go on; and the share that a pass
 must add for another."""
 

@@ -35,7 +35,7 @@ in radii of a disk."""
 FITS, FITTED = 6, 60
 """How often a surface is fitted at most, while more points agree with it, and most evaluations of a cylinder's fit."""
 
-ROUNDS, PROPOSALS, APART = 3, 400, 16.0
+ROUNDS, PROPOSALS, APART = 3, 200, 16.0
 """How often surfaces are proposed by what is left then, the most proposals of a kind, and how far two points are that
 propose one, in radii of a disk."""
 
@@ -153,9 +153,7 @@ class Seen:
 def surfaces(
     points: Float, normals: Float, asked: Mask, radius: float, off: float, rng: np.random.Generator
 ) -> list[Seen]:
-    """Return planes and cylinders of oriented points, none where no plane is among them.
-
-    A bore ends in faces; on a shape without any, what bends as a cylinder does is none.
+    """Return planes and cylinders of oriented points.
 
     Parameters
     ----------
@@ -167,9 +165,7 @@ def surfaces(
     """
     if len(points) <= BESIDE:
         return []
-    search = _Search(points, normals, radius, off, rng)
-    found = search.surfaces(asked) if search.has_planes(asked) else []
-    return found if any(isinstance(one.surface, Plane) for one in found) else []
+    return _Search(points, normals, radius, off, rng).surfaces(asked)
 
 
 def planar_share(points: Float, normals: Float, radius: float, off: float, rng: np.random.Generator) -> float:
@@ -206,10 +202,6 @@ class _Search:
                 taken, left = self.taken(left, self.planes(left[asked[left]]) + self._cylinders(left, asked[left]))
                 found += taken
         return found
-
-    def has_planes(self, asked: Mask) -> bool:
-        """Return whether points, by a mask of shape (N,), propose planes that hold."""
-        return bool(self.taken(np.arange(len(self.points)), self.planes(np.flatnonzero(asked)))[0])
 
     def planes(self, rows: Int) -> list[Plane | Cylinder]:
         """Return the planes of some points whose neighbours lie on them."""

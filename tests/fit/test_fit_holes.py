@@ -9,7 +9,7 @@ from gnrecon.cloud import Float, Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.holes import _shut_away, continued
 from gnrecon.fit.min_cut import minimal_inside
-from gnrecon.fit.primitives import Cylinder, Plane, agreed, surfaces
+from gnrecon.fit.primitives import Cylinder, Plane, agreed, planar_share, surfaces
 
 SIDE = 0.6
 HEIGHT, BORE = 0.25, 0.4
@@ -90,8 +90,16 @@ def test_a_plane_and_a_bore_are_found_among_points_that_lie_on_neither() -> None
     assert abs(bores[0].axis[2]) > 0.9999
 
 
-def test_a_ball_has_neither_planes_nor_cylinders() -> None:
-    assert found(*ball(3000), 0.022, 0.007) == []
+def test_the_share_on_planes_tells_made_shapes_from_grown_ones() -> None:
+    def share(points: Float, normals: Float) -> float:
+        return planar_share(points, normals, 0.022, 0.007, np.random.default_rng(0))
+
+    assert share(*ball(3000)) == 0.0
+    assert share(*cube(3000)) > 0.99
+    points, normals = bored(3000)
+    on_planes = np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-9
+    # Planes take strips off the bore, too.
+    assert on_planes.mean() - 0.02 < share(points, normals) < 0.95
 
 
 def test_a_cylinder_of_two_sides() -> None:
@@ -175,6 +183,21 @@ def test_a_bore_of_which_a_part_was_seen_goes_on() -> None:
     apart = np.linalg.norm(points[hidden][:, None] - across.points[wall], axis=2).min(axis=1)
     assert np.quantile(apart, 0.95) < 0.06
     assert not (np.hypot(across.points[:, 0], across.points[:, 1]) < BORE - 0.02).any()
+
+
+def test_the_side_of_a_can_goes_on() -> None:
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, 1500), rng.uniform(-0.7, 0.7, 1500)
+    side = np.stack([np.cos(angle), np.sin(angle), np.zeros(1500)], axis=1)
+    lid = rng.uniform(-0.4, 0.4, (900, 3))
+    lid = lid[np.hypot(lid[:, 0], lid[:, 1]) < 0.4]
+    up = np.where(rng.random((len(lid), 1)) < 0.5, -1.0, 1.0) * [0.0, 0.0, 1.0]
+    points = np.concatenate([0.4 * side + height[:, None] * [0, 0, 1], lid * [1, 1, 0] + 0.7 * up])
+    across = continued(*without(points, np.concatenate([side, up]), [0.4, 0.0, 0.0], 0.3))
+    assert across.holes == 1
+    assert len(across) > 20
+    np.testing.assert_allclose(np.hypot(across.points[:, 0], across.points[:, 1]), 0.4, atol=1e-9)
+    assert np.abs(across.points[:, 2]).max() < 0.4
 
 
 @pytest.mark.parametrize("scan", [cube(2500), ball(2000), without(*ball(2000), [SIDE, 0.0, 0.0], 0.3), cube(40)])
