@@ -49,7 +49,7 @@ class _Task:
 
     Parameters
     ----------
-    samples : of the scan, or of its faces continued to their edges
+    samples : of the scan, and those that continue its faces to their edges and across holes
     held : mask of shape (N,), of samples that the global field does not see
     rows : of those that it sees
     sharp : the faces, where they are continued to their edges

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from gnrecon.cloud import Float
+from gnrecon.fit.primitives import cosine_of
 from gnrecon.sampling import Density
 
 Int = npt.NDArray[np.integer]
@@ -100,7 +101,7 @@ class Faces:
     @cached_property
     def on_faces(self) -> Mask:
         """Which points lie on a face with some of their neighbours, of shape (N,); outliers do not."""
-        face = self._close & (self.cosine > _cos(ONE_FACE))
+        face = self._close & (self.cosine > cosine_of(ONE_FACE))
         alike = face.sum(axis=1)
         rough = np.where(face, np.abs(self.height), 0.0).sum(axis=1) / np.maximum(alike, 1)
         on_faces: Mask = (alike >= LEAST_FACE) & (rough < FLAT * self.disks)
@@ -123,7 +124,7 @@ class Faces:
     def _within(self) -> Mask:
         """Which neighbours are near and of one face, of shape (N, k)."""
         apart = (self.distance > 0) & (self.distance < WITHIN * self.disks[:, None])
-        near: Mask = apart & (self.cosine > _cos(BETWEEN))
+        near: Mask = apart & (self.cosine > cosine_of(BETWEEN))
         return near
 
     @cached_property
@@ -147,7 +148,7 @@ class Faces:
     def towards_edges(self) -> tuple[Float, Float, Float, float]:
         """Return samples near edges, normals, disks of the points continued to them, and the share that is kept."""
         # Both points are in front of the other's plane, or both behind: else the faces do not meet between them.
-        turned = (self.cosine < _cos(APART)) & (self.cosine > _cos(OPPOSED))
+        turned = (self.cosine < cosine_of(APART)) & (self.cosine > cosine_of(OPPOSED))
         meet = self._close & turned & (self.height * self.own > 0)
         i, rank = np.nonzero(meet & self.on_faces[:, None] & self.on_faces[self.near])
         j = self.near[i, rank]
@@ -192,10 +193,10 @@ class Faces:
             points, like = np.concatenate([points, others[0]]), np.concatenate([like, others[1]])
         free = np.ones(len(samples), dtype=bool)
         row, col = _pairs(cKDTree(points), samples, apart * disks)
-        free[row[_dot(like[col], normals[row]) > _cos(OTHER_FACE)]] = False
+        free[row[_dot(like[col], normals[row]) > cosine_of(OTHER_FACE)]] = False
         samples, normals, disks = samples[free], normals[free], disks[free]
         row, col = _pairs(cKDTree(samples), samples, apart * disks) if len(samples) else (np.zeros(0, int),) * 2
-        clash = (row != col) & (_dot(normals[row], normals[col]) > _cos(OTHER_FACE))
+        clash = (row != col) & (_dot(normals[row], normals[col]) > cosine_of(OTHER_FACE))
         row, col = row[clash], col[clash]
         ends = np.searchsorted(row, np.arange(len(samples) + 1))
         kept = np.ones(len(samples), dtype=bool)
@@ -211,7 +212,7 @@ class Faces:
         first = order[at]
         chosen = np.full(len(self.points), -1)
         chosen[i[first]] = j[first]
-        other = order[_dot(self.normals[j[order]], self.normals[chosen[i[order]]]) < _cos(OTHER_FACE)]
+        other = order[_dot(self.normals[j[order]], self.normals[chosen[i[order]]]) < cosine_of(OTHER_FACE)]
         _, at = np.unique(i[other], return_index=True)
         return np.concatenate([first, other[at]])
 
@@ -221,13 +222,9 @@ class Faces:
         normal = self.normals[col]
         mine, others = _dot(normal, self.normals[i[row]]), _dot(normal, self.normals[j[row]])
         off = np.abs(_dot(self.points[col] - samples[row], self.normals[i[row]])) > OFF * self.disks[i[row]]
-        bad = (mine > _cos(ONE_FACE)) & off
-        bad |= (np.maximum(mine, others) < _cos(ONE_FACE)) & (np.maximum(mine, others) > _cos(APART))
+        bad = (mine > cosine_of(ONE_FACE)) & off
+        bad |= (np.maximum(mine, others) < cosine_of(ONE_FACE)) & (np.maximum(mine, others) > cosine_of(APART))
         return np.setdiff1d(np.arange(len(samples)), row[bad])
-
-
-def _cos(degrees: float) -> float:
-    return float(np.cos(np.radians(degrees)))
 
 
 def _dot(a: Float, b: Float) -> Float:

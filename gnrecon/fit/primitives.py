@@ -179,7 +179,7 @@ def agreed(surface: Surface, points: Float, normals: Float, off: float) -> Mask:
     """Return which points, of shape (N, 3), lie on a surface: no farther off it, and by their normals."""
     on = np.abs(surface.at(points)) < off
     turned: Float = np.einsum("kd,kd->k", surface.normal(points), normals)
-    agreeing: Mask = on & (turned > _cos(ANGLE))
+    agreeing: Mask = on & (turned > cosine_of(ANGLE))
     return agreeing
 
 
@@ -210,7 +210,7 @@ class _Search:
         absent = near == len(self.points)
         near = np.where(absent, 0, near)
         height = np.einsum("ikd,id->ik", self.points[near] - self.points[rows, None], self.normals[rows])
-        alike = np.einsum("ikd,id->ik", self.normals[near], self.normals[rows]) > _cos(ANGLE)
+        alike = np.einsum("ikd,id->ik", self.normals[near], self.normals[rows]) > cosine_of(ANGLE)
         flat = rows[((np.abs(height) < self.off) & alike & ~absent).mean(axis=1) >= FLAT]
         some = self.rng.choice(flat, min(PROPOSALS, len(flat)), replace=False)
         return [Plane(self.points[row], self.normals[row]) for row in some]
@@ -225,7 +225,7 @@ class _Search:
         second = np.array([self.rng.choice(sorted(near)) for near in found])
         n, m, beyond = normals[first], normals[second], points[second] - points[first]
         cosine = np.einsum("kd,kd->k", n, m)
-        wanted = (cosine < _cos(TURNED[0])) & (cosine > _cos(TURNED[1]))
+        wanted = (cosine < cosine_of(TURNED[0])) & (cosine > cosine_of(TURNED[1]))
         first, n, m, beyond = first[wanted], n[wanted], m[wanted], beyond[wanted]
         axis = np.cross(n, m)
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -280,7 +280,7 @@ class _Search:
         if int(on.sum()) < LEAST or (isinstance(surface, Cylinder) and _bend(normals[on]) < BENT):
             return False
         near = Density(points[on]).tree.query(points)[0] < ASIDE * self.radius
-        nearly = near & (np.einsum("kd,kd->k", surface.normal(points), normals) > _cos(NEARLY)) & ~on
+        nearly = near & (np.einsum("kd,kd->k", surface.normal(points), normals) > cosine_of(NEARLY)) & ~on
         most = TOUCHES[isinstance(surface, Cylinder)]
         return bool(nearly.sum() < most * on.sum())
 
@@ -296,5 +296,6 @@ def _bend(normals: Float) -> float:
     return float(np.degrees(np.arccos(cosine.min().clip(-1.0, 1.0))))
 
 
-def _cos(degrees: float) -> float:
+def cosine_of(degrees: float) -> float:
+    """Return the cosine of an angle in degrees."""
     return float(np.cos(np.radians(degrees)))
