@@ -242,6 +242,10 @@ UncertaintyOption = Annotated[
         rich_help_panel=MESH,
     ),
 ]
+KeepHandles = Annotated[
+    bool,
+    typer.Option("--keep-handles", help="Keep handles and tunnels that no points support.", rich_help_panel=MESH),
+]
 Remesh = Annotated[
     float | None,
     typer.Option(

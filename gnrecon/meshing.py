@@ -1,4 +1,4 @@
-"""From a fitted field to a mesh in file units: extract, drop what no data supports, project, refine, repair.
+"""From a fitted field to a mesh in file units: extract, drop what no data supports, project, refine, repair, cut.
 
 A reconstruction and `gnrecon mesh`, which meshes a saved field again, both do their meshing here.
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
-from gnrecon.export import SignedDistance, extract, project, refine, remove_stray, repair
+from gnrecon.export import SignedDistance, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.export.protocol import sdf_and_gradient
 from gnrecon.mesh import Mesh
@@ -57,7 +57,7 @@ class Meshed:
         Closed, with normals; `gnrecon.export.require_sound` has accepted it.
     fineness : Fineness
     actions : list of str
-        A sentence for each thing that was dropped, refined or repaired, and for what was asked of the fineness.
+        A sentence for each thing that was dropped, refined, repaired or cut, and for what was asked of the fineness.
     """
 
     mesh: Mesh
@@ -81,7 +81,8 @@ def mesh_field(
     field : MeshedField
     options : Options
     data : array of shape (N, 3), file units, or None
-        Points that the field was fitted to, which tell surface from sheets that were invented; with None all is kept.
+        Points that the field was fitted to, which tell surface from sheets and handles that were invented; with None
+        all is kept.
     bounds : array of shape (2, 3), file units, optional
         The box to mesh in; by default the field's own.
     stages : callable
@@ -108,8 +109,11 @@ def mesh_field(
             mesh, refined = refine(mesh, field, options.refine(), advance=advance)
     with stages("repair"):
         mesh, repaired = repair(mesh)
+        cut: list[str] = []
+        if data is not None and not options.keep_handles:
+            mesh, cut = remove_handles(mesh, data)
         fineness = measure_fineness(mesh, field, cells, box)
-    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *_said(fineness, options)])
+    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *_said(fineness, options)])
 
 
 def _extracted(

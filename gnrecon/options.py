@@ -84,6 +84,8 @@ class Options:
     max_error : float, file units, optional
         Distance from the field's surface that 99.9 % of face centres and edge midpoints are to stay within; the mesh is
         made finer until they do, up to 1,024 cells.
+    keep_handles : bool
+        Whether handles and tunnels that no points support stay, see `gnrecon.export.remove_handles`.
     trim : float or str, optional
         Distance from the nearest point beyond which the surface is cut off, in file units, in another unit as in
         ``"2mm"``, or in spacings of the points as in ``"3s"``; the mesh is then open. By default nothing is cut.
@@ -129,6 +131,7 @@ class Options:
     resolution: int | None = None
     edge_length: float | None = None
     max_error: float | None = None
+    keep_handles: bool = False
     trim: float | str | None = None
     remesh: float | None = None
     adaptive: bool = False

@@ -1,4 +1,4 @@
-"""From a field to a verified mesh: extract, project, refine, repair, verify, measure, draw, and attributes."""
+"""From a field to a verified mesh: extract, project, refine, repair, cut, verify, measure, draw, and attributes."""
 
 from gnrecon.export.ambient import vertex_sky
 from gnrecon.export.attribute import Attribute
@@ -9,6 +9,7 @@ from gnrecon.export.definitions import DISTANCES, Metrics
 from gnrecon.export.error import vertex_error
 from gnrecon.export.examine import Findings, examine
 from gnrecon.export.extract import extract
+from gnrecon.export.handles import remove_handles
 from gnrecon.export.invented import Invented, invented
 from gnrecon.export.lighten import lighten
 from gnrecon.export.metrics import measure
@@ -52,6 +53,7 @@ __all__ = [
     "quality",
     "refine",
     "remesh",
+    "remove_handles",
     "remove_stray",
     "render",
     "render_sheet",

@@ -1,0 +1,256 @@
+"""Drop handles and tunnels that no point supports.
+
+Where points are sparse or noisy, beside an edge or between two walls, a field may cross zero often, and its surface
+hangs together by necks and is pierced by tunnels that no scan could have told. A loop around such a neck or through
+such a tunnel does not take the surface apart, and is short beside the disks that points stand for. A real tunnel has
+points on its wall, and a real rod on its sides: the normals of the surface at the points near its loop go all around
+it. So a loop is dropped where these leave more than half of the circle bare and it is no longer than the rim of one
+disk, or five sixths and it is twice as long. The surface is cut along the loop, and both rims are closed by a cap: a
+neck is cut through, a tunnel closed at both ends, and the genus is one less. Then the caps and what lies around them,
+within the loop's length, are laid out smoothly.
+Sources: Guskov and Wood, Topological noise removal (2001); Kobbelt, Campagna, Vorsatz and Seidel, Interactive
+multi-resolution modeling on arbitrary meshes (1998), for the layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from gnrecon.cloud import Float
+from gnrecon.errors import MeshError
+from gnrecon.export.loops import Loop, short_loops
+from gnrecon.export.topology import Edges, Mask, corner_fans
+from gnrecon.export.verify import require_sound
+from gnrecon.mesh import Int, Mesh
+from gnrecon.sampling import Density
+
+RIM = 2 * np.pi
+"""Length of a disk's rim, in radii of it."""
+
+BARE = (1.0, np.pi), (2.0, 5 / 3 * np.pi)
+"""Lengths of loops that are dropped, at most, in rims, and how much of the circle their points must leave bare."""
+
+NEAR, UPON = 2.0, 0.7
+"""How near to a place and to the surface points lie that tell of it, in disks."""
+
+ASIDE, ALIKE = 0.7, 0.5
+"""Cosines: at most of a loop's axis and a normal that tells of it, at least of the normals of a place and a point."""
+
+AROUND = 8
+"""Points that a vertex is compared with."""
+
+STUB = 3.0
+"""Length of what is left of a neck, at most, in lengths of the loop."""
+
+ROUNDS, TOGETHER = 20, 24
+"""Times that loops are looked for, and loops that are cut at once: few enough for their words of 64 bits."""
+
+
+def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
+    """Cut handles and close tunnels that no points support.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        A closed, oriented 2-manifold.
+    points : array of shape (N, 3), units of the mesh
+        The cloud that the surface was fitted to.
+
+    Returns
+    -------
+    Mesh
+        The same mesh where there is none; a closed, oriented 2-manifold of as many components.
+    list of str
+        A sentence for what was done.
+    """
+    if len(points) < 2 or len(mesh.vertices) - len(mesh.faces) // 2 == 2:  # no handle at all
+        return mesh, []
+    support, rng = _Support(points), np.random.default_rng(0)
+    count, widest = 0, 0.0
+    sought = np.ones(len(mesh.vertices), dtype=bool)
+    for _ in range(ROUNDS):
+        disks = support.disks(mesh)
+        bare = support.bare(mesh, disks, short_loops(mesh, BARE[-1][0] * RIM * disks, sought, rng))
+        loops = _apart(mesh, bare)
+        cut = _without(mesh, loops, support)
+        if cut is None:
+            break
+        count, widest = count + len(loops), max(widest, *(loop.length for loop in loops))
+        # Those that are left lie near some that were found, which hid them or lay too near to be cut at once.
+        places = cKDTree(np.concatenate([mesh.vertices[loop.vertices] for loop in bare]))
+        mesh = cut
+        sought = places.query(mesh.vertices)[0] <= RIM * support.disks(mesh)
+    if not count:
+        return mesh, []
+    handles = "a handle or tunnel" if count == 1 else f"{count} handles or tunnels"
+    return mesh, [f"Removed {handles} that no points support, of up to {widest:.3g} around."]
+
+
+class _Support:
+    """What points tell of a surface.
+
+    Parameters
+    ----------
+    points : of shape (N, 3)
+    """
+
+    def __init__(self, points: Float) -> None:
+        self._density = Density(points)
+
+    def disks(self, mesh: Mesh) -> Float:
+        """Return the radius of the disk of the point nearest to each vertex, of shape (V,)."""
+        return np.asarray(self._density.disks[self._density.tree.query(mesh.vertices)[1]])
+
+    def lonely(self, mesh: Mesh) -> Mask:
+        """Return which vertices, of shape (V,), have no point near on a surface that looks as theirs does."""
+        vertex, upon = self._upon(mesh)
+        normals = mesh.vertex_normals()
+        away, near = self._density.tree.query(mesh.vertices, k=min(AROUND, len(vertex)))
+        looks = np.einsum("vi,vki->vk", normals, normals[vertex[near]])
+        held = (away < NEAR * self._density.disks[near]) & upon[near] & (looks > ALIKE)
+        return np.asarray(~held.any(axis=1))
+
+    def bare(self, mesh: Mesh, disks: Float, loops: Sequence[Loop]) -> list[Loop]:
+        """Return the loops that are short, and whose points leave more bare than they may."""
+        if not loops:
+            return []
+        vertex, upon = self._upon(mesh)
+        places, normals = cKDTree(mesh.vertices[vertex[upon]]), mesh.vertex_normals()[vertex[upon]]
+        kept = []
+        for loop in loops:
+            disk = float(disks[loop.vertices].mean())
+            limit = next((bare for length, bare in BARE if loop.length <= length * RIM * disk), None)
+            if limit is not None:
+                near = np.unique(np.concatenate(places.query_ball_point(mesh.vertices[loop.vertices], NEAR * disk)))
+                if _gap(mesh.vertices[loop.vertices], normals[near.astype(np.int64)]) > limit:
+                    kept.append(loop)
+        return kept
+
+    def _upon(self, mesh: Mesh) -> tuple[Int, Mask]:
+        """Return the vertex nearest to each point, and which points lie on the surface; both of shape (N,)."""
+        away, vertex = cKDTree(mesh.vertices).query(self._density.points)
+        return vertex, away < UPON * self._density.disks
+
+
+def _gap(ring: Float, normals: Float) -> float:
+    """Return the largest angle about a ring's axis into which no normal looks, of shapes (L, 3) and (N, 3)."""
+    arms = ring - ring.mean(axis=0)
+    axis = np.cross(arms, np.roll(arms, -1, axis=0)).sum(axis=0)
+    size = float(np.linalg.norm(axis))
+    if size == 0:
+        return 2 * np.pi
+    axis /= size
+    normals = normals[np.abs(normals @ axis) < ASIDE]
+    if not len(normals):
+        return 2 * np.pi
+    first = arms[0] - axis * (arms[0] @ axis)
+    angles = np.sort(np.arctan2(normals @ np.cross(axis, first), normals @ first))
+    return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())
+
+
+def _apart(mesh: Mesh, loops: Sequence[Loop]) -> list[Loop]:
+    """Return the shortest loops that have no neighbours in common and together do not take the surface apart."""
+    start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
+    table = csr_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(mesh.vertices),) * 2)
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    basis: list[int] = []
+    kept = []
+    for loop in loops:
+        word = loop.word
+        for one in basis:
+            word = min(word, word ^ one)
+        around = np.append(loop.vertices, table[loop.vertices].indices)
+        if word == 0 or used[around].any():
+            continue
+        used[around] = True
+        basis = sorted([*basis, word], reverse=True)
+        kept.append(loop)
+        if len(kept) == TOGETHER:
+            break
+    return kept
+
+
+def _without(mesh: Mesh, loops: Sequence[Loop], support: _Support) -> Mesh | None:
+    """Return the mesh cut along loops and closed again, or None where there are none, or it would not be sound."""
+    if not loops:
+        return None
+    closed, reach = _capped(mesh, loops)
+    smooth = _laid_out(closed, reach, support.lonely(closed))
+    try:
+        require_sound(smooth)
+    except MeshError:
+        return None
+    return smooth
+
+
+def _capped(mesh: Mesh, loops: Sequence[Loop]) -> tuple[Mesh, Float]:
+    """Return the mesh cut along loops and closed by fans, and the length of the loop of each fan, of shape (C,).
+
+    The fans' middles are the last vertices.
+    """
+    edges = Edges.of(mesh)
+    ends = edges.ends[edges.first]
+    size = len(mesh.vertices)
+    rings = [loop.vertices for loop in loops]
+    pairs = np.sort(np.concatenate([np.stack([ring, np.roll(ring, -1)], axis=1) for ring in rings]), axis=1)
+    cut = np.isin(ends[:, 0] * size + ends[:, 1], pairs[:, 0] * size + pairs[:, 1])
+    # What meets across an edge of a loop belongs to two fans from now on.
+    fans = corner_fans(mesh, replace(edges, count=np.where(cut, 1, edges.count)))
+    _, first, corners = np.unique(fans, return_index=True, return_inverse=True)
+    origin, faces = mesh.faces.reshape(-1)[first], corners.reshape(-1, 3)
+    vertices = mesh.vertices[origin]
+    opened = Edges.of(Mesh(vertices, faces))
+    half = opened.corner[opened.first[opened.count == 1]]
+    begin, end = faces.reshape(-1)[half], faces[half // 3, (half % 3 + 1) % 3]
+    links = csr_array((np.ones(len(half), dtype=bool), (begin, end)), shape=(len(vertices),) * 2)
+    _, cap = np.unique(connected_components(links, directed=False)[1][begin], return_inverse=True)
+    middles = np.stack([np.bincount(cap, column) for column in vertices[begin].T], axis=1) / np.bincount(cap)[:, None]
+    length = np.zeros(size)
+    for loop in loops:
+        length[loop.vertices] = loop.length
+    reach = np.zeros(len(middles))
+    reach[cap] = length[origin[begin]]
+    faces = np.concatenate([faces, np.column_stack([end, begin, len(vertices) + cap])])
+    normals = None if mesh.normals is None else np.concatenate([mesh.normals[origin], np.zeros_like(middles)])
+    return Mesh(np.concatenate([vertices, middles]), faces, normals), reach
+
+
+def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
+    """Return a mesh whose caps, and what lies around them, lie smoothly.
+
+    Of all layouts that keep the other vertices it has the least sum of squares of each vertex's offset from the mean of
+    its neighbours.
+
+    Parameters
+    ----------
+    mesh : whose last vertices are the middles of caps
+    reach : of shape (C,), how far around each cap vertices are laid out, along the surface
+    lonely : of shape (V,), which vertices no points support: what is left of a neck is laid out as a whole
+    """
+    size = len(mesh.vertices)
+    start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
+    away = np.linalg.norm(mesh.vertices[start] - mesh.vertices[end], axis=1)
+    paths = csr_array((away, (start, end)), shape=(size, size))
+    along = lonely[start] & lonely[end] | (np.maximum(start, end) >= size - len(reach))
+    stubs = csr_array((away[along], (start[along], end[along])), shape=(size, size))
+    free = np.zeros(size, dtype=bool)
+    for middle, length in zip(range(size - len(reach), size), reach, strict=True):
+        stub = np.flatnonzero(np.isfinite(dijkstra(stubs, indices=middle, limit=STUB * length)))
+        free |= np.isfinite(dijkstra(paths, indices=stub, limit=length, min_only=True))
+    means = csr_array((np.ones(len(start)), (start, end)), shape=(size, size))
+    offsets = diags_array(1.0 / means.sum(axis=1)) @ means - eye_array(size)
+    rows = np.flatnonzero(abs(offsets) @ free)
+    inner, outer = offsets[rows][:, np.flatnonzero(free)], offsets[rows][:, np.flatnonzero(~free)]
+    vertices = mesh.vertices.copy()
+    vertices[free] = splu((inner.T @ inner).tocsc()).solve(-(inner.T @ (outer @ vertices[~free])))
+    smooth = Mesh(vertices, mesh.faces)
+    if mesh.normals is None:
+        return smooth
+    return Mesh(vertices, mesh.faces, np.where(free[:, None], smooth.vertex_normals(), mesh.normals))
