@@ -126,8 +126,8 @@ def _one_view(
     ranges += scanner.noise * rng.standard_normal(ranges.shape)
     places = start + ranges[..., None] * rays
     normals = image_normals(places, rays, scanner.reach)
-    # NaN compares as false, so rays without a return or a normal go as well.
-    seen = -np.einsum("ijk,ijk->ij", normals, rays) >= np.cos(np.radians(scanner.grazing))
+    # NaN compares as false, so rays without a normal go as well; one without a return may have one, by its neighbours.
+    seen = np.isfinite(ranges) & (-np.einsum("ijk,ijk->ij", normals, rays) >= np.cos(np.radians(scanner.grazing)))
     wrong = seen & (rng.random(seen.shape) < scanner.outliers)
     places[wrong] += rng.uniform(-1.0, 1.0, (int(wrong.sum()), 1)) * rays[wrong]
     normals[wrong] = -rays[wrong]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array
@@ -46,7 +47,7 @@ ASIDE, ALIKE = 0.7, 0.5
 AROUND = 8
 """Points that a vertex is compared with."""
 
-STUB = 3.0
+STUB, BESIDE = 3.0, 0.3
 """Length of what is left of a neck, at most, in lengths of the loop."""
 
 ROUNDS, TOGETHER = 20, 24
@@ -111,11 +112,21 @@ class _Support:
     def lonely(self, mesh: Mesh) -> Mask:
         """Return which vertices, of shape (V,), have no point near on a surface that looks as theirs does."""
         vertex, upon = self._upon(mesh)
-        normals = mesh.vertex_normals()
         away, near = self._density.tree.query(mesh.vertices, k=min(AROUND, len(vertex)))
-        looks = np.einsum("vi,vki->vk", normals, normals[vertex[near]])
+        looks = np.abs(np.einsum("vi,vki->vk", mesh.vertex_normals(), self._normals[near]))
         held = (away < NEAR * self._density.disks[near]) & upon[near] & (looks > ALIKE)
         return np.asarray(~held.any(axis=1))
+
+    @cached_property
+    def _normals(self) -> Float:
+        """Normals of either sign of the planes of each point and those around it, of shape (N, 3).
+
+        The surface's own would not do: a point in the mouth of a tunnel lies nearest to the tunnel's wall.
+        """
+        points = self._density.points
+        around = points[self._density.tree.query(points, k=min(AROUND + 1, len(points)))[1]]
+        spread = around - around.mean(axis=1, keepdims=True)
+        return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0])
 
     def bare(self, mesh: Mesh, disks: Float, loops: Sequence[Loop]) -> list[Loop]:
         """Return the loops that are short, and whose points leave more bare than they may."""
@@ -218,8 +229,11 @@ def _capped(mesh: Mesh, loops: Sequence[Loop]) -> tuple[Mesh, Float]:
     reach = np.zeros(len(middles))
     reach[cap] = length[origin[begin]]
     faces = np.concatenate([faces, np.column_stack([end, begin, len(vertices) + cap])])
-    normals = None if mesh.normals is None else np.concatenate([mesh.normals[origin], np.zeros_like(middles)])
-    return Mesh(np.concatenate([vertices, middles]), faces, normals), reach
+    # A middle takes what is known of a vertex on its rim.
+    origin = np.append(origin, origin[begin[np.unique(cap, return_index=True)[1]]])
+    attributes = {name: values[origin] for name, values in mesh.attributes.items()}
+    normals = None if mesh.normals is None else mesh.normals[origin]
+    return Mesh(np.concatenate([vertices, middles]), faces, normals, attributes), reach
 
 
 def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
@@ -237,20 +251,24 @@ def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
     size = len(mesh.vertices)
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     away = np.linalg.norm(mesh.vertices[start] - mesh.vertices[end], axis=1)
+    caps = np.arange(size - len(reach), size)
+    loose = lonely.copy()
+    loose[mesh.faces[(mesh.faces >= caps[0]).any(axis=1)]] = True
+    along = loose[start] & loose[end]
     paths = csr_array((away, (start, end)), shape=(size, size))
-    along = lonely[start] & lonely[end] | (np.maximum(start, end) >= size - len(reach))
     stubs = csr_array((away[along], (start[along], end[along])), shape=(size, size))
     free = np.zeros(size, dtype=bool)
-    for middle, length in zip(range(size - len(reach), size), reach, strict=True):
-        stub = np.flatnonzero(np.isfinite(dijkstra(stubs, indices=middle, limit=STUB * length)))
-        free |= np.isfinite(dijkstra(paths, indices=stub, limit=length, min_only=True))
+    for cap, length in zip(caps, reach, strict=True):
+        free |= np.isfinite(dijkstra(stubs, indices=cap, limit=STUB * length))
+        free |= np.isfinite(dijkstra(paths, indices=cap, limit=BESIDE * length))
     means = csr_array((np.ones(len(start)), (start, end)), shape=(size, size))
     offsets = diags_array(1.0 / means.sum(axis=1)) @ means - eye_array(size)
     rows = np.flatnonzero(abs(offsets) @ free)
     inner, outer = offsets[rows][:, np.flatnonzero(free)], offsets[rows][:, np.flatnonzero(~free)]
     vertices = mesh.vertices.copy()
     vertices[free] = splu((inner.T @ inner).tocsc()).solve(-(inner.T @ (outer @ vertices[~free])))
-    smooth = Mesh(vertices, mesh.faces)
+    smooth = mesh.with_vertices(vertices)
     if mesh.normals is None:
         return smooth
-    return Mesh(vertices, mesh.faces, np.where(free[:, None], smooth.vertex_normals(), mesh.normals))
+    by_faces = Mesh(vertices, mesh.faces).vertex_normals()
+    return replace(smooth, normals=np.where(free[:, None], by_faces, mesh.normals))
