@@ -71,7 +71,7 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     list of str
         A sentence for what was done.
     """
-    if len(points) < 2 or len(mesh.vertices) - len(mesh.faces) // 2 == 2:  # no handle at all
+    if len(points) < 2:
         return mesh, []
     support, rng = _Support(points), np.random.default_rng(0)
     count, widest = 0, 0.0

@@ -58,6 +58,8 @@ NOISY: dict[str, Case] = {
     "gear, noise 0.5%, tilt 10": AnalyticScan("gear", 10_000, noise=0.005, tilt=10.0),
     "gyroid, noise 0.5%": AnalyticScan("gyroid", 10_000, noise=0.005),
     "gyroid, noise 1%, tilt 10": AnalyticScan("gyroid", 10_000, noise=0.01, tilt=10.0),
+    "stand, noise 0.5%, tilt 10": AnalyticScan("stand", 5000, noise=0.005, tilt=10.0),
+    "housing, noise 0.5%, tilt 10": AnalyticScan("housing", 5000, noise=0.005, tilt=10.0),
     "torus, outliers 5%": AnalyticScan("torus", 3000, outliers=0.05),
     "gear, outliers 5%": AnalyticScan("gear", 10_000, outliers=0.05),
 }
@@ -70,6 +72,8 @@ SPARSE: dict[str, Case] = {
     "gear, 1500 points": AnalyticScan("gear", 1500),
     "gyroid, 1500 points": AnalyticScan("gyroid", 1500),
     "gyroid, 1500 points, noise 0.5%": AnalyticScan("gyroid", 1500, noise=0.005),
+    "stand, 2000 points": AnalyticScan("stand", 2000),
+    "housing, 2000 points": AnalyticScan("housing", 2000),
     "torus, uneven": AnalyticScan("torus", 1000, uneven=30.0),
     "block, uneven, noise 0.25%": AnalyticScan("block", 2000, noise=0.0025, uneven=100.0),
     "sphere, hole": AnalyticScan("sphere", 1000, hole=0.5),

@@ -143,6 +143,27 @@ def _gear(m: Any) -> Any:
     return m.Manifold.extrude(section, 0.36).translate([0.0, 0.0, -0.18])
 
 
+def _stand(m: Any) -> Any:
+    """Three thin plates that meet at slanting angles: a foot with a notch, a back with a round hole, and a shelf."""
+    foot = m.Manifold.cube([1.2, 1.0, 0.05], True).translate([0.0, 0.0, -0.5])
+    back = m.Manifold.cube([0.05, 1.0, 1.0], True).rotate([0.0, 20.0, 0.0]).translate([0.1, 0.0, -0.05])
+    shelf = m.Manifold.cube([0.3, 1.0, 0.05], True).rotate([0.0, 20.0, 0.0]).translate([-0.05, 0.0, -0.25])
+    notch = m.Manifold.cube([0.5, 0.3, 0.3], True).translate([0.35, 0.0, -0.5])
+    hole = m.Manifold.cylinder(2.0, 0.15, 0.15, 96, True).rotate([0.0, 90.0, 0.0]).translate([0.0, 0.0, 0.1])
+    return m.Manifold.batch_boolean([foot, back, shelf], m.OpType.Add) - notch - hole
+
+
+def _housing(m: Any) -> Any:
+    """A box without a lid: bored posts in its four corners, a bored boss on its floor, a hole in two of its walls."""
+    solid = m.Manifold.cube([1.8, 1.4, 0.7], True) - m.Manifold.cube([1.6, 1.2, 0.7], True).translate([0.0, 0.0, 0.1])
+    for x, y in ((-0.65, -0.45), (-0.65, 0.45), (0.65, -0.45), (0.65, 0.45)):
+        solid += m.Manifold.cylinder(0.5, 0.13, 0.13, 96, True).translate([x, y, -0.1])
+        solid -= m.Manifold.cylinder(1.2, 0.06, 0.06, 96, True).translate([x, y, 0.0])
+    solid += m.Manifold.cylinder(0.3, 0.35, 0.35, 96, True).translate([0.0, 0.0, -0.2])
+    solid -= m.Manifold.cylinder(2.0, 0.2, 0.2, 96, True)
+    return solid - m.Manifold.cylinder(3.0, 0.12, 0.12, 96, True).rotate([90.0, 0.0, 0.0]).translate([0.3, 0.0, 0.1])
+
+
 SOLIDS = {
     "sphere": Solid(_zero_level(sphere), genus=0, function=sphere),
     "torus": Solid(_zero_level(torus), genus=1, function=torus),
@@ -150,4 +171,6 @@ SOLIDS = {
     "plate": Solid(_manifold(_plate), genus=0),
     "gear": Solid(_manifold(_gear), genus=6),
     "gyroid": Solid(_zero_level(gyroid), genus=10, function=gyroid),
+    "stand": Solid(_manifold(_stand), genus=1),
+    "housing": Solid(_manifold(_housing), genus=7),
 }
