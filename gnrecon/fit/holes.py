@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from gnrecon.cloud import Float
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.min_cut import minimal_inside, shifted
+from gnrecon.fit.mouths import mouths
 from gnrecon.fit.primitives import Seen, Surface, planar_share, surfaces
 from gnrecon.sampling import Box, CoarseDistance, Density
 
@@ -132,7 +133,8 @@ def _once(points: Float, normals: Float, rng: np.random.Generator) -> Continued:
     if not found:
         return Continued.none()
     samples, theirs = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    return Continued(samples, theirs, len(found))
+    kept = ~mouths(samples, theirs, points, normals)
+    return Continued(samples[kept], theirs[kept], len(found))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from gnrecon.cloud import Float, Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.holes import _shut_away, continued
 from gnrecon.fit.min_cut import minimal_inside
+from gnrecon.fit.mouths import mouths
 from gnrecon.fit.primitives import Cylinder, Plane, agreed, planar_share, surfaces
 
 SIDE = 0.6
@@ -183,6 +184,40 @@ def test_a_bore_of_which_a_part_was_seen_goes_on() -> None:
     apart = np.linalg.norm(points[hidden][:, None] - across.points[wall], axis=2).min(axis=1)
     assert np.quantile(apart, 0.95) < 0.06
     assert not (np.hypot(across.points[:, 0], across.points[:, 1]) < BORE - 0.02).any()
+
+
+def across_mouth(height: float) -> tuple[Float, Float]:
+    """Samples of a disk that shuts the bore of the plate."""
+    angle, away = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), [0.05, 0.15, 0.25, 0.35])
+    x = np.stack([away * np.cos(angle), away * np.sin(angle), np.full(angle.shape, height)], axis=-1).reshape(-1, 3)
+    return x, np.broadcast_to([0.0, 0.0, np.sign(height)], x.shape)
+
+
+def test_the_mouth_of_a_bore_whose_wall_was_seen_is_told() -> None:
+    points, normals = bored(6000)
+    seen = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > 0.05)
+    points, normals = points[seen], normals[seen]
+    for turn in (np.eye(3), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])):
+        shut, theirs = across_mouth(HEIGHT)
+        assert mouths(shut @ turn, theirs @ turn, points @ turn, normals @ turn).all()
+    # Of a wall that was seen at one end alone the other mouth knows nothing.
+    end = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > HEIGHT - 0.03)
+    assert mouths(*across_mouth(HEIGHT), points[end], normals[end]).all()
+    assert not mouths(*across_mouth(-HEIGHT), points[end], normals[end]).any()
+    assert mouths(np.zeros((0, 3)), np.zeros((0, 3)), points, normals).shape == (0,)
+
+
+def test_the_floor_of_a_blind_bore_and_a_face_without_one_are_no_mouths() -> None:
+    points, normals = bored(6000)
+    inner = np.hypot(points[:, 0], points[:, 1]) < BORE + 1e-6
+    floor, up = across_mouth(0.1)
+    above = ~inner | (points[:, 2] > 0.1)
+    assert not mouths(floor, up, points[above], normals[above]).any()
+    # A face with a hole that nobody saw has faces behind it, which look away from it.
+    x, out = cube(6000)
+    left, theirs = without(x, out, [0.0, 0.0, SIDE], 0.4)
+    patch, up = across_mouth(SIDE)
+    assert not mouths(patch, up, left, theirs).any()
 
 
 def test_the_side_of_a_can_goes_on() -> None:
