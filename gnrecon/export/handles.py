@@ -6,8 +6,8 @@ such a tunnel does not take the surface apart, and is short beside the disks tha
 points on its wall, and a real rod on its sides: the normals of the surface at the points near its loop go all around
 it. So a loop is dropped where these leave more than half of the circle bare and it is no longer than the rim of one
 disk, or five sixths and it is twice as long. The surface is cut along the loop, and both rims are closed by a cap: a
-neck is cut through, a tunnel closed at both ends, and the genus is one less. Then the caps and what lies around them,
-within the loop's length, are laid out smoothly.
+neck is cut through, a tunnel closed at both ends, and the genus is one less. Then the caps, what lies right beside
+them, and what is left of a neck are laid out smoothly; what points support stays.
 Sources: Guskov and Wood, Topological noise removal (2001); Kobbelt, Campagna, Vorsatz and Seidel, Interactive
 multi-resolution modeling on arbitrary meshes (1998), for the layout.
 """
@@ -45,10 +45,10 @@ ASIDE, ALIKE = 0.7, 0.5
 """Cosines: at most of a loop's axis and a normal that tells of it, at least of the normals of a place and a point."""
 
 AROUND = 8
-"""Points that a vertex is compared with."""
+"""Points that a vertex is compared with, and that a point's plane goes through beside itself."""
 
 STUB, BESIDE = 3.0, 0.3
-"""Length of what is left of a neck, at most, in lengths of the loop."""
+"""How far from a cap the surface is laid out anew where no points support it, and anywhere, in lengths of the loop."""
 
 ROUNDS, TOGETHER = 20, 24
 """Times that loops are looked for, and loops that are cut at once: few enough for their words of 64 bits."""
@@ -245,8 +245,8 @@ def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
     Parameters
     ----------
     mesh : whose last vertices are the middles of caps
-    reach : of shape (C,), how far around each cap vertices are laid out, along the surface
-    lonely : of shape (V,), which vertices no points support: what is left of a neck is laid out as a whole
+    reach : of shape (C,), length of each cap's loop
+    lonely : of shape (V,), which vertices no points support, as what is left of a neck
     """
     size = len(mesh.vertices)
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
@@ -265,8 +265,10 @@ def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
     offsets = diags_array(1.0 / means.sum(axis=1)) @ means - eye_array(size)
     rows = np.flatnonzero(abs(offsets) @ free)
     inner, outer = offsets[rows][:, np.flatnonzero(free)], offsets[rows][:, np.flatnonzero(~free)]
+    # Far-off coordinates would cancel badly.
+    middle = mesh.vertices[free].mean(axis=0)
     vertices = mesh.vertices.copy()
-    vertices[free] = splu((inner.T @ inner).tocsc()).solve(-(inner.T @ (outer @ vertices[~free])))
+    vertices[free] = middle - splu((inner.T @ inner).tocsc()).solve(inner.T @ (outer @ (vertices[~free] - middle)))
     smooth = mesh.with_vertices(vertices)
     if mesh.normals is None:
         return smooth
