@@ -30,7 +30,6 @@ from gnrecon.export.loops import Loop, short_loops
 from gnrecon.export.topology import Edges, Mask, corner_fans
 from gnrecon.export.verify import require_sound
 from gnrecon.mesh import Int, Mesh
-from gnrecon.sampling import Density
 
 RIM = 2 * np.pi
 """Length of a disk's rim, in radii of it."""
@@ -103,6 +102,9 @@ class _Support:
     """
 
     def __init__(self, points: Float) -> None:
+        # It brings torch, which a check of a mesh does without.
+        from gnrecon.sampling import Density
+
         self._density = Density(points)
 
     def disks(self, mesh: Mesh) -> Float:
