@@ -69,7 +69,13 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
         The same mesh where there is none; a closed, oriented 2-manifold of as many components.
     list of str
         A sentence for what was done.
+
+    Raises
+    ------
+    MeshError
+        When the mesh is not sound, as an open one.
     """
+    require_sound(mesh)
     if len(points) < 2:
         return mesh, []
     support, rng = _Support(points), np.random.default_rng(0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, torus, union
 
+from gnrecon.errors import MeshError
 from gnrecon.export import extract, project, remove_handles, require_sound
 from gnrecon.export.loops import short_loops
 from gnrecon.export.nearest import nearest_on_surface
@@ -138,6 +139,11 @@ def test_the_two_parts_of_a_mesh_are_told_apart() -> None:
     assert (facts.components, facts.euler_characteristic) == (2, 4)
     assert len(actions) == 1
     assert "a handle or tunnel" in actions[0]
+
+
+def test_an_open_mesh_is_refused(true_clip: Mesh) -> None:
+    with pytest.raises(MeshError, match="3 edges have only one face"):
+        remove_handles(Mesh(true_clip.vertices, true_clip.faces[1:]), true_clip.vertices)
 
 
 def test_loops_are_as_short_as_they_can_be() -> None:
