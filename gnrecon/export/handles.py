@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from gnrecon.angles import widest_gap
 from gnrecon.cloud import Float
 from gnrecon.errors import MeshError
 from gnrecon.export.loops import Loop, short_loops
@@ -80,9 +81,8 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
         return mesh, []
     support, rng = _Support(points), np.random.default_rng(0)
     count, widest = 0, 0.0
-    sought = np.ones(len(mesh.vertices), dtype=bool)
+    disks, sought = support.disks(mesh), np.ones(len(mesh.vertices), dtype=bool)
     for _ in range(ROUNDS):
-        disks = support.disks(mesh)
         bare = support.bare(mesh, disks, short_loops(mesh, BARE[-1][0] * RIM * disks, sought, rng))
         loops = _apart(mesh, bare)
         cut = _without(mesh, loops, support)
@@ -91,8 +91,8 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
         count, widest = count + len(loops), max(widest, *(loop.length for loop in loops))
         # Those that are left lie near some that were found, which hid them or lay too near to be cut at once.
         places = cKDTree(np.concatenate([mesh.vertices[loop.vertices] for loop in bare]))
-        mesh = cut
-        sought = places.query(mesh.vertices)[0] <= RIM * support.disks(mesh)
+        mesh, disks = cut, support.disks(cut)
+        sought = places.query(mesh.vertices)[0] <= RIM * disks
     if not count:
         return mesh, []
     handles = "a handle or tunnel" if count == 1 else f"{count} handles or tunnels"
@@ -166,12 +166,7 @@ def _gap(ring: Float, normals: Float) -> float:
     if size == 0:
         return 2 * np.pi
     axis /= size
-    normals = normals[np.abs(normals @ axis) < ASIDE]
-    if not len(normals):
-        return 2 * np.pi
-    first = arms[0] - axis * (arms[0] @ axis)
-    angles = np.sort(np.arctan2(normals @ np.cross(axis, first), normals @ first))
-    return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())
+    return widest_gap(normals[np.abs(normals @ axis) < ASIDE], axis)
 
 
 def _apart(mesh: Mesh, loops: Sequence[Loop]) -> list[Loop]:

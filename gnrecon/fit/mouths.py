@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from gnrecon.angles import widest_gap
 from gnrecon.cloud import Float
 
 Mask = npt.NDArray[np.bool_]
@@ -54,8 +55,4 @@ def mouths(samples: Float, normals: Float, points: Float, their_normals: Float) 
 def _walled(places: Float, normals: Float, axis: Float) -> bool:
     """Return whether walls, behind the origin along an axis, look to it from all around it."""
     wall = (np.abs(normals @ axis) < ACROSS) & (places @ axis < 0) & (np.einsum("nd,nd->n", normals, places) < 0)
-    if not wall.any():
-        return False
-    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    angles = np.sort(np.arctan2(places[wall] @ np.cross(axis, first), places[wall] @ first))
-    return bool(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max() < OPEN)
+    return bool(widest_gap(places[wall], axis) < OPEN)
