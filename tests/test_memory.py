@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-import gc
-import time
-from mmap import MAP_ANONYMOUS, MAP_PRIVATE, PAGESIZE, mmap
 from pathlib import Path
 from threading import Barrier, Thread
 
-import numpy as np
-import psutil
 import pytest
+from held_memory import resident, use
 
 from gnrecon import memory
 from gnrecon.memory import PeakMemory, process_peak_mb
 
 SLACK = 12.0  # MB that the interpreter, the allocator and other threads may take meanwhile
-
-
-def use(mb: float) -> None:
-    """Hold so much memory, as long as it takes to be seen where the mark cannot be set back, and give it back.
-
-    It comes from the system itself: an allocator may serve it from what earlier tests freed and it kept resident.
-    """
-    with mmap(-1, max(int(mb * 1e6), 1), flags=MAP_PRIVATE | MAP_ANONYMOUS) as held:
-        np.frombuffer(held, dtype=np.uint8)[::PAGESIZE] = 1
-        time.sleep(5 * memory.INTERVAL)
-
-
-def resident() -> float:
-    gc.collect()  # so that nothing of earlier tests is given back in a stretch
-    return psutil.Process().memory_info().rss / 1e6
 
 
 def test_a_peak_is_that_of_its_own_stretch() -> None:

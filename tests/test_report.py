@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from held_memory import resident, use
 
 from gnrecon.report import Stages, plain
 
@@ -33,10 +34,10 @@ def test_plain_values_are_json(value: Any, expected: Any) -> None:
 
 def test_stages_are_announced_and_measured() -> None:
     told: list[str] = []
+    resident()
     stages = Stages(told.append)
     with stages("read"):
-        held = np.ones(20_000_000)
-        del held
+        use(200)
     with stages("fit"):
         sum(range(200_000))
     first, second = stages.as_list()
