@@ -178,6 +178,7 @@ def fit_adaptive(
     if known is not None and known.averaging is not None:
         also += f" Averaged noisy points over {known.averaging.width:g} of their disks' radii, where normals agree."
     if task.sharp is not None:
+        also += _laid(task.sharp)
         also += f" Continued faces to their edges by {len(task.samples) - len(samples) - len(task.across)} samples."
     if task.across.holes:
         also += f" Continued planes and cylinders across {_holes(task.across.holes)} by {len(task.across)} samples."
@@ -190,6 +191,13 @@ def fit_adaptive(
         f"length {chosen['length']:.3g}, {beside}.{also}{_asked(options)}"
     )
     return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
+
+
+def _laid(sharp: Sharp) -> str:
+    """Return a sentence about points that were laid on surfaces, after a blank, or nothing."""
+    if sharp.laid is None:
+        return ""
+    return f" Laid {int(sharp.laid.on.sum())} of them on {sharp.laid.surfaces} planes and cylinders that they fit."
 
 
 def _holes(count: int) -> str:

@@ -1,8 +1,8 @@
-"""Planes and round cylinders, the surfaces of most made things, found among oriented points.
+"""Planes, round cylinders and spheres, the surfaces of most made things, found among oriented points.
 
 What proposes a plane is a single point whose neighbours lie on it; what proposes a cylinder is two points, whose
-normals cross its axis at right angles. Of the proposals that which most points agree with is fitted to them, they are
-taken out, and the search goes on.
+normals cross its axis at right angles, and a sphere two whose normals meet in its centre. Of the proposals that which
+most points agree with is fitted to them, they are taken out, and the search goes on.
 Source: Schnabel, Wahl and Klein, Efficient RANSAC for Point-Cloud Shape Detection (2007).
 """
 
@@ -45,18 +45,21 @@ TURNED = 12.0, 120.0
 ROUND, STRAIGHT = 1.5, 30.0
 """Least and most radius of a cylinder, in radii of a disk: below, no point tells, and above, it is nearly a plane."""
 
+ASTRAY = 0.2
+"""How far the normals of two points on a sphere pass each other at most, in its radii."""
+
 BENT = 25.0
-"""Degrees by which the farthest normal of a cylinder differs from their mean at least."""
+"""Degrees by which the farthest normal of a round surface differs from their mean at least."""
 
 NEARLY, ASIDE, TOUCHES = 30.0, 5.0, (1.0, 1.2)
 """Degrees between a surface's normal and those of points beside it that nearly belong to it, how near these are, in
-radii of a disk, and their most share for planes and for cylinders, whose rims are often bevelled."""
+radii of a disk, and their most share for planes and for round ones, whose rims are often bevelled."""
 
 SETTLED = 0.5
 """Share of a proposal's points that belong to a surface that is settled, from which on it is none."""
 
 NORMAL_WEIGHT = 0.3
-"""What a normal's difference counts in a cylinder's fit, as a height in radii of a disk."""
+"""What a normal's difference counts in the fit of a cylinder or a sphere, as a height in radii of a disk."""
 
 
 class Surface(Protocol):
@@ -85,7 +88,7 @@ class Plane:
         """Return the plane's normal for each x."""
         return np.broadcast_to(self.direction, x.shape)
 
-    def fitted(self, points: Float, normals: Float, _radius: float) -> Plane:
+    def fitted(self, points: Float, normals: Float, _radius: float, _weight: float = NORMAL_WEIGHT) -> Plane:
         """Return the plane nearest to points in the mean square."""
         center = points.mean(axis=0)
         direction = np.linalg.svd(points - center, full_matrices=False)[2][2]
@@ -120,8 +123,8 @@ class Cylinder:
         outward: Float = self.side * across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         return outward
 
-    def fitted(self, points: Float, normals: Float, radius: float) -> Cylinder:
-        """Return the cylinder nearest to points and their normals; `radius` is that of a point's disk."""
+    def fitted(self, points: Float, normals: Float, radius: float, weight: float = NORMAL_WEIGHT) -> Cylinder:
+        """Return the cylinder nearest to points and, by a weight, their normals; `radius` is that of a point's disk."""
         aside, upward, axis = np.linalg.svd(normals)[2]
 
         def moved(by: Float) -> Cylinder:
@@ -131,7 +134,7 @@ class Cylinder:
 
         def residuals(by: Float) -> Float:
             trial = moved(by)
-            turn = NORMAL_WEIGHT * (trial.normal(points) - normals)
+            turn = weight * (trial.normal(points) - normals)
             return np.concatenate([trial.at(points) / radius, turn.ravel()])
 
         return moved(least_squares(residuals, [0.0, 0.0, 0.0, 0.0, self.radius], method="lm", max_nfev=FITTED).x)
@@ -143,17 +146,81 @@ class Cylinder:
 
 
 @dataclass(frozen=True)
+class Sphere:
+    """A sphere.
+
+    Parameters
+    ----------
+    center : array of shape (3,)
+    radius : unit coordinates
+    side : 1 for a ball, -1 for a hollow
+    """
+
+    center: Float
+    radius: float
+    side: float
+
+    def at(self, x: Float) -> Float:
+        """Return the distance from the centre less the radius, or the reverse in a hollow."""
+        distance: Float = self.side * (np.linalg.norm(x - self.center, axis=1) - self.radius)
+        return distance
+
+    def normal(self, x: Float) -> Float:
+        """Return the direction away from the centre, or towards it in a hollow."""
+        beyond = x - self.center
+        outward: Float = self.side * beyond / np.maximum(np.linalg.norm(beyond, axis=1, keepdims=True), 1e-12)
+        return outward
+
+    def fitted(self, points: Float, normals: Float, radius: float, weight: float = NORMAL_WEIGHT) -> Sphere:
+        """Return the sphere nearest to points and, by a weight, their normals; `radius` is that of a point's disk."""
+
+        def residuals(by: Float) -> Float:
+            trial = Sphere(self.center + by[:3], by[3], self.side)
+            turn = weight * (trial.normal(points) - normals)
+            return np.concatenate([trial.at(points) / radius, turn.ravel()])
+
+        found = least_squares(residuals, [0.0, 0.0, 0.0, self.radius], method="lm", max_nfev=FITTED).x
+        return Sphere(self.center + found[:3], float(found[3]), self.side)
+
+
+Primitive = Plane | Cylinder | Sphere
+KINDS = (Plane, Cylinder, Sphere)
+
+
+@dataclass(frozen=True)
 class Seen:
     """A surface, and the points of shape (K, 3) that lie on it."""
 
-    surface: Plane | Cylinder
+    surface: Primitive
     points: Float
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """Which surfaces are looked for.
+
+    Parameters
+    ----------
+    angle : degrees between a point's normal and that of its surface, at most
+    spheres : whether spheres are, too
+    touches : most share of points beside a surface that nearly belong to it, of planes and of round ones
+    """
+
+    angle: float = ANGLE
+    spheres: bool = False
+    touches: tuple[float, float] = TOUCHES
+
+
 def surfaces(
-    points: Float, normals: Float, asked: Mask, radius: float, off: float, rng: np.random.Generator
+    points: Float,
+    normals: Float,
+    asked: Mask,
+    radius: float,
+    off: float,
+    rng: np.random.Generator,
+    wanted: Wanted | None = None,
 ) -> list[Seen]:
-    """Return planes and cylinders of oriented points.
+    """Return planes and cylinders of oriented points, or what else is wanted.
 
     Parameters
     ----------
@@ -162,10 +229,11 @@ def surfaces(
     radius : of the disk that a point stands for
     off : how far off a surface its points lie at most
     rng : draws those that do
+    wanted : which surfaces
     """
     if len(points) <= BESIDE:
         return []
-    return _Search(points, normals, radius, off, rng).surfaces(asked)
+    return _Search(points, normals, radius, off, rng, wanted or Wanted()).surfaces(asked)
 
 
 def planar_share(points: Float, normals: Float, radius: float, off: float, rng: np.random.Generator) -> float:
@@ -175,11 +243,11 @@ def planar_share(points: Float, normals: Float, radius: float, off: float, rng: 
     return sum(len(one.points) for one in found) / max(len(points), 1)
 
 
-def agreed(surface: Surface, points: Float, normals: Float, off: float) -> Mask:
-    """Return which points, of shape (N, 3), lie on a surface: no farther off it, and by their normals."""
+def agreed(surface: Surface, points: Float, normals: Float, off: float, angle: float = ANGLE) -> Mask:
+    """Return which points, of shape (N, 3), lie on a surface: no farther off it, and by their normals, in degrees."""
     on = np.abs(surface.at(points)) < off
     turned: Float = np.einsum("kd,kd->k", surface.normal(points), normals)
-    agreeing: Mask = on & (turned > cosine_of(ANGLE))
+    agreeing: Mask = on & (turned > cosine_of(angle))
     return agreeing
 
 
@@ -192,6 +260,7 @@ class _Search:
     radius: float
     off: float
     rng: np.random.Generator
+    wanted: Wanted = Wanted()
 
     def surfaces(self, asked: Mask) -> list[Seen]:
         """Return the surfaces that points, by a mask of shape (N,), propose; each point belongs to one."""
@@ -199,24 +268,24 @@ class _Search:
         left: Int = np.arange(len(self.points))
         for _ in range(ROUNDS):
             if len(left) >= LEAST:
-                taken, left = self.taken(left, self.planes(left[asked[left]]) + self._cylinders(left, asked[left]))
+                taken, left = self.taken(left, self.planes(left[asked[left]]) + self._round(left, asked[left]))
                 found += taken
         return found
 
-    def planes(self, rows: Int) -> list[Plane | Cylinder]:
+    def planes(self, rows: Int) -> list[Primitive]:
         """Return the planes of some points whose neighbours lie on them."""
         beside = list(range(2, BESIDE + 2))
         _, near = self._density.tree.query(self.points[rows], beside, distance_upper_bound=NEAR * self.radius)
         absent = near == len(self.points)
         near = np.where(absent, 0, near)
         height = np.einsum("ikd,id->ik", self.points[near] - self.points[rows, None], self.normals[rows])
-        alike = np.einsum("ikd,id->ik", self.normals[near], self.normals[rows]) > cosine_of(ANGLE)
+        alike = np.einsum("ikd,id->ik", self.normals[near], self.normals[rows]) > cosine_of(self.wanted.angle)
         flat = rows[((np.abs(height) < self.off) & alike & ~absent).mean(axis=1) >= FLAT]
         some = self.rng.choice(flat, min(PROPOSALS, len(flat)), replace=False)
         return [Plane(self.points[row], self.normals[row]) for row in some]
 
-    def _cylinders(self, rows: Int, asked: Mask) -> list[Plane | Cylinder]:
-        """Return the cylinders of pairs of rows, the first of which is one of those by a mask of shape (rows,)."""
+    def _round(self, rows: Int, asked: Mask) -> list[Primitive]:
+        """Return cylinders and spheres of pairs of rows, the first of which is one of a mask of shape (rows,)."""
         if not asked.any():
             return []
         points, normals = self.points[rows], self.normals[rows]
@@ -226,25 +295,34 @@ class _Search:
         n, m, beyond = normals[first], normals[second], points[second] - points[first]
         cosine = np.einsum("kd,kd->k", n, m)
         wanted = (cosine < cosine_of(TURNED[0])) & (cosine > cosine_of(TURNED[1]))
-        first, n, m, beyond = first[wanted], n[wanted], m[wanted], beyond[wanted]
+        pairs = points[first[wanted]], n[wanted], m[wanted], beyond[wanted]
+        return self._cylinders(*pairs) + (self._spheres(*pairs) if self.wanted.spheres else [])
+
+    def _cylinders(self, points: Float, n: Float, m: Float, beyond: Float) -> list[Primitive]:
+        """Return the cylinders of points, of shape (K, 3), with normals n, and of those `beyond` with normals m."""
         axis = np.cross(n, m)
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         # Both points lie as far from the axis, along their normals: p + s n = q + s m but for what is along the axis.
-        beyond -= np.einsum("kd,kd->k", beyond, axis)[:, None] * axis
-        turn = n - m
-        reach = np.einsum("kd,kd->k", beyond, turn) / np.einsum("kd,kd->k", turn, turn)
-        center = points[first] + reach[:, None] * n
-        size = np.abs(reach)
+        reach = _meeting(n, m, beyond - np.einsum("kd,kd->k", beyond, axis)[:, None] * axis)
+        center, size = points + reach[:, None] * n, np.abs(reach)
         proper = np.flatnonzero((size > ROUND * self.radius) & (size < STRAIGHT * self.radius))
         return [Cylinder(center[k], axis[k], float(size[k]), float(-np.sign(reach[k]))) for k in proper]
 
-    def taken(self, rows: Int, proposed: list[Plane | Cylinder]) -> tuple[list[Seen], Int]:
+    def _spheres(self, points: Float, n: Float, m: Float, beyond: Float) -> list[Primitive]:
+        """Return the spheres of the same whose normals meet in the centre; points on a cylinder's sides do not."""
+        reach = _meeting(n, m, beyond)
+        missed = np.linalg.norm(reach[:, None] * (n - m) - beyond, axis=1)
+        size = np.abs(reach)
+        proper = np.flatnonzero((size > ROUND * self.radius) & (missed < ASTRAY * size))
+        return [Sphere(points[k] + reach[k] * n[k], float(size[k]), float(-np.sign(reach[k]))) for k in proper]
+
+    def taken(self, rows: Int, proposed: list[Primitive]) -> tuple[list[Seen], Int]:
         """Return those of the proposed surfaces that hold, the largest first, and which of the rows are left."""
         found: list[Seen] = []
         points, normals = self.points[rows], self.normals[rows]
-        agreeing = np.array([agreed(one, points, normals, self.off) for one in proposed])
+        agreeing = np.array([agreed(one, points, normals, self.off, self.wanted.angle) for one in proposed])
         agreeing = agreeing.reshape(len(proposed), len(rows))
-        cylinders = np.array([isinstance(one, Cylinder) for one in proposed], dtype=bool)
+        kinds = np.array([KINDS.index(type(one)) for one in proposed])
         free, wanted = np.ones(len(rows), dtype=bool), np.ones(len(proposed), dtype=bool)
         while wanted.any() and len(found) < MOST:
             count = np.where(wanted, (agreeing & free).sum(axis=1), 0)
@@ -255,21 +333,21 @@ class _Search:
             for _ in range(FITS):
                 before = int(on.sum())
                 surface = surface.fitted(points[on], normals[on], self.radius)
-                on = agreed(surface, points, normals, self.off) & free
+                on = agreed(surface, points, normals, self.off, self.wanted.angle) & free
                 if int(on.sum()) <= max(before, LEAST):
                     break
             holds = self._ends(surface, points[free], normals[free], on[free])
-            # What mostly agrees with what is settled is no proposal any more; what no cylinder fits may be a plane.
+            # What mostly agrees with what is settled is no proposal any more; what is no cylinder may be a plane.
             like = on if holds else agreeing[best] & free
             settled = (agreeing & like).sum(axis=1) >= SETTLED * count
-            wanted &= ~(settled & (holds | (cylinders == cylinders[best])))
+            wanted &= ~(settled & (holds | (kinds == kinds[best])))
             wanted[best] = False
             if holds:
                 found.append(Seen(surface, points[on]))
                 free &= ~on
         return found, rows[free]
 
-    def _ends(self, surface: Plane | Cylinder, points: Float, normals: Float, on: Mask) -> bool:
+    def _ends(self, surface: Primitive, points: Float, normals: Float, on: Mask) -> bool:
         """Return whether a surface ends where its points do, as faces do at edges; a shape that bends away it touches.
 
         Parameters
@@ -277,16 +355,23 @@ class _Search:
         points, normals : arrays of shape (K, 3)
         on : mask of shape (K,), of those that lie on the surface
         """
-        if int(on.sum()) < LEAST or (isinstance(surface, Cylinder) and _bend(normals[on]) < BENT):
+        if int(on.sum()) < LEAST or (not isinstance(surface, Plane) and _bend(normals[on]) < BENT):
             return False
         near = Density(points[on]).tree.query(points)[0] < ASIDE * self.radius
         nearly = near & (np.einsum("kd,kd->k", surface.normal(points), normals) > cosine_of(NEARLY)) & ~on
-        most = TOUCHES[isinstance(surface, Cylinder)]
+        most = self.wanted.touches[not isinstance(surface, Plane)]
         return bool(nearly.sum() < most * on.sum())
 
     @cached_property
     def _density(self) -> Density:
         return Density(self.points)
+
+
+def _meeting(n: Float, m: Float, beyond: Float) -> Float:
+    """Return how far along its normal, of shape (K, 3), each of two points comes nearest to the other; m is its."""
+    turn = n - m
+    reach: Float = np.einsum("kd,kd->k", beyond, turn) / np.einsum("kd,kd->k", turn, turn)
+    return reach
 
 
 def _bend(normals: Float) -> float:

@@ -15,6 +15,7 @@ from gnrecon.cloud import Float, Samples
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.holes import Continued, continued
+from gnrecon.fit.laid import Laid, laid
 from gnrecon.fit.patch import Belief
 from gnrecon.sampling import Density
 
@@ -60,11 +61,13 @@ class Sharp:
     ----------
     samples : of the scan first, which may be averaged, and then those that were added
     averaging : how they were averaged, or None
+    laid : which of them lie on planes and cylinders, if some were laid there
     across : those that were added across holes
     """
 
     samples: Samples
     averaging: Averaging | None
+    laid: Laid | None
     across: Continued
 
     @property
@@ -82,11 +85,13 @@ class Sharp:
         """
         if samples.estimated or len(samples) > MOST_POINTS or len(samples) <= BESIDE:
             return None
-        points, normals, averaging = samples.points, samples.normals, None
+        points, normals, averaging, flat = samples.points, samples.normals, None, None
         faces = Faces(points, normals)
         if faces.roughness > ROUGH:
             averaging = AVERAGING
-            points, normals = averaging.of(points, normals)
+            averaged = averaging.of(points, normals)
+            flat = laid(points, normals, averaged)
+            points, normals = averaged if flat is None else (flat.points, flat.normals)
             faces = Faces(points, normals)
         if faces.roughness > SMOOTH or not _sharp(faces):
             return None
@@ -98,7 +103,7 @@ class Sharp:
         if agreed < AGREED:
             return None
         joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])
-        return cls(replace(samples, points=joined[0], normals=joined[1]), averaging, across)
+        return cls(replace(samples, points=joined[0], normals=joined[1]), averaging, flat, across)
 
 
 def _sharp(faces: Faces) -> bool:

@@ -81,6 +81,20 @@ def test_the_two_sides_of_a_sheet_do_not_attract() -> None:
     np.testing.assert_allclose(points, x, atol=1e-9)
 
 
+def test_a_surface_behind_a_wall_that_looks_the_same_way_does_not_attract() -> None:
+    """As the wall of a bore does beside a thin wall: a patch of it lies behind, with the same normals."""
+    rng = np.random.default_rng(6)
+    front, behind, noise = 4000, 300, 0.005
+    x = np.concatenate([rng.uniform(-1, 1, (front, 3)), rng.uniform(-0.25, 0.25, (behind, 3))])
+    height = np.concatenate([np.zeros(front), np.full(behind, -0.06)])
+    x[:, 2] = height + noise * rng.standard_normal(len(x))
+    points, _ = WIDE.of(x, np.tile([0.0, 0.0, 1.0], (len(x), 1)))
+    off = np.abs(points[:, 2] - height)
+    beside = np.abs(x[:, :2]).max(axis=1) < 0.2
+    assert off[:front][beside[:front]].mean() < 0.4 * noise
+    assert off[front:][beside[front:]].mean() < 0.4 * noise
+
+
 @pytest.mark.parametrize("count", [2, 10])
 def test_few_points_are_enough(count: int) -> None:
     points, normals = WIDE.of(*ball(count, np.random.default_rng(4)))

@@ -1,0 +1,224 @@
+"""Noisy points laid on the planes, round cylinders and spheres that they cannot be told from.
+
+Averaging takes a point's noise by some tens of its neighbours. A face of a made thing has hundreds of points, and where
+it is a plane, a cylinder or a sphere for all that they can tell, all of them say where it is. That is so where their
+heights over it are no more than the noise, and are noise: neither have neighbours' heights to do with each other, nor
+do they follow a quadric, as where the surface is bent otherwise.
+
+Surfaces are looked for among averaged points, and are fitted to the scanned ones. Where faces are as small as the
+neighbourhoods, as in bores, averages are taken over other faces; so those that were not found are looked for once more
+among what is left, averaged by itself and over less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gnrecon.cloud import Float
+from gnrecon.fit.bilateral import Averaging
+from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, surfaces
+from gnrecon.sampling import Density
+
+Mask = npt.NDArray[np.bool_]
+
+MADE = 0.5
+"""Least share of the points that lie on such surfaces, where a shape is a made one: 0.8 and more on machine parts, 0.2
+on a gyroid, as a piece of any surface looks like a cylinder to few noisy points."""
+
+NARROW, ANGLES = Averaging(2.0, 0.6), (10.0, 20.0)
+"""How what is left is averaged, and degrees between a point's normal and its surface's at most, first and then."""
+
+ROUNDS = 3
+"""How often surfaces are looked for at most, with either averaging, while some are found."""
+
+OFF, NEAR, WEIGHTS = 3.0, 3.0, (0.3, 0.0, 0.0)
+"""How far a point lies off its surface at most, in deviations of the noise, and from others of it, in radii of a disk;
+and what
+normals count in each fit: averages, they are wrong where a bore is narrow."""
+
+EXACT, SEARCH = 0.02, 0.05
+"""Noise below which nothing is asked of the heights, and least height that is granted in the search, in radii of a
+disk."""
+
+TOUCHES = 0.5
+"""Most share of points beside a face that nearly belong to it. On a bent shape there are more: without this a share of
+0.8 of a torus' 3,000 points would be laid on cylinders that a noise of a fourth of their disks cannot rule out."""
+
+ASIDE, NEARLY, BENDS = 7.0, 30.0, 0.1
+"""How far off a surface points beside its own are that bend away from it, in deviations of the noise; degrees between
+their normals and its own, at most; and how many there may be, over its own."""
+
+NO_MORE, WHITE, BESIDE = 1.25, 2.5, 6
+"""Most deviation of the heights, over the noise; most correlation of a height with its neighbours' mean, times the root
+of their number; and how many neighbours."""
+
+BENT, RANK = 3.0, 0.01
+"""By how many deviations of it a quadric may explain the heights better than it explains noise; and how much smaller
+than the largest of its terms one may be, over the points, that counts."""
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Points and unit normals, both of shape (N, 3): those on some surfaces, the others averaged.
+
+    `on` is the mask, of shape (N,), of those that lie on one.
+    """
+
+    points: Float
+    normals: Float
+    on: Mask
+    surfaces: int
+
+
+def laid(points: Float, normals: Float, averaged: tuple[Float, Float]) -> Laid | None:
+    """Return the points of a made shape on its planes, cylinders and spheres, or None of any other shape.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals, as they were scanned
+    averaged : points and normals, the same, with less noise
+    """
+    if len(points) <= LEAST:
+        return None
+    radius = Density(points).radius
+    off = np.einsum("nd,nd->n", points - averaged[0], averaged[1])
+    # The median heeds neither edges nor outliers; of a normal distribution it is this share of the deviation.
+    noise = max(float(np.median(np.abs(off))) / 0.6745, EXACT * radius)
+    search = _Search(points, radius, noise, np.random.default_rng(0))
+    found = search.all(*averaged, ANGLES[0], [])
+    if search.share(found) < MADE:
+        return None
+    rest = search.left(found)
+    if len(rest) > LEAST:
+        narrow = np.array(points), np.array(normals)
+        narrow[0][rest], narrow[1][rest] = NARROW.of(points[rest], normals[rest])
+        found = search.all(*narrow, ANGLES[1], found)
+    return search.laid(found, *averaged)
+
+
+@dataclass(frozen=True)
+class _Face:
+    """A surface and the rows of the points that it cannot be told from."""
+
+    surface: Primitive
+    rows: npt.NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Scanned points, of shape (N, 3), with the radius of their disks and the noise of their positions."""
+
+    points: Float
+    radius: float
+    noise: float
+    rng: np.random.Generator
+
+    def left(self, found: list[_Face]) -> npt.NDArray[np.integer]:
+        """Return the rows of the points that are on none of some faces."""
+        free = np.ones(len(self.points), dtype=bool)
+        for face in found:
+            free[face.rows] = False
+        return np.flatnonzero(free)
+
+    def share(self, found: list[_Face]) -> float:
+        """Return the share of the points that are on some faces."""
+        return 1.0 - len(self.left(found)) / len(self.points)
+
+    def all(self, points: Float, normals: Float, angle: float, found: list[_Face]) -> list[_Face]:
+        """Return some faces, and those found among the points that are on none of them, with averaged ones' help."""
+        for _ in range(ROUNDS):
+            rest = self.left(found)
+            off = max(self.noise, SEARCH * self.radius)
+            wanted = Wanted(angle, spheres=True, touches=(TOUCHES, TOUCHES))
+            everything = np.ones(len(rest), dtype=bool)
+            proposed = surfaces(points[rest], normals[rest], everything, self.radius, off, self.rng, wanted)
+            before = len(found)
+            for one in sorted(proposed, key=lambda seen: -len(seen.points)):
+                face = self._face(one, self.left(found), normals, angle)
+                found = found if face is None else [*found, face]
+            if len(found) == before:
+                break
+        return found
+
+    def _face(self, seen: Seen, free: npt.NDArray[np.integer], normals: Float, angle: float) -> _Face | None:
+        """Return the face of a surface and those free points that it cannot be told from, or None if it can.
+
+        Parameters
+        ----------
+        seen : Seen
+        free : rows of points that are on no other face
+        normals : array of shape (N, 3), averaged unit normals
+        angle : degrees between them and the surface's, at most
+        """
+        rows = free[Density(seen.points).tree.query(self.points[free])[0] < NEAR * self.radius]
+        points, theirs, surface = self.points[rows], normals[rows], seen.surface
+        on = agreed(surface, points, theirs, OFF * self.noise, angle)
+        for weight in WEIGHTS:
+            if int(on.sum()) < LEAST:
+                return None
+            surface = surface.fitted(points[on], theirs[on], self.radius, weight)
+            on = agreed(surface, points, theirs, OFF * self.noise, angle)
+        if int(on.sum()) < LEAST or not self._is_noise(surface, points[on]):
+            return None
+        height = np.abs(surface.at(points))
+        aside = ~on & agreed(surface, points, theirs, ASIDE * self.noise, NEARLY) & (height > OFF * self.noise)
+        if int(aside.sum()) > BENDS * int(on.sum()):
+            return None
+        return _Face(surface, rows[on])
+
+    def _is_noise(self, surface: Primitive, points: Float) -> bool:
+        """Return whether heights over a surface, at points of shape (K, 3), are but noise."""
+        height, feet = surface.at(points), _feet(surface, points)
+        deviation = float(np.sqrt(np.mean(height**2)))
+        if deviation < EXACT * self.radius:
+            return True
+        near = Density(points).tree.query(points, list(range(2, min(BESIDE, len(points) - 1) + 2)))[1]
+        alike = float((height * height[near].mean(axis=1)).mean()) / deviation**2
+        bent, terms = _explained(height, feet)
+        return (
+            deviation < NO_MORE * self.noise
+            and alike < WHITE / np.sqrt(len(points))
+            and bent < terms + BENT * np.sqrt(2 * terms)
+        )
+
+    def laid(self, found: list[_Face], points: Float, normals: Float) -> Laid:
+        """Return the points on faces, and the others averaged, but for those that this moves farther than noise does.
+
+        Parameters
+        ----------
+        found : the faces
+        points, normals : arrays of shape (N, 3), averaged
+        """
+        far = np.linalg.norm(points - self.points, axis=1) > OFF * self.noise
+        points, normals, on = np.where(far[:, None], self.points, points), normals.copy(), np.zeros(len(points), bool)
+        for face in found:
+            scanned = self.points[face.rows]
+            normals[face.rows] = face.surface.normal(scanned)
+            points[face.rows] = _feet(face.surface, scanned)
+            on[face.rows] = True
+        return Laid(points, normals, on, len(found))
+
+
+def _feet(surface: Primitive, points: Float) -> Float:
+    """Return the points of a surface nearest to some, all of shape (K, 3)."""
+    feet: Float = points - surface.at(points)[:, None] * surface.normal(points)
+    return feet
+
+
+def _explained(height: Float, points: Float) -> tuple[float, int]:
+    """Return how much of some heights, of shape (K,), a quadric explains, in their variance, and by how many terms.
+
+    Noise is explained by as much as there are terms, and twice that is the variance of it.
+
+    The points are of shape (K, 3).
+    """
+    x = points - points.mean(axis=0)
+    x = x / np.abs(x).max()
+    i, j = np.triu_indices(3)
+    terms = np.concatenate([np.ones((len(x), 1)), x, x[:, i] * x[:, j]], axis=1)
+    basis, size, _ = np.linalg.svd(terms, full_matrices=False)
+    basis = basis[:, size > RANK * size[0]]
+    return float(((basis.T @ height) ** 2).sum() / np.mean(height**2)), basis.shape[1]

@@ -1,0 +1,167 @@
+"""Noisy points laid on planes and cylinders that they cannot be told from, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnrecon.cloud import Float
+from gnrecon.fit.laid import Laid, laid
+from gnrecon.fit.sharp import AVERAGING
+
+SIDE, HEIGHT, BORE, NOISE = 0.7, 0.2, 0.12, 0.006
+
+Oriented = tuple[Float, Float]
+
+
+def noisy(scan: Oriented, noise: float = NOISE, tilt: float = 0.15) -> Oriented:
+    """Move points along their normals, and tilt these, in radians."""
+    rng = np.random.default_rng(7)
+    normals = scan[1] + tilt * rng.standard_normal(scan[1].shape)
+    moved = scan[0] + noise * rng.standard_normal((len(scan[0]), 1)) * scan[1]
+    return moved, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def cube(count: int) -> Oriented:
+    rng = np.random.default_rng(0)
+    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
+    x, normals = rng.uniform(-SIDE, SIDE, (count, 3)), np.zeros((count, 3))
+    x[rows, axis] = SIDE * side
+    normals[rows, axis] = side
+    return x, normals
+
+
+def bored(count: int) -> Oriented:
+    """Draw points of a square plate with a narrow round bore through it."""
+    rng = np.random.default_rng(1)
+    areas = np.array([2 * (4 * SIDE**2 - np.pi * BORE**2), 16 * SIDE * HEIGHT, 4 * np.pi * BORE * HEIGHT])
+    faces, rim, wall = rng.multinomial(count, areas / areas.sum())
+    x = rng.uniform(-SIDE, SIDE, (2 * faces, 3))
+    x = x[np.hypot(x[:, 0], x[:, 1]) > BORE][:faces]
+    normals = np.zeros_like(x)
+    normals[:, 2] = rng.choice([-1.0, 1.0], len(x))
+    x[:, 2] = HEIGHT * normals[:, 2]
+    angle = rng.uniform(0, 2 * np.pi, wall)
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(wall)], axis=1)
+    inner = BORE * around + [0, 0, 1] * rng.uniform(-HEIGHT, HEIGHT, (wall, 1))
+    outer, theirs = rng.uniform(-SIDE, SIDE, (rim, 3)), np.zeros((rim, 3))
+    outer[:, 2] *= HEIGHT / SIDE
+    side, axis = rng.choice([-1.0, 1.0], rim), rng.integers(2, size=rim)
+    theirs[np.arange(rim), axis] = side
+    outer[np.arange(rim), axis] = SIDE * side
+    return np.concatenate([x, inner, outer]), np.concatenate([normals, -around, theirs])
+
+
+def ball(count: int) -> Oriented:
+    x = np.random.default_rng(2).standard_normal((count, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return SIDE * x, x
+
+
+def torus(count: int) -> Oriented:
+    rng = np.random.default_rng(3)
+    u, v = rng.uniform(0, 2 * np.pi, (2, count))
+    ring = np.stack([np.cos(u), np.sin(u), 0 * u], axis=1)
+    normals = np.cos(v)[:, None] * ring + np.sin(v)[:, None] * [0.0, 0.0, 1.0]
+    return SIDE * ring + 0.35 * SIDE * normals, normals
+
+
+def bulged(count: int, by: float) -> tuple[Oriented, np.ndarray]:
+    """Draw points of a cube whose upper face bulges, and which of them are on that."""
+    x, normals = cube(count)
+    upper = normals[:, 2] > 0.5
+    across = x[upper, :2] / SIDE
+    x[upper, 2] += by * np.prod(1 - across**2, axis=1)
+    normals[upper, :2] = 2 * by / SIDE * across * (1 - across[:, ::-1] ** 2)
+    normals[upper] /= np.linalg.norm(normals[upper], axis=1, keepdims=True)
+    return (x, normals), upper
+
+
+def of(scan: Oriented) -> Laid | None:
+    return laid(*scan, AVERAGING.of(*scan))
+
+
+def test_faces_of_a_cube_are_known_far_better_than_an_average_knows_them() -> None:
+    exact = cube(3000)
+    scan = noisy(exact)
+    found = of(scan)
+    assert found is not None
+    assert found.on.mean() > 0.95
+    assert found.surfaces == 6
+    axis = np.abs(exact[1]).argmax(axis=1)
+
+    def off(points: Float) -> float:
+        return float(np.abs(np.abs(np.take_along_axis(points, axis[:, None], 1)) - SIDE).mean())
+
+    averaged, _ = AVERAGING.of(*scan)
+    assert off(found.points) < 0.5 * off(averaged) < 0.25 * off(scan[0])
+    turned = np.einsum("nd,nd->n", found.normals[found.on], exact[1][found.on])
+    assert np.degrees(np.arccos(turned.clip(-1, 1))).max() < 0.5
+
+
+def test_a_bore_narrower_than_what_is_averaged_is_found_in_what_is_left() -> None:
+    exact = bored(4000)
+    scan = noisy(exact)
+    found = of(scan)
+    assert found is not None
+    wall = (np.hypot(*exact[0][:, :2].T) < BORE + 1e-9) & (np.abs(exact[1][:, 2]) < 0.5)
+    assert wall.sum() > 100
+    assert found.on[wall].mean() > 0.9
+
+    def off(points: Float) -> Float:
+        return np.abs(np.hypot(*points[wall & found.on, :2].T) - BORE)
+
+    assert off(found.points).mean() < 0.3 * off(scan[0]).mean()
+    assert np.einsum("nd,nd->n", found.normals, exact[1])[wall & found.on].mean() > 0.995
+
+
+def test_exact_points_stay_and_their_tilted_normals_are_righted() -> None:
+    exact = cube(3000)
+    found = of(noisy(exact, noise=0.0, tilt=0.25))
+    assert found is not None
+    on = found.on
+    assert on.mean() > 0.9
+    np.testing.assert_allclose(found.points[on], exact[0][on], atol=1e-3)
+    turned = np.einsum("nd,nd->n", found.normals, exact[1])[on]
+    assert np.mean(turned > 1 - 1e-5) > 0.99  # but for some beside an edge
+
+
+@pytest.mark.parametrize("by", [2 * NOISE, 5 * NOISE, 10 * NOISE, 20 * NOISE])
+def test_a_face_that_bulges_is_not_laid_flat(by: float) -> None:
+    """At most on pieces that are much nearer to it than the noise."""
+    exact, upper = bulged(4000, by)
+    scan = noisy(exact)
+    found = of(scan)
+    assert found is not None
+    assert found.on[~upper].mean() > 0.95
+
+    def off(points: Float) -> float:
+        x, y, z = points[upper].T
+        return float(np.abs(z - SIDE - by * (1 - (x / SIDE) ** 2) * (1 - (y / SIDE) ** 2)).mean())
+
+    assert off(found.points) < 0.5 * off(scan[0])
+
+
+def test_a_noisy_ball_is_a_sphere() -> None:
+    found = of(noisy(ball(3000)))
+    assert found is not None
+    assert found.surfaces == 1
+    assert found.on.mean() > 0.99
+    assert np.abs(np.linalg.norm(found.points[found.on], axis=1) - SIDE).max() < 0.15 * NOISE
+
+
+@pytest.mark.parametrize("scan", [torus(3000), torus(400), cube(8)])
+def test_other_shapes_and_a_few_points_are_left_alone(scan: Oriented) -> None:
+    assert of(noisy(scan)) is None
+
+
+def test_what_averaging_moves_farther_than_noise_does_stays_where_it_was() -> None:
+    scan = noisy(cube(3000))
+    averaged = AVERAGING.of(*scan)
+    apart = 0.3 * np.ones(3)
+    points, normals = (np.concatenate([one, [other]]) for one, other in zip(scan, (apart, scan[1][0]), strict=True))
+    moved = np.concatenate([averaged[0], [apart + 0.1]]), np.concatenate([averaged[1], [scan[1][0]]])
+    found = laid(points, normals, moved)
+    assert found is not None
+    assert not found.on[-1]
+    np.testing.assert_array_equal(found.points[-1], apart)
