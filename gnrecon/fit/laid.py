@@ -31,6 +31,9 @@ on a gyroid, as a piece of any surface looks like a cylinder to few noisy points
 NARROW, ANGLES = Averaging(2.0, 0.6), (10.0, 20.0)
 """How what is left is averaged, and degrees between a point's normal and its surface's at most, first and then."""
 
+SOUGHT = 6000
+"""Most points among which surfaces are looked for: what so few do not show is found when less is left."""
+
 ROUNDS = 3
 """How often surfaces are looked for at most, with either averaging, while some are found."""
 
@@ -47,9 +50,9 @@ TOUCHES = 0.5
 """Most share of points beside a face that nearly belong to it. On a bent shape there are more: without this a share of
 0.8 of a torus' 3,000 points would be laid on cylinders that a noise of a fourth of their disks cannot rule out."""
 
-ASIDE, NEARLY, BENDS = 7.0, 30.0, 0.1
-"""How far off a surface points beside its own are that bend away from it, in deviations of the noise; degrees between
-their normals and its own, at most; and how many there may be, over its own."""
+RING, ASIDE, NEARLY, BENDS = 3.0, 7.0, 30.0, 0.1
+"""How far around a surface its shape may bend away, in what is near; how far off it such points are, in deviations of
+the noise, and degrees between their normals and its own, at most; and how many there may be, over its own."""
 
 NO_MORE, WHITE, BESIDE = 1.25, 2.5, 6
 """Most deviation of the heights, over the noise; most correlation of a height with its neighbours' mean, times the root
@@ -131,19 +134,23 @@ class _Search:
         """Return some faces, and those found among the points that are on none of them, with averaged ones' help."""
         for _ in range(ROUNDS):
             rest = self.left(found)
+            some = np.sort(self.rng.permutation(rest)[:SOUGHT])
+            radius = self.radius * float(np.sqrt(len(rest) / max(len(some), 1)))
             off = max(self.noise, SEARCH * self.radius)
             wanted = Wanted(angle, spheres=True, touches=(TOUCHES, TOUCHES))
-            everything = np.ones(len(rest), dtype=bool)
-            proposed = surfaces(points[rest], normals[rest], everything, self.radius, off, self.rng, wanted)
+            everything = np.ones(len(some), dtype=bool)
+            proposed = surfaces(points[some], normals[some], everything, radius, off, self.rng, wanted)
             before = len(found)
             for one in sorted(proposed, key=lambda seen: -len(seen.points)):
-                face = self._face(one, self.left(found), normals, angle)
+                face = self._face(one, self.left(found), normals, angle, NEAR * radius)
                 found = found if face is None else [*found, face]
             if len(found) == before:
                 break
         return found
 
-    def _face(self, seen: Seen, free: npt.NDArray[np.integer], normals: Float, angle: float) -> _Face | None:
+    def _face(
+        self, seen: Seen, free: npt.NDArray[np.integer], normals: Float, angle: float, near: float
+    ) -> _Face | None:
         """Return the face of a surface and those free points that it cannot be told from, or None if it can.
 
         Parameters
@@ -152,8 +159,10 @@ class _Search:
         free : rows of points that are on no other face
         normals : array of shape (N, 3), averaged unit normals
         angle : degrees between them and the surface's, at most
+        near : how far they are from those of the surface that were seen, at most
         """
-        rows = free[Density(seen.points).tree.query(self.points[free])[0] < NEAR * self.radius]
+        away = Density(seen.points).tree.query(self.points[free])[0]
+        rows, beside = free[away < near], free[away < RING * near]
         points, theirs, surface = self.points[rows], normals[rows], seen.surface
         on = agreed(surface, points, theirs, OFF * self.noise, angle)
         for weight in WEIGHTS:
@@ -163,8 +172,9 @@ class _Search:
             on = agreed(surface, points, theirs, OFF * self.noise, angle)
         if int(on.sum()) < LEAST or not self._is_noise(surface, points[on]):
             return None
-        height = np.abs(surface.at(points))
-        aside = ~on & agreed(surface, points, theirs, ASIDE * self.noise, NEARLY) & (height > OFF * self.noise)
+        points, theirs = self.points[beside], normals[beside]
+        aside = agreed(surface, points, theirs, ASIDE * self.noise, NEARLY)
+        aside &= np.abs(surface.at(points)) > OFF * self.noise
         if int(aside.sum()) > BENDS * int(on.sum()):
             return None
         return _Face(surface, rows[on])

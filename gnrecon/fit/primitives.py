@@ -91,7 +91,7 @@ class Plane:
     def fitted(self, points: Float, normals: Float, _radius: float, _weight: float = NORMAL_WEIGHT) -> Plane:
         """Return the plane nearest to points in the mean square."""
         center = points.mean(axis=0)
-        direction = np.linalg.svd(points - center, full_matrices=False)[2][2]
+        direction = _axes(points - center)[0]
         return Plane(center, direction * np.sign(direction @ normals.sum(axis=0)))
 
 
@@ -125,7 +125,7 @@ class Cylinder:
 
     def fitted(self, points: Float, normals: Float, radius: float, weight: float = NORMAL_WEIGHT) -> Cylinder:
         """Return the cylinder nearest to points and, by a weight, their normals; `radius` is that of a point's disk."""
-        aside, upward, axis = np.linalg.svd(normals)[2]
+        axis, upward, aside = _axes(normals)
 
         def moved(by: Float) -> Cylinder:
             turned = axis + by[0] * aside + by[1] * upward
@@ -365,6 +365,12 @@ class _Search:
     @cached_property
     def _density(self) -> Density:
         return Density(self.points)
+
+
+def _axes(directions: Float) -> Float:
+    """Return unit vectors at right angles, in rows, first that along which directions, of shape (K, 3), are least."""
+    axes: Float = np.linalg.eigh(directions.T @ directions)[1].T
+    return axes
 
 
 def _meeting(n: Float, m: Float, beyond: Float) -> Float:

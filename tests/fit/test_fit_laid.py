@@ -128,7 +128,7 @@ def test_exact_points_stay_and_their_tilted_normals_are_righted() -> None:
 
 @pytest.mark.parametrize("by", [2 * NOISE, 5 * NOISE, 10 * NOISE, 20 * NOISE])
 def test_a_face_that_bulges_is_not_laid_flat(by: float) -> None:
-    """At most on pieces that are much nearer to it than the noise."""
+    """Averaging knows it well; pieces of cylinders that the noise cannot rule out would be off by half of it."""
     exact, upper = bulged(4000, by)
     scan = noisy(exact)
     found = of(scan)
@@ -139,7 +139,7 @@ def test_a_face_that_bulges_is_not_laid_flat(by: float) -> None:
         x, y, z = points[upper].T
         return float(np.abs(z - SIDE - by * (1 - (x / SIDE) ** 2) * (1 - (y / SIDE) ** 2)).mean())
 
-    assert off(found.points) < 0.5 * off(scan[0])
+    assert off(found.points) < 1.3 * off(AVERAGING.of(*scan)[0]) < 0.6 * off(scan[0])
 
 
 def test_a_noisy_ball_is_a_sphere() -> None:
