@@ -197,7 +197,11 @@ def _laid(sharp: Sharp) -> str:
     """Return a sentence about points that were laid on surfaces, after a blank, or nothing."""
     if sharp.laid is None:
         return ""
-    return f" Laid {int(sharp.laid.on.sum())} of them on {sharp.laid.surfaces} planes and cylinders that they fit."
+    laid = sharp.laid
+    return (
+        f" Laid {int(laid.on.sum())} points on {laid.surfaces} planes, cylinders and spheres, "
+        "from which the noise cannot tell them."
+    )
 
 
 def _holes(count: int) -> str:

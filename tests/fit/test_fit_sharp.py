@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -179,3 +180,10 @@ def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.Mon
     plain, status = error()
     assert "Continued" not in status
     assert continued < 0.7 * plain
+
+
+def test_the_fit_of_a_noisy_cube_says_how_many_points_are_laid_on_its_faces() -> None:
+    _, solution = fit(cube(1500, noise=0.01), FitOptions(quality="draft"))
+    found = re.search(r"Laid (\d+) points on 6 planes, cylinders and spheres", solution.status)
+    assert found is not None
+    assert 1450 < int(found[1]) <= 1500
