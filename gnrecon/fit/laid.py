@@ -38,9 +38,8 @@ ROUNDS = 3
 """How often surfaces are looked for at most, with either averaging, while some are found."""
 
 OFF, NEAR, WEIGHTS = 3.0, 3.0, (0.3, 0.0, 0.0)
-"""How far a point lies off its surface at most, in deviations of the noise, and from others of it, in radii of a disk;
-and what
-normals count in each fit: averages, they are wrong where a bore is narrow."""
+"""How far a point lies off its surface at most, in deviations of the noise; how far from others of it, in radii of a
+disk; and what normals count in each fit: in the last ones nothing, as averages are wrong where a bore is narrow."""
 
 EXACT, SEARCH = 0.02, 0.05
 """Noise below which nothing is asked of the heights, and least height that is granted in the search, in radii of a
@@ -131,7 +130,14 @@ class _Search:
         return 1.0 - len(self.left(found)) / len(self.points)
 
     def all(self, points: Float, normals: Float, angle: float, found: list[_Face]) -> list[_Face]:
-        """Return some faces, and those found among the points that are on none of them, with averaged ones' help."""
+        """Return some faces, and those found among the points that are on none of them.
+
+        Parameters
+        ----------
+        points, normals : arrays of shape (N, 3), averaged, which propose surfaces
+        angle : degrees between a point's normal and its surface's, at most
+        found : the faces that are there already
+        """
         for _ in range(ROUNDS):
             rest = self.left(found)
             some = np.sort(self.rng.permutation(rest)[:SOUGHT])
@@ -221,9 +227,12 @@ def _feet(surface: Primitive, points: Float) -> Float:
 def _explained(height: Float, points: Float) -> tuple[float, int]:
     """Return how much of some heights, of shape (K,), a quadric explains, in their variance, and by how many terms.
 
-    Noise is explained by as much as there are terms, and twice that is the variance of it.
+    Of noise it explains as much as it has terms, in the mean, and with twice that as the variance.
 
-    The points are of shape (K, 3).
+    Parameters
+    ----------
+    height : array of shape (K,)
+    points : array of shape (K, 3), where the surface is that they are over
     """
     x = points - points.mean(axis=0)
     x = x / np.abs(x).max()

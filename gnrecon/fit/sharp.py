@@ -61,7 +61,7 @@ class Sharp:
     ----------
     samples : of the scan first, which may be averaged, and then those that were added
     averaging : how they were averaged, or None
-    laid : which of them lie on planes and cylinders, if some were laid there
+    laid : those of the scan on planes, cylinders and spheres, where noisy ones were laid there
     across : those that were added across holes
     """
 
