@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.fit.bilateral import Averaging
-from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, surfaces
+from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, surfaces
 from gnrecon.sampling import Density
 
 Mask = npt.NDArray[np.bool_]
@@ -40,6 +40,9 @@ ROUNDS = 3
 OFF, NEAR, WEIGHTS = 3.0, 3.0, (0.3, 0.0, 0.0)
 """How far a point lies off its surface at most, in deviations of the noise; how far from others of it, in radii of a
 disk; and what normals count in each fit: in the last ones nothing, as averages are wrong where a bore is narrow."""
+
+SINGLE = 0.6
+"""Share of the points beside one that lie on faces, beyond which it is taken for one of theirs."""
 
 EXACT, SEARCH = 0.02, 0.05
 """Noise below which nothing is asked of the heights, and least height that is granted in the search, in radii of a
@@ -210,12 +213,30 @@ class _Search:
         """
         far = np.linalg.norm(points - self.points, axis=1) > OFF * self.noise
         points, normals, on = np.where(far[:, None], self.points, points), normals.copy(), np.zeros(len(points), bool)
-        for face in found:
+        for face in self._with_strays(found, normals):
             scanned = self.points[face.rows]
             normals[face.rows] = face.surface.normal(scanned)
             points[face.rows] = _feet(face.surface, scanned)
             on[face.rows] = True
         return Laid(points, normals, on, len(found))
+
+    def _with_strays(self, found: list[_Face], normals: Float) -> list[_Face]:
+        """Return faces with the single points among theirs that are farther off, each on that which looks as it does.
+
+        Near edges there are most of them. As they were scanned, they would make horns.
+        """
+        left = self.left(found)
+        _, near = Density(self.points).tree.query(self.points[left], list(range(2, BESIDE + 2)))
+        single = np.isin(near, left, invert=True).mean(axis=1) > SINGLE
+        rows = left[single]
+        best, like = np.full(len(rows), -1), np.full(len(rows), cosine_of(NEARLY))
+        for number, face in enumerate(found):
+            points, theirs = self.points[rows], normals[rows]
+            alike = np.einsum("kd,kd->k", face.surface.normal(points), theirs)
+            close = Density(self.points[face.rows]).tree.query(points)[0] < NEAR * self.radius
+            better = close & (np.abs(face.surface.at(points)) < ASIDE * self.noise) & (alike > like)
+            best[better], like[better] = number, alike[better]
+        return [_Face(face.surface, np.append(face.rows, rows[best == number])) for number, face in enumerate(found)]
 
 
 def _feet(surface: Primitive, points: Float) -> Float:

@@ -126,6 +126,18 @@ def test_exact_points_stay_and_their_tilted_normals_are_righted() -> None:
     assert np.mean(turned > 1 - 1e-5) > 0.99  # but for some beside an edge
 
 
+def test_single_points_farther_off_than_noise_is_are_laid_too() -> None:
+    exact = cube(3000)
+    points, normals = noisy(exact)
+    rows = np.arange(0, 3000, 60)
+    points[rows] = exact[0][rows] + 4.5 * NOISE * exact[1][rows]
+    found = of((points, normals))
+    assert found is not None
+    axis = np.abs(exact[1][rows]).argmax(axis=1)[:, None]
+    off = np.abs(np.abs(np.take_along_axis(found.points[rows], axis, 1)[:, 0]) - SIDE)
+    assert np.mean(found.on[rows] & (off < 0.2 * NOISE)) > 0.9
+
+
 @pytest.mark.parametrize("by", [2 * NOISE, 5 * NOISE, 10 * NOISE, 20 * NOISE])
 def test_a_face_that_bulges_is_not_laid_flat(by: float) -> None:
     """Averaging knows it well; pieces of cylinders that the noise cannot rule out would be off by half of it."""
