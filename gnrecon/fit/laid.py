@@ -41,6 +41,10 @@ OFF, NEAR, WEIGHTS = 3.0, 3.0, (0.3, 0.0, 0.0)
 """How far a point lies off its surface at most, in deviations of the noise; how far from others of it, in radii of a
 disk; and what normals count in each fit: in the last ones nothing, as averages are wrong where a bore is narrow."""
 
+AROUND, CROSSED = 12, 0.3
+"""Points beside one, of which some lie on another face where there is an edge; and the most share of a face's points
+beside another that are on the wrong side of that."""
+
 SINGLE = 0.6
 """Share of the points beside one that lie on faces, beyond which it is taken for one of theirs."""
 
@@ -213,12 +217,42 @@ class _Search:
         """
         far = np.linalg.norm(points - self.points, axis=1) > OFF * self.noise
         points, normals, on = np.where(far[:, None], self.points, points), normals.copy(), np.zeros(len(points), bool)
-        for face in self._with_strays(found, normals):
+        faces = self._with_strays(found, normals)
+        for face in faces:
             scanned = self.points[face.rows]
             normals[face.rows] = face.surface.normal(scanned)
             points[face.rows] = _feet(face.surface, scanned)
             on[face.rows] = True
-        return Laid(points, normals, on, len(found))
+        return Laid(self._up_to_edges(faces, points), normals, on, len(found))
+
+    def _up_to_edges(self, faces: list[_Face], points: Float) -> Float:
+        """Return laid points, of shape (N, 3), those beyond an edge moved back to it, along their face.
+
+        Noise along a face takes some of its points beyond its edge. Where nearly all of them beside another face are on
+        one side of that, the faces meet in an edge, and the others are beyond it.
+        """
+        owner = np.full(len(points), -1)
+        for number, face in enumerate(faces):
+            owner[face.rows] = number
+        rows = np.flatnonzero(owner >= 0)
+        away, near = Density(points[rows]).tree.query(points[rows], list(range(2, min(AROUND, len(rows)) + 1)))
+        theirs = owner[rows][near]
+        row, rank = np.nonzero((theirs != owner[rows, None]) & (away < NEAR * self.radius))
+        pairs = np.unique(np.stack([owner[rows][row], theirs[row, rank], rows[row]]), axis=1)
+        moved = points.copy()
+        for one, other in np.unique(pairs[:2], axis=1).T:
+            some = pairs[2][(pairs[0] == one) & (pairs[1] == other)]
+            mine, across = faces[one].surface, faces[other].surface
+            x = moved[some]
+            height, cosine = across.at(x), np.einsum("kd,kd->k", mine.normal(x), across.normal(x))
+            side = np.sign(np.median(height))
+            beyond = (side * height < 0) & (np.abs(cosine) < cosine_of(NEARLY))
+            if len(some) < LEAST or beyond.mean() > CROSSED:
+                continue
+            x, height, cosine = x[beyond], height[beyond], cosine[beyond]
+            along = across.normal(x) - cosine[:, None] * mine.normal(x)
+            moved[some[beyond]] = _feet(mine, x - (height / (1 - cosine**2))[:, None] * along)
+        return moved
 
     def _with_strays(self, found: list[_Face], normals: Float) -> list[_Face]:
         """Return faces with the single points among theirs that are farther off, each on that which looks as it does.

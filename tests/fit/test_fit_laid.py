@@ -126,6 +126,18 @@ def test_exact_points_stay_and_their_tilted_normals_are_righted() -> None:
     assert np.mean(turned > 1 - 1e-5) > 0.99  # but for some beside an edge
 
 
+def test_no_point_is_laid_beyond_an_edge() -> None:
+    """Noise in all directions takes points of a face beyond its edge; laid on it there, they would make crumbs."""
+    exact = cube(3000)
+    scan = noisy(exact)
+    points = scan[0] + NOISE * np.random.default_rng(8).standard_normal((3000, 3))
+    found = of((points, scan[1]))
+    assert found is not None
+    beyond = np.sort(np.abs(points), axis=1)[:, 1] > SIDE
+    assert beyond.sum() > 10
+    assert np.abs(found.points[found.on]).max() < SIDE + 0.6 * NOISE
+
+
 def test_single_points_farther_off_than_noise_is_are_laid_too() -> None:
     exact = cube(3000)
     points, normals = noisy(exact)
