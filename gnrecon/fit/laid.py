@@ -41,7 +41,7 @@ OFF, NEAR, WEIGHTS = 3.0, 3.0, (0.3, 0.0, 0.0)
 """How far a point lies off its surface at most, in deviations of the noise; how far from others of it, in radii of a
 disk; and what normals count in each fit: in the last ones nothing, as averages are wrong where a bore is narrow."""
 
-AROUND, CROSSED = 12, 0.3
+AROUND, CROSSED = 12, 0.15
 """Points beside one, of which some lie on another face where there is an edge; and the most share of a face's points
 beside another that are on the wrong side of that."""
 
@@ -249,6 +249,8 @@ class _Search:
             beyond = (side * height < 0) & (np.abs(cosine) < cosine_of(NEARLY))
             if len(some) < LEAST or beyond.mean() > CROSSED:
                 continue
+            # Farther than noise takes points, there is more of the face.
+            beyond &= np.abs(height) < OFF * self.noise
             x, height, cosine = x[beyond], height[beyond], cosine[beyond]
             along = across.normal(x) - cosine[:, None] * mine.normal(x)
             moved[some[beyond]] = _feet(mine, x - (height / (1 - cosine**2))[:, None] * along)
