@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.cloud import Float
+from gnrecon.robust import deviation
 from gnrecon.sampling import Density
 from gnrecon.slices import slices
 
@@ -71,8 +72,8 @@ class Averaging:
         for _ in range(PASSES):
             normals = np.concatenate([self._normals(points, normals, *part) for part in parts])
         for _ in range(PASSES):
-            deviation = self._deviation(points, normals, *some)
-            points = np.concatenate([self._points(points, normals, *part, deviation) for part in parts])
+            usual = self._deviation(points, normals, *some)
+            points = np.concatenate([self._points(points, normals, *part, usual) for part in parts])
         return points, normals
 
     def _neighbours(self, points: Float) -> tuple[list[Part], Part]:
@@ -106,15 +107,15 @@ class Averaging:
     def _deviation(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float) -> float:
         """Return how far most neighbours that count are off some rows of the points, as a standard deviation."""
         weights = self._weights(points, normals, rows, near, widths)[:, 1:]
-        heights = np.abs(_heights(points, normals, rows, near[:, 1:]))
+        heights = _heights(points, normals, rows, near[:, 1:])
         counted = weights > COUNTED * weights.max(axis=1, keepdims=True, initial=0.0)
-        return float(np.median(heights[counted])) / 0.6745 if counted.any() else 0.0
+        return deviation(heights[counted]) if counted.any() else 0.0
 
-    def _points(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float, deviation: float) -> Float:
+    def _points(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float, usual: float) -> Float:
         """Return some rows of the points, moved along their normals."""
         heights = _heights(points, normals, rows, near)
         weights = self._weights(points, normals, rows, near, widths)
-        weights *= np.exp(-((heights / np.maximum(DEVIATIONS * deviation, LEAST_HEIGHT * widths)) ** 2))
+        weights *= np.exp(-((heights / np.maximum(DEVIATIONS * usual, LEAST_HEIGHT * widths)) ** 2))
         moved: Float = points[rows] + ((weights * heights).sum(axis=1) / weights.sum(axis=1))[:, None] * normals[rows]
         return moved
 

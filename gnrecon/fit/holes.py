@@ -22,7 +22,7 @@ from gnrecon.cloud import Float
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.min_cut import minimal_inside, shifted
 from gnrecon.fit.mouths import mouths
-from gnrecon.fit.primitives import Seen, Surface, planar_share, surfaces
+from gnrecon.fit.primitives import Seen, Surface, feet, planar_share, surfaces
 from gnrecon.sampling import Box, CoarseDistance, Density
 
 Int = npt.NDArray[np.integer]
@@ -287,7 +287,7 @@ def _along(
     for number, face in enumerate(faces):
         on = (signed[inner, number] < 0) & (signed[outer, number] >= 0) & believed[inner, number]
         some = ((cells[inner[on]] + cells[outer[on]])[:, None] / 2 + beside[on]).reshape(-1, 3)
-        some = some - face.at(some)[:, None] * face.normal(some)
+        some = feet(face, some)
         turned = face.normal(some)
         # Beyond an edge the cut goes on along another face: there both sides of this one are outside, or both inside.
         below, above = (_sides(inside, lattice, size, some + by * size * turned) for by in (-1, 1))

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.fit.bilateral import Averaging
-from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, surfaces
+from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, feet, surfaces
+from gnrecon.robust import deviation
 from gnrecon.sampling import Density
 
 Mask = npt.NDArray[np.bool_]
@@ -92,11 +93,10 @@ def laid(points: Float, normals: Float, averaged: tuple[Float, Float]) -> Laid |
     """
     if len(points) <= LEAST:
         return None
-    radius = Density(points).radius
+    density = Density(points)
     off = np.einsum("nd,nd->n", points - averaged[0], averaged[1])
-    # The median heeds neither edges nor outliers; of a normal distribution it is this share of the deviation.
-    noise = max(float(np.median(np.abs(off))) / 0.6745, EXACT * radius)
-    search = _Search(points, radius, noise, np.random.default_rng(0))
+    # The median heeds neither edges nor outliers.
+    search = _Search(density, max(deviation(off), EXACT * density.radius), np.random.default_rng(0))
     found = search.all(*averaged, ANGLES[0], [])
     if search.share(found) < MADE:
         return None
@@ -118,12 +118,21 @@ class _Face:
 
 @dataclass(frozen=True)
 class _Search:
-    """Scanned points, of shape (N, 3), with the radius of their disks and the noise of their positions."""
+    """Scanned points, with how densely they lie, and the noise of their positions."""
 
-    points: Float
-    radius: float
+    density: Density
     noise: float
     rng: np.random.Generator
+
+    @property
+    def points(self) -> Float:
+        """The points, of shape (N, 3)."""
+        return self.density.points
+
+    @property
+    def radius(self) -> float:
+        """Radius of their disks."""
+        return self.density.radius
 
     def left(self, found: list[_Face]) -> npt.NDArray[np.integer]:
         """Return the rows of the points that are on none of some faces."""
@@ -194,15 +203,15 @@ class _Search:
 
     def _is_noise(self, surface: Primitive, points: Float) -> bool:
         """Return whether heights over a surface, at points of shape (K, 3), are but noise."""
-        height, feet = surface.at(points), _feet(surface, points)
-        deviation = float(np.sqrt(np.mean(height**2)))
-        if deviation < EXACT * self.radius:
+        height = surface.at(points)
+        size = float(np.sqrt(np.mean(height**2)))
+        if size < EXACT * self.radius:
             return True
         near = Density(points).tree.query(points, list(range(2, min(BESIDE, len(points) - 1) + 2)))[1]
-        alike = float((height * height[near].mean(axis=1)).mean()) / deviation**2
-        bent, terms = _explained(height, feet)
+        alike = float((height * height[near].mean(axis=1)).mean()) / size**2
+        bent, terms = _explained(height, feet(surface, points))
         return (
-            deviation < NO_MORE * self.noise
+            size < NO_MORE * self.noise
             and alike < WHITE / np.sqrt(len(points))
             and bent < terms + BENT * np.sqrt(2 * terms)
         )
@@ -221,7 +230,7 @@ class _Search:
         for face in faces:
             scanned = self.points[face.rows]
             normals[face.rows] = face.surface.normal(scanned)
-            points[face.rows] = _feet(face.surface, scanned)
+            points[face.rows] = feet(face.surface, scanned)
             on[face.rows] = True
         return Laid(self._up_to_edges(faces, points), normals, on, len(found))
 
@@ -253,7 +262,7 @@ class _Search:
             beyond &= np.abs(height) < OFF * self.noise
             x, height, cosine = x[beyond], height[beyond], cosine[beyond]
             along = across.normal(x) - cosine[:, None] * mine.normal(x)
-            moved[some[beyond]] = _feet(mine, x - (height / (1 - cosine**2))[:, None] * along)
+            moved[some[beyond]] = feet(mine, x - (height / (1 - cosine**2))[:, None] * along)
         return moved
 
     def _with_strays(self, found: list[_Face], normals: Float) -> list[_Face]:
@@ -262,7 +271,7 @@ class _Search:
         Near edges there are most of them. As they were scanned, they would make horns.
         """
         left = self.left(found)
-        _, near = Density(self.points).tree.query(self.points[left], list(range(2, BESIDE + 2)))
+        _, near = self.density.tree.query(self.points[left], list(range(2, BESIDE + 2)))
         single = np.isin(near, left, invert=True).mean(axis=1) > SINGLE
         rows = left[single]
         best, like = np.full(len(rows), -1), np.full(len(rows), cosine_of(NEARLY))
@@ -273,12 +282,6 @@ class _Search:
             better = close & (np.abs(face.surface.at(points)) < ASIDE * self.noise) & (alike > like)
             best[better], like[better] = number, alike[better]
         return [_Face(face.surface, np.append(face.rows, rows[best == number])) for number, face in enumerate(found)]
-
-
-def _feet(surface: Primitive, points: Float) -> Float:
-    """Return the points of a surface nearest to some, all of shape (K, 3)."""
-    feet: Float = points - surface.at(points)[:, None] * surface.normal(points)
-    return feet
 
 
 def _explained(height: Float, points: Float) -> tuple[float, int]:

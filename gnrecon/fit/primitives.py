@@ -243,6 +243,12 @@ def planar_share(points: Float, normals: Float, radius: float, off: float, rng: 
     return sum(len(one.points) for one in found) / max(len(points), 1)
 
 
+def feet(surface: Surface, points: Float) -> Float:
+    """Return the points of a surface nearest to some, all of shape (K, 3)."""
+    nearest: Float = points - surface.at(points)[:, None] * surface.normal(points)
+    return nearest
+
+
 def agreed(surface: Surface, points: Float, normals: Float, off: float, angle: float = ANGLE) -> Mask:
     """Return which points, of shape (N, 3), lie on a surface: no farther off it, and by their normals, in degrees."""
     on = np.abs(surface.at(points)) < off

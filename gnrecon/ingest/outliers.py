@@ -15,6 +15,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.robust import deviation
+
 Float = npt.NDArray[np.float64]
 
 _NEIGHBOURS = 16
@@ -41,8 +43,8 @@ def find_outliers(points: Float) -> npt.NDArray[np.bool_]:
         ratio = np.log(spacing / np.median(spacing[neighbours], axis=1))
         if bound is None:
             middle = float(np.median(ratio))
-            deviation = 1.4826 * float(np.median(np.abs(ratio - middle)))
-            bound = max(float(np.log(_LEAST_FACTOR)), middle + _DEVIATIONS * deviation)
+            spread = deviation(ratio - middle)
+            bound = max(float(np.log(_LEAST_FACTOR)), middle + _DEVIATIONS * spread)
         far = ratio > bound
         sparse = np.flatnonzero(spacing > _SPARSE_FACTOR * np.median(spacing))
         far[sparse] |= thickness(points[remaining][neighbours[sparse]]) > _THICKNESS

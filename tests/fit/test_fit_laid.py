@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import made_shapes
 import numpy as np
 import pytest
+from made_shapes import bored_plate
 
 from gnrecon.cloud import Float
 from gnrecon.fit.laid import Laid, laid
@@ -23,33 +25,11 @@ def noisy(scan: Oriented, noise: float = NOISE, tilt: float = 0.15) -> Oriented:
 
 
 def cube(count: int) -> Oriented:
-    rng = np.random.default_rng(0)
-    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
-    x, normals = rng.uniform(-SIDE, SIDE, (count, 3)), np.zeros((count, 3))
-    x[rows, axis] = SIDE * side
-    normals[rows, axis] = side
-    return x, normals
+    return made_shapes.cube(count, SIDE)
 
 
 def bored(count: int) -> Oriented:
-    """Draw points of a square plate with a narrow round bore through it."""
-    rng = np.random.default_rng(1)
-    areas = np.array([2 * (4 * SIDE**2 - np.pi * BORE**2), 16 * SIDE * HEIGHT, 4 * np.pi * BORE * HEIGHT])
-    faces, rim, wall = rng.multinomial(count, areas / areas.sum())
-    x = rng.uniform(-SIDE, SIDE, (2 * faces, 3))
-    x = x[np.hypot(x[:, 0], x[:, 1]) > BORE][:faces]
-    normals = np.zeros_like(x)
-    normals[:, 2] = rng.choice([-1.0, 1.0], len(x))
-    x[:, 2] = HEIGHT * normals[:, 2]
-    angle = rng.uniform(0, 2 * np.pi, wall)
-    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(wall)], axis=1)
-    inner = BORE * around + [0, 0, 1] * rng.uniform(-HEIGHT, HEIGHT, (wall, 1))
-    outer, theirs = rng.uniform(-SIDE, SIDE, (rim, 3)), np.zeros((rim, 3))
-    outer[:, 2] *= HEIGHT / SIDE
-    side, axis = rng.choice([-1.0, 1.0], rim), rng.integers(2, size=rim)
-    theirs[np.arange(rim), axis] = side
-    outer[np.arange(rim), axis] = SIDE * side
-    return np.concatenate([x, inner, outer]), np.concatenate([normals, -around, theirs])
+    return bored_plate(count, SIDE, HEIGHT, BORE, seed=1)
 
 
 def ball(count: int) -> Oriented:
