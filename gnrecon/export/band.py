@@ -49,20 +49,18 @@ class Band:
     slope: float
     leaves: Leaves
 
-    def values(self, nodes: Int) -> Values:
-        """The field at nodes of shape (N, 3), clear of zero and of bounded magnitude."""
-        values = self.lattice.values(nodes, self.slope)
+    def values(self, leaves: Int) -> Values:
+        """The field at the nodes of leaves of shape (N, 3), clear of zero and of bounded magnitude: shape (N, K)."""
+        values = self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope)
         clear = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
         return np.clip(clear, -LIMIT, LIMIT).astype(np.float32)
 
     def evaluate(self, leaves: Int, advance: Advance = unheard) -> None:
         """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
-        count = max(1, self.lattice.batch // len(_NODES))
-        for rows in slices(len(leaves), count):
+        for rows in slices(len(leaves), self.lattice.together(len(_NODES))):
             advance(rows.start / len(leaves))
             some = leaves[rows]
-            values = self.values((some[:, None] * LEAF + _NODES).reshape(-1, 3))
-            self.leaves.keep(some, values.reshape(-1, LEAF, LEAF, LEAF))
+            self.leaves.keep(some, self.values(some).reshape(-1, LEAF, LEAF, LEAF))
 
     def missing(self, chunk: Int) -> Int:
         """Leaves, of shape (N, 3), that hold an unevaluated corner of a cell with a sign change in this chunk."""

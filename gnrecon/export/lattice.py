@@ -14,10 +14,13 @@ import numpy.typing as npt
 from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Float
 from gnrecon.errors import MeshError, UsageError
-from gnrecon.export.protocol import SignedDistance
+from gnrecon.export.protocol import SignedDistance, knows_blocks, sdf_around
 from gnrecon.slices import slices
 
 Int = npt.NDArray[np.int64]
+
+PER_BLOCK = 8
+"""Points that a block counts as for a field that knows blocks: the more at once, the more they share."""
 
 
 @dataclass(frozen=True)
@@ -86,15 +89,54 @@ class Lattice:
         MeshError
             When the field is not finite somewhere.
         """
-        inside = np.clip(nodes, 0, self.cells)
-        depth = np.minimum(nodes, self.cells - nodes).min(axis=1)
+        return self._closed(self._asked(np.clip(nodes, 0, self.cells), advance), nodes, slope)
+
+    def together(self, nodes: int) -> int:
+        """Return how many blocks of so many nodes the field is asked for at once."""
+        return max(1, self.batch // (PER_BLOCK if knows_blocks(self.field) else nodes))
+
+    def values_of_blocks(self, corners: Int, offsets: Int, slope: float) -> Float:
+        """Return what `values` does, of shape (N, K), at K offsets from the corners of blocks, as many as `together`.
+
+        Parameters
+        ----------
+        corners : array of shape (N, 3)
+            The lower corners.
+        offsets : array of shape (K, 3)
+            Of the nodes of every block, not negative.
+        slope : float
+
+        Raises
+        ------
+        MeshError
+            When the field is not finite somewhere.
+        """
+        nodes = corners[:, None] + offsets
+        out = np.empty(nodes.shape[:2])
+        # The field is not asked beyond its box.
+        within = (nodes <= self.cells).all(axis=(1, 2))
+        apart = self.cell * self.field.frame.scale * offsets.astype(np.float64)
+        out[within] = sdf_around(self.field, self.world(corners[within]), apart)
+        if not within.all():
+            clipped = np.minimum(nodes[~within], self.cells).reshape(-1, 3)
+            out[~within] = self._asked(clipped).reshape(-1, len(offsets))
+        return self._closed(out, nodes, slope)
+
+    def _asked(self, nodes: npt.NDArray[np.floating] | Int, advance: Advance = unheard) -> Float:
+        """Return the field in file units, of shape (N,), at lattice coordinates of shape (N, 3)."""
         out = np.empty(len(nodes))
         for rows in slices(len(nodes), self.batch):
-            out[rows] = self.field.sdf(self.world(inside[rows]))
+            out[rows] = self.field.sdf(self.world(nodes[rows]))
             advance(rows.stop / len(nodes))
-        if not np.isfinite(out).all():
-            raise MeshError(f"The field is not finite at {np.count_nonzero(~np.isfinite(out))} of {len(out)} points.")
-        closed: Float = np.maximum(out / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
+        return out
+
+    def _closed(self, values: Float, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
+        """Return the field in cells over its slope, closed at the box, by its values in file units."""
+        if not np.isfinite(values).all():
+            count = np.count_nonzero(~np.isfinite(values))
+            raise MeshError(f"The field is not finite at {count} of {values.size} points.")
+        depth = np.minimum(nodes, self.cells - nodes).min(axis=-1)
+        closed: Float = np.maximum(values / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
         return closed
 
     def gradients(self, nodes: npt.NDArray[np.floating] | Int) -> Float:

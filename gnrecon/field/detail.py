@@ -24,8 +24,8 @@ from gnrecon.threads import abreast
 ROWS = 512
 """Pairs of a point and a cube whose features are made at once: they stay in the processor's cache."""
 
-TOGETHER = 16_384
-"""Points that one thread evaluates at a time."""
+TOGETHER, AROUND = 16_384, 131_072
+"""Points that one thread evaluates at a time: any, and those around centres, which take less each."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,16 @@ class Detail:
         value, gradient = self._blended(x, 1)
         return value, gradient
 
+    def value_around(self, x: Float, offsets: Float) -> Float:
+        """Return d, of shape (N, K), at K offsets, of shape (K, 3), from each of x, of shape (N, 3)."""
+        values = np.empty((len(x), len(offsets)))
+
+        def fill(rows: slice) -> None:
+            values[rows] = self._blend_around(x[rows], offsets)
+
+        abreast(fill, slices(len(x), max(1, AROUND // len(offsets))), self.amplitudes.device)
+        return values
+
     def hessian(self, x: Float) -> Float:
         """Return the second derivatives of d, of shape (N, 3, 3), at x, of shape (N, 3)."""
         return self._blended(x, 2)[2]
@@ -120,6 +130,26 @@ class Detail:
             parts.append(weight[0][:, None, None] * own[2] + cross + cross.mT + own[0][:, None, None] * weight[2])
         to = torch.as_tensor(rows)
         return [part.new_zeros(len(x), *part.shape[1:]).index_add_(0, to, part).numpy() for part in parts]
+
+    def _blend_around(self, x: Float, offsets: Float) -> Float:
+        """Return what `value_around` does, for centres of which all may be held at once, with all of their cubes."""
+        keys, rows = self.partition.pairs_of_boxes(x + offsets.min(axis=0), x + offsets.max(axis=0))
+        cubes = self._cubes(keys)
+        by_cube = np.flatnonzero(cubes >= 0)
+        by_cube = by_cube[np.argsort(cubes[by_cube], kind="stable")]
+        rows, cubes = rows[by_cube], cubes[by_cube]
+        values = np.zeros((len(x), len(offsets)))
+        for some in np.split(np.arange(len(cubes)), np.flatnonzero(np.diff(cubes)) + 1) if len(cubes) else []:
+            cube, near = cubes[some[0]], rows[some]
+            center, length = self.partition.center(self.keys[cube]), float(self.lengths[cube])
+            stencil = self.features.stencil(offsets / length)
+            phase = self.features.phase(torch.as_tensor(x[near]), torch.as_tensor(center), length)
+            own = stencil.sums(phase, self.amplitudes[cube]).double().cpu().numpy()
+            points = torch.as_tensor((x[near][:, None] + offsets).reshape(-1, 3))
+            weight = next(self.partition.weight(points, torch.as_tensor(center), 0)).numpy()
+            # A centre has a cube once, so that no row is named twice.
+            values[near] += weight.reshape(own.shape) * own
+        return values
 
     def _own(self, points: Tensor, centers: Tensor, cubes: Int, order: int) -> list[Tensor]:
         """Return cubes' own functions with derivatives, each at one point, in double precision.

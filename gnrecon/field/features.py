@@ -14,6 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.cloud import Float
+from gnrecon.field.stencil import Stencil
+
 DEGREES_OF_FREEDOM = 12.0
 """Of the features' spectrum, a Student t distribution: the larger, the smoother; 4 is a Matern kernel's."""
 
@@ -60,6 +63,10 @@ class Features:
     def phase(self, x: Tensor, center: Tensor, length: float) -> Tensor:
         """Return F . (x - center) / length + p, of shape (N, m), in the features' precision."""
         return self.local(x, center, length) @ self._affine
+
+    def stencil(self, offsets: Float) -> Stencil:
+        """Return the stencil for offsets over the length, of shape (K, 3), see `gnrecon.field.stencil`."""
+        return Stencil.of(self.frequencies, torch.as_tensor(offsets).to(self.frequencies))
 
     def sums(self, amplitudes: Tensor, x: Tensor, center: Tensor, length: float, order: int) -> list[Tensor]:
         """Return c at x, of shape (N, 3), and its derivatives in space up to an order of at most two.

@@ -77,6 +77,24 @@ class Partition:
         rows, turns = np.nonzero(held)
         return own[rows] + _TURNS[turns] * beside[rows], rows
 
+    def pairs_of_boxes(self, low: Float, high: Float) -> tuple[Int, Int]:
+        """Return every pair of a cube's key, of shape (P, 3), and a row of the boxes that it meets, of shape (P,).
+
+        Parameters
+        ----------
+        low, high : arrays of shape (N, 3)
+            Corners of the boxes.
+        """
+        first, last = (
+            turn((x - self.origin) / self.cell - 0.5 + sign * (1.0 + self.overlap) / 2).astype(np.int64)
+            for turn, x, sign in ((np.ceil, low, -1.0), (np.floor, high, 1.0))
+        )
+        most = int((last - first).max(initial=0)) + 1
+        steps = np.array(list(itertools.product(range(most), repeat=3)))
+        keys = first[:, None] + steps
+        rows, which = np.nonzero((keys <= last[:, None]).all(axis=2))
+        return keys[rows, which], rows
+
     def weight(self, x: Tensor, center: Tensor, order: int) -> Iterator[Tensor]:
         """Yield the weight of the cube around `center`, and its derivatives up to an order of at most two.
 

@@ -11,6 +11,7 @@ networks for shape reconstruction are ``Siren((32, 32, 32))``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from gnrecon.field.jet import Jet
 from gnrecon.field.layout import Layout
+from gnrecon.field.stencil import Stencil
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,21 @@ class Siren:
         for layer_weights, layer_bias in hidden:
             activation = torch.addmm(layer_bias, activation, layer_weights.T).sin_()
         return (activation @ weights[0]).add_(bias)
+
+    def around(self, theta: Tensor, offsets: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return the function that gives f, of shape (N, K), at K offsets from centres of shape (N, 3).
+
+        Parameters
+        ----------
+        theta : of shape (p,)
+        offsets : of shape (K, 3)
+        """
+        layers = self.layout.layers(theta)
+        if len(layers) > 2:
+            return lambda x: self.value(theta, (x[:, None] + offsets).reshape(-1, 3)).reshape(len(x), -1)
+        (weights, bias), (outer, constant) = layers
+        stencil = Stencil.of(weights, offsets)
+        return lambda x: stencil.sums(torch.addmm(bias, x, weights.T), outer[0]).add_(constant)
 
     def value_and_gradient(self, theta: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return f, of shape (N,), and its gradient in x, of shape (N, 3), at points x, of shape (N, 3)."""

@@ -105,6 +105,29 @@ class NeuralSDF:
             values += self.detail.value(x)
         return self.frame.scale * values
 
+    def sdf_around(self, centers: npt.ArrayLike, offsets: npt.ArrayLike) -> Float:
+        """Return signed distances, of shape (N, K), at K offsets from each of N centres, all in file units.
+
+        Where there are many centres, this is many times as fast as `sdf` at the same points.
+
+        Parameters
+        ----------
+        centers : array of shape (N, 3)
+        offsets : array of shape (K, 3)
+        """
+        x = self._unit(centers)
+        apart = np.asarray(offsets, dtype=np.float64).reshape(-1, 3) / self.frame.scale
+        values = np.empty((len(x), len(apart)))
+        around = self.field.around(self.theta, self._tensor(apart))
+
+        def fill(rows: slice) -> None:
+            values[rows] = around(self._tensor(x[rows])).cpu().numpy()
+
+        self._each_batch(fill, len(x))
+        if self.detail is not None:
+            values += self.detail.value_around(x, apart)
+        return self.frame.scale * values
+
     def gradient(self, points: npt.ArrayLike) -> Float:
         """Return the gradient of the distance, of shape (N, 3), at `points`, of shape (N, 3); it has no unit."""
         return self.sdf_and_gradient(points)[1]

@@ -52,6 +52,22 @@ def _nearest(queries: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.n
     return cKDTree(targets).query(queries)
 
 
+@pytest.mark.parametrize("name", ["torus", "sphere beyond the box", "random sines"])
+def test_a_field_that_knows_blocks_is_asked_for_them_within_its_box(name: str) -> None:
+    class Knowing(Field):
+        def sdf_around(self, centers: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+            points = (centers[:, None] + offsets).reshape(-1, 3)
+            low, high = self.bounds
+            assert ((points >= low - 1e-9) & (points <= high + 1e-9)).all()
+            return Field(SHAPES[name]).sdf(points).reshape(len(centers), -1)
+
+    knowing, plain = Knowing(SHAPES[name]), Field(SHAPES[name])
+    mesh, expected = extract(knowing, resolution=64), extract(plain, resolution=64)
+    assert np.array_equal(mesh.faces, expected.faces)
+    assert np.allclose(mesh.vertices, expected.vertices, rtol=0, atol=1e-9)
+    assert knowing.asked < 0.5 * plain.asked
+
+
 def test_few_points_are_asked() -> None:
     field = Field(sphere())
     mesh = extract(field, resolution=256)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
-from gnrecon.field.detail import TOGETHER, Detail
+from gnrecon.field.detail import AROUND, TOGETHER, Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
 from gnrecon.pipeline import limited
@@ -51,6 +52,27 @@ def test_it_is_the_blend_of_its_cubes(rng: np.random.Generator) -> None:
     x = points(of, rng)
     np.testing.assert_allclose(of.value(x), [plainly(of, point) for point in x], atol=1e-12)
     assert (of.value(of.partition.origin + np.array([[-5.0, 0, 0], [0.2, 0.2, 9.0]])) == 0).all()
+
+
+@pytest.mark.parametrize("reach", [0.05, 0.4, 1.6], ids=["within a cube", "as large as one", "larger than cubes"])
+def test_around_centres_it_is_what_it_is_at_each_point(reach: float, rng: np.random.Generator) -> None:
+    of = detail(rng)
+    x, offsets = points(of, rng), rng.uniform(-reach, reach, (11, 3))
+    expected = of.value((x[:, None] + offsets).reshape(-1, 3)).reshape(len(x), -1)
+    np.testing.assert_allclose(of.value_around(x, offsets), expected, rtol=0, atol=1e-12)
+    assert np.abs(expected).max() > 0.1
+
+
+def test_around_many_centres_threads_change_nothing(rng: np.random.Generator) -> None:
+    of = detail(rng)
+    offsets = rng.uniform(-0.1, 0.1, (64, 3))
+    x = points(of, rng, 2 * AROUND // len(offsets) + 5)
+    found = []
+    for count in (1, 2):
+        with limited(count):
+            found.append(of.value_around(x, offsets))
+    np.testing.assert_array_equal(*found)
+    np.testing.assert_allclose(found[0][-1], of.value(x[-1] + offsets), rtol=0, atol=1e-12)
 
 
 def test_derivatives_are_those_of_differences(rng: np.random.Generator) -> None:

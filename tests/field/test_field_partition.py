@@ -46,6 +46,25 @@ def test_members_are_all_whose_weight_is_not_zero(partition: Partition, rng: np.
     assert keys.tolist() == sorted(keys.tolist())
 
 
+@pytest.mark.parametrize("size", [0.0, 0.1, 0.7], ids=["points", "small", "larger than cubes"])
+def test_a_box_meets_the_cubes_that_hold_some_of_its_points(
+    partition: Partition, size: float, rng: np.random.Generator
+) -> None:
+    low = cloud(partition, rng, 40)
+    sizes = rng.uniform(0.0, size, low.shape)
+    keys, rows = partition.pairs_of_boxes(low, low + sizes)
+    found = {(tuple(key), int(row)) for key, row in zip(keys.tolist(), rows, strict=True)}
+    assert len(found) == len(rows)
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(0.0, 1.0, 12)], indexing="ij"), axis=-1).reshape(-1, 3)
+    keys, rows = partition.pairs((low[:, None] + sizes[:, None] * grid).reshape(-1, 3))
+    held = {(tuple(key), int(row)) for key, row in zip(keys.tolist(), rows // len(grid), strict=True)}
+    assert held <= found
+    for key, row in found:
+        center = partition.center(key)
+        nearest = np.clip(center, low[row], low[row] + sizes[row])
+        assert (np.abs(nearest - center) <= partition.reach + 1e-12).all()
+
+
 def test_derivatives_are_those_of_autodiff(partition: Partition, rng: np.random.Generator) -> None:
     center = torch.as_tensor(partition.center((0, 0, 0)))
     x = center + torch.as_tensor(rng.uniform(-1.0, 1.0, (50, 3))) * partition.reach

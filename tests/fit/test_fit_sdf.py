@@ -57,6 +57,17 @@ def test_gradient_agrees_with_finite_differences(frame: Frame) -> None:
     assert np.allclose(sdf.gradient(x), slopes, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("frame", [UNIT, UTM], ids=["unit", "UTM"])
+@pytest.mark.parametrize("widths", [(11,), (9, 7)], ids=str)
+def test_around_centres_it_answers_what_it_does_at_each_point(widths: tuple[int, ...], frame: Frame) -> None:
+    sdf = random_field(widths, frame)
+    centers, offsets = frame.to_world(points(30)), 0.3 * frame.scale * points(8)
+    values = sdf.sdf_around(centers, offsets)
+    expected = sdf.sdf((centers[:, None] + offsets).reshape(-1, 3)).reshape(30, 8)
+    assert np.allclose(values, expected, rtol=0, atol=1e-7)
+    assert np.ptp(expected) > 0.1 * frame.scale
+
+
 def test_normals_are_unit_gradients_and_finite_where_the_gradient_vanishes() -> None:
     sdf = random_field()
     x = UTM.to_world(points(30))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.cloud import Float, Frame
-from gnrecon.export import SignedDistance, extract, project
+from gnrecon.export import extract, project
 from gnrecon.export.lattice import Lattice
 from gnrecon.fit import NeuralSDF
 
@@ -16,7 +16,7 @@ from gnrecon.fit import NeuralSDF
 class Counting:
     """A field that counts the points which it is asked for, of values and of gradients."""
 
-    def __init__(self, field: SignedDistance) -> None:
+    def __init__(self, field: NeuralSDF) -> None:
         self._field = field
         self.values = self.gradients = 0
 
@@ -34,6 +34,11 @@ class Counting:
         """Ask the field for values."""
         self.values += len(points)
         return self._field.sdf(points)
+
+    def sdf_around(self, centers: Float, offsets: Float) -> Float:
+        """Ask the field for values around centres."""
+        self.values += len(centers) * len(offsets)
+        return self._field.sdf_around(centers, offsets)
 
     def gradient(self, points: Float) -> Float:
         """Ask the field for gradients."""
