@@ -50,8 +50,11 @@ class Band:
     leaves: Leaves
 
     def values(self, leaves: Int) -> Values:
-        """The field at the nodes of leaves of shape (N, 3), clear of zero and of bounded magnitude: shape (N, K)."""
-        values = self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope)
+        """The field at the nodes of leaves, of shape (N, 3): clear, of shape (N, K)."""
+        return self.clear(self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope))
+
+    def clear(self, values: Float) -> Values:
+        """Return values over the slope, of any shape, clear of zero and of bounded magnitude."""
         clear = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
         return np.clip(clear, -LIMIT, LIMIT).astype(np.float32)
 

@@ -63,9 +63,8 @@ class _Task:
     across: Continued
 
     @classmethod
-    def of(cls, samples: Samples, by_blocks: bool, edges: bool, rng: np.random.Generator) -> _Task:
-        """Draw what is held out of a scan, whose faces are continued if `edges` says so and it has any."""
-        sharp = Sharp.of(samples) if edges else None
+    def of(cls, samples: Samples, sharp: Sharp | None, by_blocks: bool, rng: np.random.Generator) -> _Task:
+        """Draw what is held out of a scan, whose faces may be continued."""
         if sharp is not None:
             samples = sharp.samples
         order = rng.permutation(len(samples))
@@ -139,11 +138,13 @@ def fit_adaptive(
             "thin the scan with --max-points."
         )
     edges = not (by_blocks or options.regularisers)
-    task = _Task.of(samples, by_blocks, edges, rng)
+    sharp = Sharp.of(samples) if edges and not samples.estimated else None
+    task = _Task.of(samples, sharp, by_blocks, rng)
     turned, left_out = 0.0, 0
     if samples.estimated:
         samples, turned = reconciled(samples, task.rows, options)
-        task = replace(task, samples=samples)
+        sharp = Sharp.of(samples) if edges else None
+        task = replace(task, samples=samples) if sharp is None else _Task.of(samples, sharp, by_blocks, rng)
     whole = task
     closes = not options.regularisers  # which say themselves how holes are closed
     task = task.continued(rng) if closes else task
@@ -153,7 +154,7 @@ def fit_adaptive(
         left_out = int(off.sum())
         if left_out:
             samples = replace(samples, points=samples.points[~off], normals=samples.normals[~off])
-            task = _Task.of(samples, by_blocks, edges, rng) if task.sharp else whole.without(off)
+            task = _Task.of(samples, Sharp.of(samples), by_blocks, rng) if task.sharp else whole.without(off)
             task = task.continued(rng) if closes else task
             first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, SHARE / 2, SHARE))
     sdf = first.sdf

@@ -96,7 +96,7 @@ def laid(points: Float, normals: Float, averaged: tuple[Float, Float]) -> Laid |
     density = Density(points)
     off = np.einsum("nd,nd->n", points - averaged[0], averaged[1])
     # The median heeds neither edges nor outliers.
-    search = _Search(density, max(deviation(off), EXACT * density.radius), np.random.default_rng(0))
+    search = Search(density, max(deviation(off), EXACT * density.radius), np.random.default_rng(0))
     found = search.all(*averaged, ANGLES[0], [])
     if search.share(found) < MADE:
         return None
@@ -109,7 +109,7 @@ def laid(points: Float, normals: Float, averaged: tuple[Float, Float]) -> Laid |
 
 
 @dataclass(frozen=True)
-class _Face:
+class Face:
     """A surface and the rows of the points that it cannot be told from."""
 
     surface: Primitive
@@ -117,7 +117,7 @@ class _Face:
 
 
 @dataclass(frozen=True)
-class _Search:
+class Search:
     """Scanned points, with how densely they lie, and the noise of their positions."""
 
     density: Density
@@ -134,18 +134,18 @@ class _Search:
         """Radius of their disks."""
         return self.density.radius
 
-    def left(self, found: list[_Face]) -> npt.NDArray[np.integer]:
+    def left(self, found: list[Face]) -> npt.NDArray[np.integer]:
         """Return the rows of the points that are on none of some faces."""
         free = np.ones(len(self.points), dtype=bool)
         for face in found:
             free[face.rows] = False
         return np.flatnonzero(free)
 
-    def share(self, found: list[_Face]) -> float:
+    def share(self, found: list[Face]) -> float:
         """Return the share of the points that are on some faces."""
         return 1.0 - len(self.left(found)) / len(self.points)
 
-    def all(self, points: Float, normals: Float, angle: float, found: list[_Face]) -> list[_Face]:
+    def all(self, points: Float, normals: Float, angle: float, found: list[Face]) -> list[Face]:
         """Return some faces, and those found among the points that are on none of them.
 
         Parameters
@@ -172,7 +172,7 @@ class _Search:
 
     def _face(
         self, seen: Seen, free: npt.NDArray[np.integer], normals: Float, angle: float, near: float
-    ) -> _Face | None:
+    ) -> Face | None:
         """Return the face of a surface and those free points that it cannot be told from, or None if it can.
 
         Parameters
@@ -199,7 +199,7 @@ class _Search:
         aside &= np.abs(surface.at(points)) > OFF * self.noise
         if int(aside.sum()) > BENDS * int(on.sum()):
             return None
-        return _Face(surface, rows[on])
+        return Face(surface, rows[on])
 
     def _is_noise(self, surface: Primitive, points: Float) -> bool:
         """Return whether heights over a surface, at points of shape (K, 3), are but noise."""
@@ -216,7 +216,7 @@ class _Search:
             and bent < terms + BENT * np.sqrt(2 * terms)
         )
 
-    def laid(self, found: list[_Face], points: Float, normals: Float) -> Laid:
+    def laid(self, found: list[Face], points: Float, normals: Float) -> Laid:
         """Return the points on faces, and the others averaged, but for those that this moves farther than noise does.
 
         Parameters
@@ -234,7 +234,7 @@ class _Search:
             on[face.rows] = True
         return Laid(self._up_to_edges(faces, points), normals, on, len(found))
 
-    def _up_to_edges(self, faces: list[_Face], points: Float) -> Float:
+    def _up_to_edges(self, faces: list[Face], points: Float) -> Float:
         """Return laid points, of shape (N, 3), those beyond an edge moved back to it, along their face.
 
         Noise along a face takes some of its points beyond its edge. Where nearly all of them beside another face are on
@@ -265,7 +265,7 @@ class _Search:
             moved[some[beyond]] = feet(mine, x - (height / (1 - cosine**2))[:, None] * along)
         return moved
 
-    def _with_strays(self, found: list[_Face], normals: Float) -> list[_Face]:
+    def _with_strays(self, found: list[Face], normals: Float) -> list[Face]:
         """Return faces with the single points among theirs that are farther off, each on that which looks as it does.
 
         Near edges there are most of them. As they were scanned, they would make horns.
@@ -281,7 +281,7 @@ class _Search:
             close = Density(self.points[face.rows]).tree.query(points)[0] < NEAR * self.radius
             better = close & (np.abs(face.surface.at(points)) < ASIDE * self.noise) & (alike > like)
             best[better], like[better] = number, alike[better]
-        return [_Face(face.surface, np.append(face.rows, rows[best == number])) for number, face in enumerate(found)]
+        return [Face(face.surface, np.append(face.rows, rows[best == number])) for number, face in enumerate(found)]
 
 
 def _explained(height: Float, points: Float) -> tuple[float, int]:

@@ -28,6 +28,10 @@ ANGLE = 10.0
 LEAST, MOST = 12, 12
 """Least points of a surface, and most surfaces of a round of proposals."""
 
+MISSED = 30
+"""Proposals in a row that may fail, the largest first, before no more are tried: on made shapes one in that many holds,
+and on round ones, of which each piece looks like some surface, hundreds would be fitted in vain."""
+
 FLAT, BESIDE, NEAR = 0.3, 12, 3.0
 """Share of a point's neighbours that lie on its plane where there is one; how many are asked, and how near they are,
 in radii of a disk."""
@@ -330,7 +334,8 @@ class _Search:
         agreeing = agreeing.reshape(len(proposed), len(rows))
         kinds = np.array([KINDS.index(type(one)) for one in proposed])
         free, wanted = np.ones(len(rows), dtype=bool), np.ones(len(proposed), dtype=bool)
-        while wanted.any() and len(found) < MOST:
+        missed = 0
+        while wanted.any() and len(found) < MOST and missed < MISSED:
             count = np.where(wanted, (agreeing & free).sum(axis=1), 0)
             best = int(np.argmax(count))
             if count[best] < LEAST:
@@ -348,6 +353,7 @@ class _Search:
             settled = (agreeing & like).sum(axis=1) >= SETTLED * count
             wanted &= ~(settled & (holds | (kinds == kinds[best])))
             wanted[best] = False
+            missed = 0 if holds else missed + 1
             if holds:
                 found.append(Seen(surface, points[on]))
                 free &= ~on

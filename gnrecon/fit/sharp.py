@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.cloud import Float, Samples
+from gnrecon.fit.bare import laid_bare
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.holes import Continued, continued
@@ -81,13 +82,18 @@ class Sharp:
     def of(cls, samples: Samples) -> Sharp | None:
         """Return the samples of a scan with its faces continued, or None where no sharp edges are beyond doubt.
 
-        Estimated normals are means over edges, which tell too little of them.
+        Estimated normals are means over edges, which tell too little of them, but for points that lie on surfaces.
         """
-        if samples.estimated or len(samples) > MOST_POINTS or len(samples) <= BESIDE:
+        if len(samples) > MOST_POINTS or len(samples) <= BESIDE:
             return None
         points, normals, averaging, flat = samples.points, samples.normals, None, None
+        if samples.estimated:
+            flat = laid_bare(points, normals)
+            if flat is None:
+                return None
+            points, normals = flat.points, flat.normals
         faces = Faces(points, normals)
-        if faces.roughness > ROUGH:
+        if faces.roughness > ROUGH and not samples.estimated:
             averaging = AVERAGING
             averaged = averaging.of(points, normals)
             flat = laid(points, normals, averaged)

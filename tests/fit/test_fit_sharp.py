@@ -12,6 +12,7 @@ from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit, sharp
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.sharp import AVERAGING, Sharp
+from gnrecon.ingest.normals import oriented_normals
 from gnrecon.sampling import Density
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
@@ -144,9 +145,26 @@ def test_where_two_faces_meet_in_a_fillet_nothing_is_added_beyond_it() -> None:
     assert agreed == 1.0
 
 
-def test_estimated_normals_and_many_points_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faces_are_continued_by_the_normals_of_their_surfaces_where_normals_were_estimated() -> None:
     samples = cube(600)
-    assert Sharp.of(replace(samples, estimated=True)) is None
+    scanned = replace(samples, normals=oriented_normals(samples.points).normals, estimated=True)
+
+    def exact(normals: np.ndarray) -> float:
+        return float((np.abs(normals).max(axis=1) > np.cos(np.radians(5))).mean())
+
+    found = Sharp.of(scanned)
+    assert found is not None
+    assert found.laid is not None
+    assert found.laid.surfaces == 6
+    assert found.averaging is None
+    assert exact(scanned.normals) < 0.9
+    assert exact(found.samples.normals) > 0.98
+    assert off_cube(found.samples.points).max() < 0.01
+
+
+def test_round_shapes_and_many_points_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = cube(600)
+    assert Sharp.of(replace(ball(600), estimated=True)) is None
     assert Sharp.of(replace(samples, points=samples.points[:5], normals=samples.normals[:5])) is None
     monkeypatch.setattr(sharp, "MOST_POINTS", 599)
     assert Sharp.of(samples) is None
@@ -160,9 +178,12 @@ def test_points_that_are_there_twice_do_no_harm() -> None:
     assert found is None or np.isfinite(found.samples.points).all()
 
 
-def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("estimated", [False, True], ids=["given normals", "estimated normals"])
+def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.MonkeyPatch, estimated: bool) -> None:
     """Against the same fit without: the mean distance of its zero level from the cube's edges and faces."""
     scan, options = cube(500), FitOptions(quality="draft")
+    if estimated:
+        scan = replace(scan, normals=oriented_normals(scan.points).normals, estimated=True)
     exact = cube(3000, seed=5)
     # Beside the edges, where |f| of a signed distance is the distance.
     places = exact.points[from_edges(exact.points) < 0.1]
@@ -176,6 +197,7 @@ def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.Mon
     continued, status = error()
     assert "Continued faces to their edges by" in status
     assert "degrees in normals" not in status
+    assert ("points on 6 planes, cylinders and spheres" in status) == estimated
     monkeypatch.setattr(Sharp, "of", classmethod(lambda *_: None))
     plain, status = error()
     assert "Continued" not in status
