@@ -111,7 +111,7 @@ def mesh_field(
         mesh, repaired = repair(mesh)
         cut: list[str] = []
         if data is not None and not options.keep_handles:
-            mesh, cut = remove_handles(mesh, data, sound=True)
+            mesh, cut = remove_handles(mesh, data)
         fineness = measure_fineness(mesh, field, cells, box)
     return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *_said(fineness, options)])
 

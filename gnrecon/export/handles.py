@@ -54,7 +54,7 @@ ROUNDS, TOGETHER = 20, 24
 """Times that loops are looked for, and loops that are cut at once: few enough for their words of 64 bits."""
 
 
-def remove_handles(mesh: Mesh, points: Float, *, sound: bool = False) -> tuple[Mesh, list[str]]:
+def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     """Cut handles and close tunnels that no points support.
 
     Parameters
@@ -63,8 +63,6 @@ def remove_handles(mesh: Mesh, points: Float, *, sound: bool = False) -> tuple[M
         A closed, oriented 2-manifold.
     points : array of shape (N, 3), units of the mesh
         The cloud that the surface was fitted to.
-    sound : bool
-        Whether the mesh is known to be sound; else that is required first.
 
     Returns
     -------
@@ -78,8 +76,7 @@ def remove_handles(mesh: Mesh, points: Float, *, sound: bool = False) -> tuple[M
     MeshError
         When the mesh is not sound, as an open one.
     """
-    if not sound:
-        require_sound(mesh)
+    require_sound(mesh)
     if len(points) < 2:
         return mesh, []
     support, rng = _Support(points), np.random.default_rng(0)
