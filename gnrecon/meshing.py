@@ -15,9 +15,10 @@ import numpy as np
 
 from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Float
-from gnrecon.export import SignedDistance, extract, project, refine, remove_handles, remove_stray, repair
+from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.export.protocol import sdf_and_gradient
+from gnrecon.fit import NeuralSDF
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 
@@ -28,6 +29,12 @@ SAFE = 0.95
 
 MOST_SHIFTED, MOST_TILTED = 0.2, 1e-3
 """Errors of single precision that are put up with: in cells, and of gradients, as a share of themselves."""
+
+CHORD = 0.07
+"""Mean distance of a mesh's faces from the surface, over its curvature and the square of a cell: 0.072 on spheres."""
+
+MOST_SMOOTH, ASKED = 224, 2000
+"""Most cells that a smooth shape gets for its faces' sake, and points at which its curvature is asked for."""
 
 StageTimer = Callable[[str], AbstractContextManager[None]]
 """Gives the context in which a stage of a name runs, such as `gnrecon.report.Stages`."""
@@ -45,6 +52,25 @@ class MeshedField(SignedDistance, Protocol):
     def single(self) -> SignedDistance:
         """Return the same field in single precision."""
         ...
+
+
+def fine_enough(sdf: NeuralSDF, cells: int) -> int:
+    """Return the cells, or as many more as make faces no farther off the surface than the field itself may be, up to 224.
+
+    How much of the shape the smooth global field leaves over to the detail at the data tells how far it is off between
+    them at most. That is far more than faces are off, but on smooth shapes that were scanned without noise.
+    """
+    data = sdf.data
+    if sdf.detail is None or data is None or cells >= MOST_SMOOTH:
+        return cells
+    some = data[:: max(1, len(data) // ASKED)]
+    off = float(np.sqrt(np.mean(sdf.coarse().sdf(some) ** 2)))
+    mean, gauss = curvatures(sdf.gradient(some), sdf.hessian(some))
+    bend = float(np.nanmean(np.sqrt((4 * mean**2 - 2 * gauss).clip(0.0))))
+    longest = float(np.ptp(sdf.bounds, axis=0).max())
+    # off = CHORD bend (longest / wanted)^2
+    wanted = longest * np.sqrt(CHORD * bend / max(off, np.finfo(np.float64).tiny))
+    return int(np.clip(np.ceil(wanted), cells, MOST_SMOOTH))
 
 
 @dataclass(frozen=True)

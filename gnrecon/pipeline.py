@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ from gnrecon.io import (
 )
 from gnrecon.logs import TOLD
 from gnrecon.mesh import Mesh
-from gnrecon.meshing import mesh_field
+from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
 from gnrecon.region import Region
@@ -237,6 +237,7 @@ def _run(
     with stages("ingest"):
         samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
         scan, layers = survey(cloud), layers_of(samples, counts.normals)
+    free = options.resolution is None and options.edge_length is None and options.max_error is None
     options = options.for_scan(samples.frame.to_world(samples.points), bounds_of(samples))
     options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
     warnings = [] if layers is None else [layers.describe()]
@@ -250,6 +251,8 @@ def _run(
     remark(solution.status)
     if unseen is not None:
         remark(f"At {counts.held_out} points that the fit never saw: {unseen.describe()}")
+    if free and options.resolution is not None:
+        options = replace(options, resolution=fine_enough(sdf, options.resolution))
     # The field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
     mesh, actions = meshed.mesh, meshed.actions

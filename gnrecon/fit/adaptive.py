@@ -19,6 +19,7 @@ from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.errors import UsageError
 from gnrecon.fit.averaged import Told, told
+from gnrecon.fit.ball import Ball
 from gnrecon.fit.choose import Int, Mask
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.detail import CHOSEN, ShapingFor, fit_detail
@@ -116,8 +117,8 @@ def fit_adaptive(
     The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given; then a
     Dask cluster can solve them, too.
 
-    The faces of a sharp shape are continued to their edges first (`sharp`), and planes and cylinders of any across its
-    holes (`holes`).
+    The points of a ball are laid on it first (`ball`), and the faces of a sharp shape are continued to their edges
+    (`sharp`), planes and cylinders of any across its holes (`holes`).
 
     Normals that were estimated are turned around where a first field contradicts them, and points that lie off the
     surface of their neighbours are left out.
@@ -138,6 +139,9 @@ def fit_adaptive(
             "thin the scan with --max-points."
         )
     edges = not (by_blocks or options.regularisers)
+    ball = Ball.of(samples) if edges else None
+    scanned = len(samples)
+    samples = samples if ball is None else ball.samples
     sharp = Sharp.of(samples) if edges and not samples.estimated else None
     task = _Task.of(samples, sharp, by_blocks, rng)
     turned, left_out = 0.0, 0
@@ -178,6 +182,11 @@ def fit_adaptive(
     also += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
     if known is not None and known.averaging is not None:
         also += f" Averaged noisy points over {known.averaging.width:g} of their disks' radii, where normals agree."
+    if ball is not None:
+        also += (
+            f" Laid {scanned} points on a ball of radius {ball.radius:.6g}, from which their noise cannot tell them, "
+            f"and filled its gaps by {len(ball.samples) - scanned} samples."
+        )
     if task.sharp is not None:
         also += _laid(task.sharp)
         also += f" Continued faces to their edges by {len(task.samples) - len(samples) - len(task.across)} samples."

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from gnrecon.cloud import Float
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, feet, surfaces
+from gnrecon.fit.white import is_white
 from gnrecon.robust import deviation
 from gnrecon.sampling import Density
 
@@ -46,8 +47,9 @@ AROUND, CROSSED = 12, 0.15
 """Points beside one, of which some lie on another face where there is an edge; and the most share of a face's points
 beside another that are on the wrong side of that."""
 
-SINGLE = 0.6
-"""Share of the points beside one that lie on faces, beyond which it is taken for one of theirs."""
+SINGLE, BESIDE = 0.6, 6
+"""Share of the points beside one that lie on faces, beyond which it is taken for one of theirs; and how many of them
+are asked."""
 
 EXACT, SEARCH = 0.02, 0.05
 """Noise below which nothing is asked of the heights, and least height that is granted in the search, in radii of a
@@ -61,13 +63,8 @@ RING, ASIDE, NEARLY, BENDS = 3.0, 7.0, 30.0, 0.1
 """How far around a surface its shape may bend away, in what is near; how far off it such points are, in deviations of
 the noise, and degrees between their normals and its own, at most; and how many there may be, over its own."""
 
-NO_MORE, WHITE, BESIDE = 1.25, 2.5, 6
-"""Most deviation of the heights, over the noise; most correlation of a height with its neighbours' mean, times the root
-of their number; and how many neighbours."""
-
-BENT, RANK = 3.0, 0.01
-"""By how many deviations of it a quadric may explain the heights better than it explains noise; and how much smaller
-than the largest of its terms one may be, over the points, that counts."""
+NO_MORE = 1.25
+"""Most deviation of the heights, over the noise."""
 
 
 @dataclass(frozen=True)
@@ -207,14 +204,7 @@ class Search:
         size = float(np.sqrt(np.mean(height**2)))
         if size < EXACT * self.radius:
             return True
-        near = Density(points).tree.query(points, list(range(2, min(BESIDE, len(points) - 1) + 2)))[1]
-        alike = float((height * height[near].mean(axis=1)).mean()) / size**2
-        bent, terms = _explained(height, feet(surface, points))
-        return (
-            size < NO_MORE * self.noise
-            and alike < WHITE / np.sqrt(len(points))
-            and bent < terms + BENT * np.sqrt(2 * terms)
-        )
+        return size < NO_MORE * self.noise and is_white(height, points, feet(surface, points))
 
     def laid(self, found: list[Face], points: Float, normals: Float) -> Laid:
         """Return the points on faces, and the others averaged, but for those that this moves farther than noise does.
@@ -282,22 +272,3 @@ class Search:
             better = close & (np.abs(face.surface.at(points)) < ASIDE * self.noise) & (alike > like)
             best[better], like[better] = number, alike[better]
         return [Face(face.surface, np.append(face.rows, rows[best == number])) for number, face in enumerate(found)]
-
-
-def _explained(height: Float, points: Float) -> tuple[float, int]:
-    """Return how much of some heights, of shape (K,), a quadric explains, in their variance, and by how many terms.
-
-    Of noise it explains as much as it has terms, in the mean, and with twice that as the variance.
-
-    Parameters
-    ----------
-    height : array of shape (K,)
-    points : array of shape (K, 3), where the surface is that they are over
-    """
-    x = points - points.mean(axis=0)
-    x = x / np.abs(x).max()
-    i, j = np.triu_indices(3)
-    terms = np.concatenate([np.ones((len(x), 1)), x, x[:, i] * x[:, j]], axis=1)
-    basis, size, _ = np.linalg.svd(terms, full_matrices=False)
-    basis = basis[:, size > RANK * size[0]]
-    return float(((basis.T @ height) ** 2).sum() / np.mean(height**2)), basis.shape[1]
