@@ -5,9 +5,10 @@ hangs together by necks and is pierced by tunnels that no scan could have told. 
 such a tunnel does not take the surface apart, and is short beside the disks that points stand for. A real tunnel has
 points on its wall, and a real rod on its sides: the normals of the surface at the points near its loop go all around
 it. So a loop is dropped where these leave more than half of the circle bare and it is no longer than the rim of one
-disk, or five sixths and it is twice as long. The surface is cut along the loop, and both rims are closed by a cap: a
-neck is cut through, a tunnel closed at both ends, and the genus is one less. Then the caps, what lies right beside
-them, and what is left of a neck are laid out smoothly; what points support stays.
+disk, or five sixths and it is twice as long. It may be three times as long where it runs around a neck and no point is
+near at all; the wall of a tunnel may be out of sight of a scanner that saw its mouths. The surface is cut along the
+loop, and both rims are closed by a cap: a neck is cut through, a tunnel closed at both ends, and the genus is one less.
+Then the caps, what lies right beside them, and what is left of a neck are laid out smoothly; what points support stays.
 Sources: Guskov and Wood, Topological noise removal (2001); Kobbelt, Campagna, Vorsatz and Seidel, Interactive
 multi-resolution modeling on arbitrary meshes (1998), for the layout.
 """
@@ -37,6 +38,9 @@ RIM = 2 * np.pi
 
 BARE = (1.0, np.pi), (2.0, 5 / 3 * np.pi)
 """Lengths of loops that are dropped, at most, in rims, and how much of the circle their points must leave bare."""
+
+UNSEEN = 3.0
+"""Length of a loop around a neck that no point is near, at most, in rims."""
 
 NEAR, UPON = 2.0, 0.7
 """How near to a place and to the surface points lie that tell of it, in disks."""
@@ -80,7 +84,18 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     if len(points) < 2:
         return mesh, []
     support, rng = _Support(points), np.random.default_rng(0)
-    count, widest = 0, 0.0
+    mesh, lengths = _cut_bare(mesh, support, rng)
+    mesh, more = _cut_unseen(mesh, support, rng)
+    lengths += more
+    if not lengths:
+        return mesh, []
+    handles = "a handle or tunnel" if len(lengths) == 1 else f"{len(lengths)} handles or tunnels"
+    return mesh, [f"Removed {handles} that no points support, of up to {max(lengths):.3g} around."]
+
+
+def _cut_bare(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tuple[Mesh, list[float]]:
+    """Cut along short loops whose points leave more bare than they may, and return the loops' lengths, too."""
+    lengths: list[float] = []
     disks, sought = support.disks(mesh), np.ones(len(mesh.vertices), dtype=bool)
     for _ in range(ROUNDS):
         bare = support.bare(mesh, disks, short_loops(mesh, BARE[-1][0] * RIM * disks, sought, rng))
@@ -88,15 +103,29 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
         cut = _without(mesh, loops, support)
         if cut is None:
             break
-        count, widest = count + len(loops), max(widest, *(loop.length for loop in loops))
+        lengths += [loop.length for loop in loops]
         # Those that are left lie near some that were found, which hid them or lay too near to be cut at once.
         places = cKDTree(np.concatenate([mesh.vertices[loop.vertices] for loop in bare]))
         mesh, disks = cut, support.disks(cut)
         sought = places.query(mesh.vertices)[0] <= RIM * disks
-    if not count:
-        return mesh, []
-    handles = "a handle or tunnel" if count == 1 else f"{count} handles or tunnels"
-    return mesh, [f"Removed {handles} that no points support, of up to {widest:.3g} around."]
+    return mesh, lengths
+
+
+def _cut_unseen(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tuple[Mesh, list[float]]:
+    """Cut along longer loops around necks that no point is near, and return the loops' lengths, too."""
+    lengths: list[float] = []
+    for _ in range(ROUNDS):
+        disks = support.disks(mesh)
+        unseen = support.away(mesh) > NEAR * disks
+        found = short_loops(mesh, UNSEEN * RIM * disks, unseen, rng)
+        normals = mesh.vertex_normals()
+        loops = _apart(mesh, [loop for loop in found if unseen[loop.vertices].all() and _is_neck(mesh, normals, loop)])
+        cut = _without(mesh, loops, support)
+        if cut is None:
+            break
+        lengths += [loop.length for loop in loops]
+        mesh = cut
+    return mesh, lengths
 
 
 class _Support:
@@ -116,6 +145,10 @@ class _Support:
     def disks(self, mesh: Mesh) -> Float:
         """Return the radius of the disk of the point nearest to each vertex, of shape (V,)."""
         return np.asarray(self._density.disks[self._density.tree.query(mesh.vertices)[1]])
+
+    def away(self, mesh: Mesh) -> Float:
+        """Return the distance from each vertex to the nearest point, of shape (V,)."""
+        return np.asarray(self._density.tree.query(mesh.vertices)[0])
 
     def lonely(self, mesh: Mesh) -> Mask:
         """Return which vertices, of shape (V,), have no point near on a surface that looks as theirs does."""
@@ -156,6 +189,12 @@ class _Support:
         """Return the vertex nearest to each point, and which points lie on the surface; both of shape (N,)."""
         away, vertex = cKDTree(mesh.vertices).query(self._density.points)
         return vertex, away < UPON * self._density.disks
+
+
+def _is_neck(mesh: Mesh, normals: Float, loop: Loop) -> bool:
+    """Return whether a loop runs around what is inside: the vertices' normals, of shape (V, 3), look away from it."""
+    ring = mesh.vertices[loop.vertices]
+    return float(((ring - ring.mean(axis=0)) * normals[loop.vertices]).sum()) > 0
 
 
 def _gap(ring: Float, normals: Float) -> float:

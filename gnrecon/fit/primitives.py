@@ -285,9 +285,9 @@ class _Search:
     def planes(self, rows: Int) -> list[Primitive]:
         """Return the planes of some points whose neighbours lie on them."""
         beside = list(range(2, BESIDE + 2))
-        _, near = self._density.tree.query(self.points[rows], beside, distance_upper_bound=NEAR * self.radius)
-        absent = near == len(self.points)
-        near = np.where(absent, 0, near)
+        away, near = self._density.tree.query(self.points[rows], beside)
+        # A face that was seen from the side has fewer points than others.
+        absent = away > NEAR * np.maximum(self._density.disks[rows, None], self.radius)
         height = np.einsum("ikd,id->ik", self.points[near] - self.points[rows, None], self.normals[rows])
         alike = np.einsum("ikd,id->ik", self.normals[near], self.normals[rows]) > cosine_of(self.wanted.angle)
         flat = rows[((np.abs(height) < self.off) & alike & ~absent).mean(axis=1) >= FLAT]

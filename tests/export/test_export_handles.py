@@ -120,6 +120,21 @@ def test_what_is_wide_stays_unseen() -> None:
     assert remove_handles(bored, points[seen]) == (bored, [])
 
 
+def test_a_wide_neck_that_no_point_is_near_is_cut(true_clip: Mesh) -> None:
+    """A tunnel as wide as it stays: a scanner that sees both its mouths may see nothing of its wall."""
+    necked = meshed(union(clip(), rod(0.1, 0.2, 0.0, 0.15)))
+    assert genus(necked) == 1
+    result, actions = remove_handles(necked, scanned(true_clip))
+    assert require_sound(result).genus == 0
+    assert "a handle or tunnel" in actions[0]
+    assert off(result, true_clip) < 0.04
+    bored = meshed(without(box((0.5, 0.5, 0.15)), rod(0.12)))
+    points = scanned(bored)
+    seen = np.hypot(*(points - UTM.center)[:, :2].T) > 0.13 * UTM.scale
+    assert genus(bored) == 1
+    assert remove_handles(bored, points[seen]) == (bored, [])
+
+
 def test_a_neck_that_holds_a_part_is_not_cut() -> None:
     balls = meshed(union(sphere(0.3, (0.0, 0.0, 0.5)), sphere(0.3, (0.0, 0.0, -0.5)), rod(0.03, half=0.3)))
     apart = meshed(union(sphere(0.3, (0.0, 0.0, 0.5)), sphere(0.3, (0.0, 0.0, -0.5))))
