@@ -20,7 +20,7 @@ from gnrecon.errors import UsageError
 from gnrecon.export import SignedDistance
 from gnrecon.export.fineness import chord_error
 from gnrecon.ingest.spacing import neighbour_spacing
-from gnrecon.meshing import mesh_field
+from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 
@@ -115,6 +115,33 @@ def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
     assert Options().for_scan(points, 3 * box).resolution == 256
     assert Options().for_scan(np.zeros((9, 3)), box).resolution == 256
     assert Options(resolution=50).for_scan(points, box).resolution == 50
+
+
+def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(0, 2 * np.pi, (2, 800))
+    normals = np.stack([np.cos(u) * np.cos(v), np.sin(u) * np.cos(v), np.sin(v)], axis=1)
+    points = 3 * np.stack([np.cos(u), np.sin(u), 0 * u], axis=1) + normals
+    box = np.array([points.min(axis=0), points.max(axis=0)])
+    found = {}
+    for noise in (0.0, 0.02):
+        scan = points + noise * rng.standard_normal((len(points), 1)) * normals
+        result = reconstruct(scan, normals, quality="draft")
+        cells = result.report["fineness"]["resolution"]
+        assert result.report["options"]["resolution"] == cells
+        found[noise] = cells
+        by_points = Options().for_scan(scan, box).resolution
+        assert by_points is not None
+        assert cells >= by_points
+        if noise == 0.0:
+            # The faces are then as near to the torus as the field is, or as near as the most cells allow.
+            x = result.mesh.vertices[result.mesh.faces].mean(axis=1)
+            off = np.hypot(np.hypot(x[:, 0], x[:, 1]) - 3, x[:, 2]) - 1
+            assert np.abs(off).mean() < 3e-4
+            assert fine_enough(result.sdf, 200) == max(200, cells)
+            assert fine_enough(replace(result.sdf, detail=None), 128) == 128
+    assert found[0.0] > found[0.02] == 128
+    assert reconstruct(points, normals, quality="draft", resolution=60).report["fineness"]["resolution"] == 60
 
 
 def test_an_impossible_edge_length_is_refused_before_the_fit() -> None:

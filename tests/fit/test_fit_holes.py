@@ -71,6 +71,18 @@ def test_a_plane_and_a_bore_are_found_among_points_that_lie_on_neither() -> None
     assert abs(bores[0].axis[2]) > 0.9999
 
 
+def test_a_face_that_was_seen_from_the_side_is_found_though_its_points_are_few() -> None:
+    points, normals = noisy(*cube(6000), 0.002, 0.05)
+    rng = np.random.default_rng(3)
+    kept = (points[:, 2] < SIDE - 0.02) | (rng.random(len(points)) < 0.06)
+    points, normals = points[kept], normals[kept]
+    sparse = points[:, 2] > SIDE - 0.02
+    assert 40 < sparse.sum() < 90
+    upper = [one for one in found(points, normals, 0.02, 0.008) if isinstance(one, Plane) and one.direction[2] > 0.99]
+    assert len(upper) == 1
+    assert upper[0].center[2] == pytest.approx(SIDE, abs=2e-3)
+
+
 def test_the_share_on_planes_tells_made_shapes_from_grown_ones() -> None:
     def share(points: Float, normals: Float) -> float:
         return planar_share(points, normals, 0.022, 0.007, np.random.default_rng(0))
