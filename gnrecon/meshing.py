@@ -55,7 +55,7 @@ class MeshedField(SignedDistance, Protocol):
 
 
 def fine_enough(sdf: NeuralSDF, cells: int) -> int:
-    """Return the cells, or as many more as make faces no farther off the surface than the field itself may be, up to 224.
+    """Return the cells, or up to 224 so that faces are no farther off the surface than the field itself may be.
 
     How much of the shape the smooth global field leaves over to the detail at the data tells how far it is off between
     them at most. That is far more than faces are off, but on smooth shapes that were scanned without noise.

@@ -46,9 +46,9 @@ class Ball:
 
     @classmethod
     def of(cls, samples: Samples) -> Ball | None:
-        """Return the samples of a scan laid on a ball, with its gaps filled, or None where they could be of another shape.
+        """Return a scan's samples laid on a ball whose gaps are filled, or None where they could be of another shape.
 
-        Their normals are exact then.
+        Their normals are those of the ball then.
         """
         points, normals = samples.points, samples.normals
         if len(points) < LEAST:
@@ -70,9 +70,7 @@ class Ball:
             return None
         more = filled[away > APART * np.sqrt(4 * np.pi / len(filled))]
         directions = np.concatenate([outward, more])
-        on = replace(
-            samples, points=sphere.center + sphere.radius * directions, normals=directions, estimated=False
-        )
+        on = replace(samples, points=sphere.center + sphere.radius * directions, normals=directions, estimated=False)
         return cls(on, samples.frame.scale * sphere.radius)
 
 

@@ -22,7 +22,7 @@ from gnrecon.cloud import Float
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.min_cut import minimal_inside, shifted
 from gnrecon.fit.mouths import mouths
-from gnrecon.fit.primitives import Seen, Surface, feet, planar_share, surfaces
+from gnrecon.fit.primitives import Seen, Surface, Wanted, feet, planar_share, surfaces
 from gnrecon.sampling import Box, CoarseDistance, Density
 
 Int = npt.NDArray[np.integer]
@@ -190,7 +190,8 @@ class _Scan:
         around = distance < AROUND
         disk = radius * float(np.sqrt(len(self.points) / len(self.closer)))
         asked = distance[around] < TOUCH
-        faces = surfaces(self.closer[around], self.their_normals[around], asked, disk, self._off(disk), rng)
+        off, wanted = self._off(disk), Wanted(sparse=True)
+        faces = surfaces(self.closer[around], self.their_normals[around], asked, disk, off, rng, wanted)
         faces = [face for face in faces if (hole.query(face.points)[0] < TOUCH * radius).sum() >= TOUCHING]
         if not faces:
             return np.zeros((0, 3)), np.zeros((0, 3))

@@ -208,11 +208,13 @@ class Wanted:
     angle : degrees between a point's normal and that of its surface, at most
     spheres : whether spheres are, too
     touches : most share of points beside a surface that nearly belong to it, of planes and of round ones
+    sparse : whether planes may have fewer points than the rest, as faces that were seen from the side
     """
 
     angle: float = ANGLE
     spheres: bool = False
     touches: tuple[float, float] = TOUCHES
+    sparse: bool = False
 
 
 def surfaces(
@@ -286,8 +288,8 @@ class _Search:
         """Return the planes of some points whose neighbours lie on them."""
         beside = list(range(2, BESIDE + 2))
         away, near = self._density.tree.query(self.points[rows], beside)
-        # A face that was seen from the side has fewer points than others.
-        absent = away > NEAR * np.maximum(self._density.disks[rows, None], self.radius)
+        own = self._density.disks[rows, None] if self.wanted.sparse else 0.0
+        absent = away > NEAR * np.maximum(own, self.radius)
         height = np.einsum("ikd,id->ik", self.points[near] - self.points[rows, None], self.normals[rows])
         alike = np.einsum("ikd,id->ik", self.normals[near], self.normals[rows]) > cosine_of(self.wanted.angle)
         flat = rows[((np.abs(height) < self.off) & alike & ~absent).mean(axis=1) >= FLAT]

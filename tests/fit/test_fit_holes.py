@@ -12,7 +12,7 @@ from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.holes import _shut_away, continued
 from gnrecon.fit.min_cut import minimal_inside
 from gnrecon.fit.mouths import mouths
-from gnrecon.fit.primitives import Cylinder, Plane, agreed, planar_share, surfaces
+from gnrecon.fit.primitives import Cylinder, Plane, Wanted, agreed, planar_share, surfaces
 
 SIDE = 0.6
 HEIGHT, BORE = 0.25, 0.4
@@ -49,9 +49,9 @@ def noisy(points: Float, normals: Float, noise: float, tilt: float) -> tuple[Flo
     return points + noise * rng.standard_normal(points.shape), turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
-def found(points: Float, normals: Float, radius: float, off: float) -> list[Plane | Cylinder]:
-    everything = np.ones(len(points), dtype=bool)
-    return [one.surface for one in surfaces(points, normals, everything, radius, off, np.random.default_rng(0))]
+def found(points: Float, normals: Float, radius: float, off: float, sparse: bool = False) -> list[Plane | Cylinder]:
+    everything, rng = np.ones(len(points), dtype=bool), np.random.default_rng(0)
+    return [one.surface for one in surfaces(points, normals, everything, radius, off, rng, Wanted(sparse=sparse))]
 
 
 def test_a_plane_and_a_bore_are_found_among_points_that_lie_on_neither() -> None:
@@ -78,7 +78,11 @@ def test_a_face_that_was_seen_from_the_side_is_found_though_its_points_are_few()
     points, normals = points[kept], normals[kept]
     sparse = points[:, 2] > SIDE - 0.02
     assert 40 < sparse.sum() < 90
-    upper = [one for one in found(points, normals, 0.02, 0.008) if isinstance(one, Plane) and one.direction[2] > 0.99]
+    upper = [
+        one
+        for one in found(points, normals, 0.02, 0.008, sparse=True)
+        if isinstance(one, Plane) and one.direction[2] > 0.99
+    ]
     assert len(upper) == 1
     assert upper[0].center[2] == pytest.approx(SIDE, abs=2e-3)
 
