@@ -20,7 +20,7 @@ from gnrecon.fit.laid import Laid, laid
 from gnrecon.fit.patch import Belief
 from gnrecon.sampling import Density
 
-SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.6
+SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.8
 """Lengths of the difference of two neighbours' normals: above the first there is an edge between them, up to the last,
 from which on they are the two sides of a sheet. Round shapes have more that differ by the second to the first."""
 

@@ -209,3 +209,23 @@ def test_the_fit_of_a_noisy_cube_says_how_many_points_are_laid_on_its_faces() ->
     found = re.search(r"Laid (\d+) points on 6 planes, cylinders and spheres", solution.status)
     assert found is not None
     assert 1450 < int(found[1]) <= 1500
+
+
+def test_acute_edges_are_edges_and_the_sides_of_a_sheet_are_none() -> None:
+    rng = np.random.default_rng(4)
+    corners = 0.5 * np.array([[1.0, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
+    weights = rng.dirichlet(np.ones(3), 300)
+    opposite = rng.integers(4, size=300)
+    faces = np.array([[k for k in range(4) if k != corner] for corner in range(4)])
+    points = np.einsum("nk,nkd->nd", weights, corners[faces[opposite]])
+    scan = Samples(points, -corners[opposite] / np.linalg.norm(corners[0]), FRAME)
+    found = Sharp.of(scan)
+    assert found is not None
+    # On the faces' planes, and not beyond the edges.
+    heights = found.samples.points @ -corners.T / np.linalg.norm(corners[0])
+    assert heights.max() < heights[:300].max() + 1e-9
+    disc = rng.uniform(-1, 1, (3000, 3)) * [0.8, 0.8, 0.0]
+    disc = disc[np.hypot(disc[:, 0], disc[:, 1]) < 0.8]
+    disc[:, 2] = 0.01 * rng.choice([-1.0, 1.0], len(disc))
+    normals = np.sign(disc[:, 2:]) * [[0.0, 0.0, 1.0]] + 0.15 * rng.standard_normal(disc.shape)
+    assert Sharp.of(Samples(disc, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)) is None
