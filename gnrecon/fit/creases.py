@@ -132,7 +132,7 @@ class Faces:
         bent: Float = np.abs(self.height - self.own) / 2
         return bent
 
-    def more(self) -> tuple[Float, Float, float]:
+    def more(self, gaps: bool = True) -> tuple[Float, Float, float]:
         """Return samples between points of a face and near its edges, and how far edges could be trusted.
 
         Returns
@@ -142,6 +142,8 @@ class Faces:
         """
         samples, normals, disks, agreed = self.towards_edges()
         samples, normals = self.thinned(samples, normals, disks, APART_EDGE)
+        if not gaps:
+            return samples, normals, agreed
         within = self.thinned(*self.between(), APART_FACE, (samples, normals))
         return np.concatenate([samples, within[0]]), np.concatenate([normals, within[1]]), agreed
 

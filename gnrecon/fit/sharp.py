@@ -18,6 +18,7 @@ from gnrecon.fit.creases import Faces
 from gnrecon.fit.holes import Continued, continued
 from gnrecon.fit.laid import Laid, laid
 from gnrecon.fit.patch import Belief
+from gnrecon.fit.spread import spread
 from gnrecon.sampling import Density
 
 SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.8
@@ -105,7 +106,11 @@ class Sharp:
         if len(across):
             points, normals = across.joined(points, normals)
             faces = Faces(points, normals)
-        more, their_normals, agreed = faces.more()
+        spread_points, spread_normals = spread(points, normals)
+        if len(spread_points):
+            points, normals = np.concatenate([points, spread_points]), np.concatenate([normals, spread_normals])
+            faces = Faces(points, normals)
+        more, their_normals, agreed = faces.more(gaps=not len(spread_points))
         if agreed < AGREED:
             return None
         joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])
