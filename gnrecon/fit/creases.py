@@ -135,6 +135,10 @@ class Faces:
     def more(self, gaps: bool = True) -> tuple[Float, Float, float]:
         """Return samples between points of a face and near its edges, and how far edges could be trusted.
 
+        Parameters
+        ----------
+        gaps : whether those between points are wanted, too
+
         Returns
         -------
         samples, normals : arrays of shape (M, 3)

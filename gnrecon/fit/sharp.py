@@ -1,5 +1,7 @@
 """Sharp shapes: whether faces meet at edges, and then their samples with the faces continued to the edges (`creases`).
 
+Planes and cylinders are covered by samples first, as far as their points tell of them (`spread`).
+
 What is left out of a scan hardly tells how sharp an edge is: few points lie near one, and patches that predict them
 have too few features for it. That a shape is sharp is plain from its normals, though, and what is then believed of its
 continued faces is always the same: they are nearly exact, and features are as short as their samples can tell apart.
@@ -106,11 +108,12 @@ class Sharp:
         if len(across):
             points, normals = across.joined(points, normals)
             faces = Faces(points, normals)
-        spread_points, spread_normals = spread(points, normals)
-        if len(spread_points):
-            points, normals = np.concatenate([points, spread_points]), np.concatenate([normals, spread_normals])
+        found = spread(points, normals)
+        if len(found[0]):
+            points, normals = np.concatenate([points, found[0]]), np.concatenate([normals, found[1]])
             faces = Faces(points, normals)
-        more, their_normals, agreed = faces.more(gaps=not len(spread_points))
+        # Where samples were spread they leave no gaps to halve.
+        more, their_normals, agreed = faces.more(gaps=not len(found[0]))
         if agreed < AGREED:
             return None
         joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])

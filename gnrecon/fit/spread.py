@@ -37,10 +37,11 @@ FEW, EQUAL, BENT, MOST_LEFT = 3, 2.0, 40.0, 2000
 """Points that a plane has at least, where it is a small one; degrees between their normals and its own at most; up to
 which a normal beside it shows that it is bent; and most points among which such planes are looked for."""
 
-ENOUGH, MOST = 6000, 12.0
-"""How many samples there are to be, about, for as many points at most; and most samples for each point."""
+ENOUGH, MOST, MOST_POINTS = 6000, 12.0, 15_000
+"""How many samples there are to be, about, or as many as points; most samples for each point; and points from which on
+there are none, as faces are rounded over no more than the points' spacing."""
 
-SURE, REACH, MOST_CELLS = 1.5, 3.0, 24.0
+SURE, REACH, MOST_CELLS = 2.0, 3.0, 24.0
 """How far a sample may lie from the nearest point of its surface, in radii of that one's disk, whatever is beside it,
 and where it closes a gap; on a plane of few points as far as the third of them; and how far at most, in cells."""
 
@@ -76,7 +77,7 @@ def spread(points: Float, normals: Float) -> tuple[Float, Float]:
     points, normals : arrays of shape (N, 3), unit normals
     """
     nothing = np.zeros((0, 3)), np.zeros((0, 3))
-    if len(points) >= ENOUGH:
+    if len(points) >= MOST_POINTS:
         return nothing
     density = Density(points)
     search = Search(density, NOISE * density.radius, np.random.default_rng(0))
@@ -84,7 +85,7 @@ def spread(points: Float, normals: Float) -> tuple[Float, Float]:
     found = [face for face in _with_small(search, normals, found) if isinstance(face.surface, Plane | Cylinder)]
     if not found:
         return nothing
-    size = float(np.sqrt(np.pi * np.square(density.disks).sum() / min(ENOUGH, MOST * len(points))))
+    size = float(np.sqrt(np.pi * np.square(density.disks).sum() / min(max(ENOUGH, len(points)), MOST * len(points))))
     faces = _Faces(density, normals, found)
     covers = [faces.cover(number, size) for number in range(len(found))]
     samples, theirs = (np.concatenate(parts) for parts in zip(*((one.x, one.normals) for one in covers), strict=True))
