@@ -108,16 +108,28 @@ class Sharp:
         if len(across):
             points, normals = across.joined(points, normals)
             faces = Faces(points, normals)
-        found = spread(points, normals)
-        if len(found[0]):
-            points, normals = np.concatenate([points, found[0]]), np.concatenate([normals, found[1]])
-            faces = Faces(points, normals)
-        # Where samples were spread they leave no gaps to halve.
-        more, their_normals, agreed = faces.more(gaps=not len(found[0]))
-        if agreed < AGREED:
+        joined = _covered(points, normals) or _continued(faces)
+        if joined is None:
             return None
-        joined = np.concatenate([points, more]), np.concatenate([normals, their_normals])
         return cls(replace(samples, points=joined[0], normals=joined[1]), averaging, flat, across)
+
+
+def _covered(points: Float, normals: Float) -> tuple[Float, Float] | None:
+    """Return points and normals with samples spread over their surfaces and towards edges, or None without any."""
+    samples, theirs = spread(points, normals)
+    if not len(samples):
+        return None
+    # They leave no gaps to halve.
+    faces = Faces(np.concatenate([points, samples]), np.concatenate([normals, theirs]))
+    return _continued(faces, gaps=False)
+
+
+def _continued(faces: Faces, gaps: bool = True) -> tuple[Float, Float] | None:
+    """Return points and normals of faces that are continued to their edges, or None where points contradict that."""
+    more, theirs, agreed = faces.more(gaps)
+    if agreed < AGREED:
+        return None
+    return np.concatenate([faces.points, more]), np.concatenate([faces.normals, theirs])
 
 
 def _sharp(faces: Faces) -> bool:

@@ -96,8 +96,24 @@ def spread(points: Float, normals: Float) -> tuple[Float, Float]:
     for _ in range(TWICE):
         # What goes on beyond the edge of a sheet on both of its sides looks two-sided until it ends nowhere.
         kept = _without_open(covers, _two_sided(kept, samples, theirs, *alone), points, size)
+    kept &= ~_beyond(covers, kept, size)
     kept &= np.concatenate([one.apart for one in covers])
     return samples[kept], theirs[kept]
+
+
+def _beyond(covers: list[_Cover], kept: Mask, size: float) -> Mask:
+    """Return which samples lie beyond an edge, now that both of its faces are covered up to it, of shape (M,).
+
+    The parameters are those of `_without_open`.
+    """
+    x, normals = (np.concatenate(parts) for parts in zip(*((one.x, one.normals) for one in covers), strict=True))
+    face = np.repeat(np.arange(len(covers)), [len(one.x) for one in covers])
+    found = [
+        _through(one.x, one.start, x[other], normals[other], np.full(int(other.sum()), BESIDE * size))
+        for number, one in enumerate(covers)
+        for other in [kept & (face != number)]
+    ]
+    return np.concatenate(found)
 
 
 def _without_open(covers: list[_Cover], kept: Mask, points: Float, size: float) -> Mask:
@@ -206,9 +222,12 @@ class _Faces:
         x = chart.places(cells)
         away, nearest = tree.query(x)
         kept = np.flatnonzero(away < reach[nearest])
-        kept = kept[~self._through(x[kept], own[nearest[kept]], face.rows)]
-        sure = away[kept] < SURE * disks[nearest[kept]]
-        return _Cover(chart, cells[kept], x[kept], face.surface.normal(x[kept]), sure, away[kept] > APART * size)
+        other = np.setdiff1d(np.arange(len(self.density.points)), face.rows)
+        seen = self.density.points[other], self.normals[other], self._reaches[other]
+        kept = kept[~_through(x[kept], own[nearest[kept]], *seen)]
+        x, away, nearest = x[kept], away[kept], nearest[kept]
+        sure, apart = away < SURE * disks[nearest], away > APART * size
+        return _Cover(chart, cells[kept], x, face.surface.normal(x), own[nearest], sure, apart)
 
     @cached_property
     def _reaches(self) -> Float:
@@ -219,21 +238,6 @@ class _Faces:
         third = np.where(alike.cumsum(axis=1) >= THIRD, away, np.inf).min(axis=1)
         reaches: Float = np.maximum(THROUGH * self.density.disks, np.minimum(third, away[:, -1]))
         return reaches
-
-    def _through(self, x: Float, start: Float, rows: Int) -> Mask:
-        """Return whether ways from `start` to x, both of shape (M, 3), lead through faces of other points than rows."""
-        other = np.setdiff1d(np.arange(len(self.density.points)), rows)
-        if not len(other) or not len(x):
-            return np.zeros(len(x), dtype=bool)
-        points, normals, reaches = self.density.points[other], self.normals[other], self._reaches[other]
-        _, near = cKDTree(points).query(x, list(range(1, min(OTHERS, len(other)) + 1)))
-        there = np.einsum("mkd,mkd->mk", x[:, None] - points[near], normals[near])
-        here = np.einsum("mkd,mkd->mk", start[:, None] - points[near], normals[near])
-        crosses = there * here < 0
-        share = np.where(crosses, here, 0.0) / np.where(crosses, here - there, 1.0)
-        at = start[:, None] + share[..., None] * (x - start)[:, None]
-        hit = crosses & (np.linalg.norm(at - points[near], axis=2) < reaches[near])
-        return np.asarray(hit.any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -305,6 +309,7 @@ class _Cover:
     chart : of the face
     cells : integer array of shape (M, 2)
     x, normals : arrays of shape (M, 3)
+    start : array of shape (M, 3), the nearest point of the face to each
     sure, apart : masks of shape (M,), of those near points of the face, and of those not right beside one
     """
 
@@ -312,6 +317,7 @@ class _Cover:
     cells: Int
     x: Float
     normals: Float
+    start: Float
     sure: Mask
     apart: Mask
 
@@ -324,6 +330,26 @@ class _Cover:
         table = {(one, other): row for row, (one, other) in enumerate(self.cells.tolist())}
         found = [table.get((one, other), -1) for one, other in cells.reshape(-1, 2).tolist()]
         return places, np.array(found, dtype=np.int64).reshape(-1, 4)
+
+
+def _through(x: Float, start: Float, points: Float, normals: Float, reaches: Float) -> Mask:
+    """Return whether ways from `start` to x, both of shape (M, 3), lead through the planes of points that are near.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (K, 3), of other faces
+    reaches : array of shape (K,), how near to each its plane is its face
+    """
+    if not len(points) or not len(x):
+        return np.zeros(len(x), dtype=bool)
+    _, near = cKDTree(points).query(x, list(range(1, min(OTHERS, len(points)) + 1)))
+    there = np.einsum("mkd,mkd->mk", x[:, None] - points[near], normals[near])
+    here = np.einsum("mkd,mkd->mk", start[:, None] - points[near], normals[near])
+    crosses = there * here < 0
+    share = np.where(crosses, here, 0.0) / np.where(crosses, here - there, 1.0)
+    at = start[:, None] + share[..., None] * (x - start)[:, None]
+    hit = crosses & (np.linalg.norm(at - points[near], axis=2) < reaches[near])
+    return np.asarray(hit.any(axis=1))
 
 
 def _around(cells: Float, reach: Float) -> Int:
