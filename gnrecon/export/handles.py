@@ -117,6 +117,8 @@ def _cut_unseen(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tupl
     for _ in range(ROUNDS):
         disks = support.disks(mesh)
         unseen = support.away(mesh) > NEAR * disks
+        if not unseen.any():
+            break
         found = short_loops(mesh, UNSEEN * RIM * disks, unseen, rng)
         normals = mesh.vertex_normals()
         loops = _apart(mesh, [loop for loop in found if unseen[loop.vertices].all() and _is_neck(mesh, normals, loop)])
