@@ -22,7 +22,7 @@ from gnrecon.cloud import Float
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.min_cut import minimal_inside, shifted
 from gnrecon.fit.mouths import mouths
-from gnrecon.fit.primitives import Seen, Surface, Wanted, feet, planar_share, surfaces
+from gnrecon.fit.primitives import Seen, Surface, Wanted, agreed, feet, planar_share, surfaces
 from gnrecon.sampling import Box, CoarseDistance, Density
 
 Int = npt.NDArray[np.integer]
@@ -190,8 +190,7 @@ class _Scan:
         around = distance < AROUND
         disk = radius * float(np.sqrt(len(self.points) / len(self.closer)))
         asked = distance[around] < TOUCH
-        off, wanted = self._off(disk), Wanted(sparse=True)
-        faces = surfaces(self.closer[around], self.their_normals[around], asked, disk, off, rng, wanted)
+        faces = self._surfaces(around, asked, disk, rng)
         faces = [face for face in faces if (hole.query(face.points)[0] < TOUCH * radius).sum() >= TOUCHING]
         if not faces:
             return np.zeros((0, 3)), np.zeros((0, 3))
@@ -210,6 +209,25 @@ class _Scan:
         far = self.density.tree.query(samples)[0] > UNSEEN * radius
         far &= hole.query(samples)[0] < ROOM * radius
         return samples[far], normals[far]
+
+    def _surfaces(self, around: Mask, asked: Mask, disk: float, rng: np.random.Generator) -> list[Seen]:
+        """Return the surfaces of some points, and then those of what is left that have fewer points than others.
+
+        Parameters
+        ----------
+        around : mask of shape (K,), of the points
+        asked : mask of shape (around,), of those that propose
+        disk : radius of what a point stands for
+        rng : draws proposals
+        """
+        points, normals, off = self.closer[around], self.their_normals[around], self._off(disk)
+        faces = surfaces(points, normals, asked, disk, off, rng)
+        left = np.ones(len(points), dtype=bool)
+        for face in faces:
+            left &= ~agreed(face.surface, points, normals, off)
+        # A face that was seen from the side.
+        rest = points[left], normals[left], asked[left]
+        return faces + surfaces(*rest, disk, off, rng.spawn(1)[0], Wanted(sparse=True))
 
     def _known(self, cells: Float, shape: tuple[int, ...]) -> Int:
         """Return 1 for cells, of shape (Q, 3), that are inside beyond doubt, -1 for those outside, and 0 elsewhere."""
