@@ -78,7 +78,9 @@ class _Task:
 
     def continued(self, rng: np.random.Generator) -> _Task:
         """Return the task with samples across the holes; a scan whose faces are continued to their edges has them."""
-        across = Continued.none() if self.sharp else continued(self.samples.points, self.samples.normals)
+        if self.sharp:
+            return self
+        across = continued(self.samples.points, self.samples.normals, not self.samples.estimated)
         if not len(across):
             return self
         points, normals = across.joined(self.samples.points, self.samples.normals)

@@ -99,18 +99,19 @@ class Continued:
         return np.concatenate([points, self.points]), np.concatenate([normals, self.normals])
 
 
-def continued(points: Float, normals: Float) -> Continued:
+def continued(points: Float, normals: Float, exact: bool = True) -> Continued:
     """Return samples of the planes and cylinders that go on across the holes of a scan.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
+    exact : whether normals may be believed where points are few; estimated ones may not
     """
     # By chance of its own, so that what follows draws the same whether there are holes or not.
     rng = np.random.default_rng(0)
     across = Continued.none()
     for _ in range(PASSES):
-        more = _once(*across.joined(points, normals), rng)
+        more = _once(*across.joined(points, normals), exact, rng)
         enough = len(more) <= FEW * len(across)
         across = Continued(*across.joined(more.points, more.normals), max(across.holes, more.holes))
         if enough:
@@ -118,13 +119,13 @@ def continued(points: Float, normals: Float) -> Continued:
     return across
 
 
-def _once(points: Float, normals: Float, rng: np.random.Generator) -> Continued:
+def _once(points: Float, normals: Float, exact: bool, rng: np.random.Generator) -> Continued:
     """Return the same of one pass."""
     if len(points) < FEWEST:
         return Continued.none()
     drawn = rng.permutation(len(points))
     rows, closer = np.sort(drawn[:MOST_POINTS]), np.sort(drawn[:CLOSER])
-    scan = _Scan.of(points[rows], normals[rows], points[closer], normals[closer], rng)
+    scan = _Scan.of(points[rows], normals[rows], points[closer], normals[closer], exact, rng)
     spacing = SPACING * scan.density.radius * np.sqrt(len(rows) / len(points))
     holes = scan.holes()
     if not holes or not scan.made(rng):
@@ -147,6 +148,7 @@ class _Scan:
     their_normals: Float
     density: Density
     coarse: CoarseDistance
+    exact: bool
 
     @cached_property
     def roughness(self) -> float:
@@ -154,10 +156,18 @@ class _Scan:
         return Faces(self.closer, self.their_normals).roughness
 
     @classmethod
-    def of(cls, points: Float, normals: Float, closer: Float, their_normals: Float, rng: np.random.Generator) -> _Scan:
+    def of(
+        cls,
+        points: Float,
+        normals: Float,
+        closer: Float,
+        their_normals: Float,
+        exact: bool,
+        rng: np.random.Generator,
+    ) -> _Scan:
         density = Density(points)
         coarse = CoarseDistance(points, normals, rng, density)
-        return cls(points, normals, closer, their_normals, density, coarse)
+        return cls(points, normals, closer, their_normals, density, coarse, exact)
 
     def made(self, rng: np.random.Generator) -> bool:
         """Return whether the shape is one of planes at large, and not of a few that a grown one has by chance."""
@@ -222,6 +232,8 @@ class _Scan:
         """
         points, normals, off = self.closer[around], self.their_normals[around], self._off(disk)
         faces = surfaces(points, normals, asked, disk, off, rng)
+        if not self.exact:
+            return faces
         left = np.ones(len(points), dtype=bool)
         for face in faces:
             left &= ~agreed(face.surface, points, normals, off)
