@@ -77,9 +77,9 @@ class Options:
         Whether vertices carry ``sigma``, the standard deviation of their position along the normal, see `Uncertainty`.
     resolution : int, optional
         Cells of the extraction along the longest side of the shape's box. Unless there is an edge length, as many as
-        make a cell a third of the points' spacing, but from 128 to 256, and at least 224 where the faces of a smooth
-        shape would be farther off than its field; of 200,000 points or more, one and a half spacings, from 256 to 1,024
-        cells.
+        make a cell a third of the points' spacing, but from 128 to 256, or more, up to 224, where the faces of a smooth
+        shape would else be farther off than its field; of 200,000 points or more, one and a half spacings, from 256 to
+        1,024 cells.
     edge_length : float, file units, optional
         Mean length of the mesh's edges, from which the number of cells follows.
     max_error : float, file units, optional

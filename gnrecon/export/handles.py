@@ -115,8 +115,8 @@ def _cut_unseen(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tupl
     """Cut along longer loops around necks that no point is near, and return the loops' lengths, too."""
     lengths: list[float] = []
     for _ in range(ROUNDS):
-        disks = support.disks(mesh)
-        unseen = support.away(mesh) > NEAR * disks
+        away, disks = support.nearest(mesh)
+        unseen = away > NEAR * disks
         if not unseen.any():
             break
         found = short_loops(mesh, UNSEEN * RIM * disks, unseen, rng)
@@ -146,11 +146,12 @@ class _Support:
 
     def disks(self, mesh: Mesh) -> Float:
         """Return the radius of the disk of the point nearest to each vertex, of shape (V,)."""
-        return np.asarray(self._density.disks[self._density.tree.query(mesh.vertices)[1]])
+        return self.nearest(mesh)[1]
 
-    def away(self, mesh: Mesh) -> Float:
-        """Return the distance from each vertex to the nearest point, of shape (V,)."""
-        return np.asarray(self._density.tree.query(mesh.vertices)[0])
+    def nearest(self, mesh: Mesh) -> tuple[Float, Float]:
+        """Return the distance from each vertex to the nearest point, and the radius of its disk, both of shape (V,)."""
+        away, near = self._density.tree.query(mesh.vertices)
+        return np.asarray(away), np.asarray(self._density.disks[near])
 
     def lonely(self, mesh: Mesh) -> Mask:
         """Return which vertices, of shape (V,), have no point near on a surface that looks as theirs does."""

@@ -95,19 +95,28 @@ def spread(points: Float, normals: Float) -> tuple[Float, Float]:
     kept: Mask = np.ones(len(samples), dtype=bool)
     for _ in range(TWICE):
         # What goes on beyond the edge of a sheet on both of its sides looks two-sided until it ends nowhere.
-        kept = _without_open(covers, _two_sided(kept, samples, theirs, *alone), points, size)
-    kept &= ~_beyond(covers, kept, size)
+        kept = _without_open(covers, _two_sided(kept, samples, theirs, *alone), samples, points, size)
+    kept &= ~_beyond(covers, kept, samples, theirs, size)
     kept &= np.concatenate([one.apart for one in covers])
     return samples[kept], theirs[kept]
 
 
-def _beyond(covers: list[_Cover], kept: Mask, size: float) -> Mask:
+def _owners(covers: list[_Cover]) -> Int:
+    """Return the number of each sample's face, of shape (M,)."""
+    return np.repeat(np.arange(len(covers)), [len(one.x) for one in covers])
+
+
+def _beyond(covers: list[_Cover], kept: Mask, x: Float, normals: Float, size: float) -> Mask:
     """Return which samples lie beyond an edge, now that both of its faces are covered up to it, of shape (M,).
 
-    The parameters are those of `_without_open`.
+    Parameters
+    ----------
+    covers : of the faces
+    kept : mask of shape (M,), of their samples, in order
+    x, normals : arrays of shape (M, 3), the samples
+    size : how far apart they are
     """
-    x, normals = (np.concatenate(parts) for parts in zip(*((one.x, one.normals) for one in covers), strict=True))
-    face = np.repeat(np.arange(len(covers)), [len(one.x) for one in covers])
+    face = _owners(covers)
     found = [
         _through(one.x, one.start, x[other], normals[other], np.full(int(other.sum()), BESIDE * size))
         for number, one in enumerate(covers)
@@ -116,19 +125,19 @@ def _beyond(covers: list[_Cover], kept: Mask, size: float) -> Mask:
     return np.concatenate(found)
 
 
-def _without_open(covers: list[_Cover], kept: Mask, points: Float, size: float) -> Mask:
+def _without_open(covers: list[_Cover], kept: Mask, x: Float, points: Float, size: float) -> Mask:
     """Return which samples stay when those far from points are taken away wherever nothing is beside them.
 
     Parameters
     ----------
     covers : of the faces
     kept : mask of shape (M,), of their samples, in order
+    x : array of shape (M, 3), the samples
     points : array of shape (N, 3), that were scanned
     size : how far apart samples are
     """
     ends = np.cumsum([0, *(len(one.x) for one in covers)])
-    x, kept = np.concatenate([one.x for one in covers]), kept.copy()
-    face = np.repeat(np.arange(len(covers)), np.diff(ends))
+    face, kept = _owners(covers), kept.copy()
     beside = [one.beside() for one in covers]
     for _ in range(PEELS):
         before = int(kept.sum())
