@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -13,6 +14,9 @@ from gnrecon.slices import slices
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
+
+FOLDED = math.radians(45.0)
+"""Angle from the area-weighted normal at which edge-weighted ones are no longer believed."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,28 @@ class Mesh:
             np.add.at(sums, self.faces[:, corner], vectors)
         sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
         return sums
+
+    def smooth_normals(self) -> Float:
+        """Unit normals of the smooth surface that the vertices sample, of shape (V, 3): the stored ones, else the faces'.
+
+        A corner between edges a and b of its face adds a x b / (|a|^2 |b|^2). On a sphere that is exact however
+        irregular the faces, where area weights of a hull of random points are off by degrees; noise counts for more,
+        the shorter the edges. So where faces are folded, and the result is beyond `FOLDED` of the area-weighted normal,
+        that one is taken. Source: Max, Weights for computing vertex normals from facet normals (1999).
+        """
+        by_area = self.vertex_normals()
+        if self.normals is not None:
+            return by_area
+        sums = np.zeros_like(self.vertices)
+        for corner in range(3):
+            at, following, before = (self.vertices[np.roll(self.faces, -corner, axis=1)[:, k]] for k in range(3))
+            a, b = following - at, before - at
+            squares = np.einsum("ij,ij->i", a, a) * np.einsum("ij,ij->i", b, b)
+            weighted = np.cross(a, b) / np.maximum(squares, np.finfo(np.float64).tiny)[:, None]
+            np.add.at(sums, self.faces[:, corner], weighted)
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        folded = np.einsum("ij,ij->i", sums, by_area) < math.cos(FOLDED)
+        return np.where(folded[:, None], by_area, sums)
 
     def with_vertices(self, vertices: Float) -> Mesh:
         """Return the same faces, normals and attributes over moved vertices, of shape (V, 3)."""
