@@ -502,6 +502,13 @@ def learn_command(
             help="Most steps; without a budget, the same steps and seed give the same mesh.", rich_help_panel=FIT
         ),
     ] = None,
+    wider: Annotated[
+        int,
+        typer.Option(
+            help="Hidden units more that each layer begins with; those that are least needed are taken away again.",
+            rich_help_panel=FIT,
+        ),
+    ] = 0,
     seed: Seed = 0,
     threads: Threads = None,
     resolution: Annotated[
@@ -554,7 +561,7 @@ def learn_command(
     from gnrecon.commands.scanned import ScanFiles
 
     del debug
-    options = LearnOptions(optimiser, budget, steps, seed, resolution, curvature, threads)
+    options = LearnOptions(optimiser, budget, steps, seed, resolution, curvature, threads, wider)
     raise SystemExit(
         run_learn(
             problem,

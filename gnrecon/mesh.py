@@ -109,7 +109,7 @@ class Mesh:
         return sums
 
     def smooth_normals(self) -> Float:
-        """Unit normals of the smooth surface that the vertices sample, of shape (V, 3): the stored ones, else the faces'.
+        """Unit normals of the smooth surface that the vertices sample, of shape (V, 3): the stored ones, else by faces.
 
         A corner between edges a and b of its face adds a x b / (|a|^2 |b|^2). On a sphere that is exact however
         irregular the faces, where area weights of a hull of random points are off by degrees; noise counts for more,

@@ -51,6 +51,7 @@ class LearnOptions:
     resolution: int = 192
     curvature: bool = False
     threads: int | None = None
+    wider: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what makes no sense, before any work."""
@@ -64,6 +65,10 @@ class LearnOptions:
             raise UsageError(f"The resolution is {self.resolution}, but must be at least 16 cells.")
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads is {self.threads}, but must be at least 1.")
+        if self.wider < 0:
+            raise UsageError(f"The network begins wider by {self.wider} units, but that must be at least 0.")
+        if self.wider and self.optimiser != "gn":
+            raise UsageError("A network can begin wider by Gauss-Newton alone (--optimiser gn).")
 
     @property
     def seconds(self) -> float | None:
@@ -111,6 +116,7 @@ def run_learn(
             budget=options.seconds,
             steps=options.steps,
             seed=options.seed,
+            wider=options.wider,
             heard=(lambda found: _say(console, told(found))) if verbose else None,
         )
         rng = np.random.default_rng(options.seed)
@@ -200,6 +206,7 @@ def _report(
             "best": learned.best.as_dict(),
             "history": [found.as_dict() for found in history],
             "optimiser": options.optimiser,
+            "wider": options.wider,
             "method": learned.solution.method,
             "status": learned.solution.status,
             "interrupted": learned.solution.interrupted,

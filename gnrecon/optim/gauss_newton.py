@@ -22,10 +22,18 @@ from gnrecon.optim.stop import HeldOut, StopRule, Watch
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Gauss-Newton with a given search and linear solver."""
+    """Gauss-Newton with a given search and linear solver.
+
+    Parameters
+    ----------
+    search : step control
+    solver : of the linear systems
+    damping : of the first step, by default the search's own; for a run that goes on where another one ended
+    """
 
     search: Search
     solver: LinearSolver = field(default_factory=Cholesky)
+    damping: float | None = None
 
     def run(
         self,
@@ -36,7 +44,7 @@ class GaussNewton:
         held_out: HeldOut | None = None,
     ) -> Solution:
         """Minimise |r|^2 / 2 from theta, of shape (p,); see `Optimiser`."""
-        damping = self.search.initial_damping
+        damping = self.search.initial_damping if self.damping is None else self.damping
 
         def advance(number: int, problem: Problem) -> Outcome:
             nonlocal damping

@@ -10,23 +10,29 @@ Gauss-Newton these are nearly always the last ones; runs of L-BFGS that lose the
 Each step fits its own points somewhat better than all, in another way each time, so that a mean over the last few
 steps' parameters is measured as well. Source: Polyak and Juditsky, Acceleration of stochastic approximation by
 averaging (1992), with weights that fall off, as there is no end at which to begin.
+
+Gauss-Newton may begin with a wider network (`wider`), and take the units that are too many away again, one by one,
+with some steps after each (`shapes.prune`). On the rocker arm that ends a seventh lower than the same network does
+that was never wider (docs/paper.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
 from torch import Tensor
 
 from gnrecon.errors import FitError, UsageError
-from gnrecon.optim import LBFGS, Adam, GaussNewton, Optimiser, Problem, Solution, StopRule
+from gnrecon.field import Network
+from gnrecon.optim import LBFGS, Adam, GaussNewton, Optimiser, Problem, Record, Solution, StopRule
 from gnrecon.shapes.learned import LearnedField
 from gnrecon.shapes.measure import Measurement, measure
 from gnrecon.shapes.pretrain import pretrained
 from gnrecon.shapes.problem import ShapeProblem
+from gnrecon.shapes.prune import narrower, widened
 
 OPTIMISERS: dict[str, Callable[[ShapeProblem, float], Optimiser]] = {
     "gn": lambda problem, rate: GaussNewton(problem.search, problem.solver()),  # noqa: ARG005 (one signature for all)
@@ -41,6 +47,12 @@ FIRST, GROWTH = 5.0, 1.5
 
 PRETRAINING = 0.25
 """Share of the budget within which the network must have become the start."""
+
+WIDE, BETWEEN = 0.14, 4
+"""Share of the budget for which a wider network is kept, and steps after each unit that is taken away."""
+
+EASED, MOST_DAMPED = 3.0, 1e-3
+"""Factor on the damping of the last step once a unit is gone, and the most that it then is."""
 
 KEEP = 0.6
 """Share of the former mean of the parameters in the next one."""
@@ -82,6 +94,8 @@ class _Run:
     history: list[Measurement] = field(default_factory=list)
     best: tuple[Measurement, Tensor] | None = None
     mean: Tensor | None = None
+    records: list[Record] = field(default_factory=list)
+    interrupted: Solution | None = None
 
     def problem_at(self, number: int, theta: Tensor) -> Problem:
         """Measure what the last step led to, if that is due, and freeze the next problem."""
@@ -91,6 +105,23 @@ class _Run:
             self.due = max(self.due * GROWTH, passed + (1 if self.by_steps else 0.0))
             self.note(number - 1, theta)
         return self.problem.freeze(number, theta, self.rng)
+
+    def go_on(self, method: Optimiser, theta: Tensor, steps: int, seconds: float | None) -> Solution:
+        """Run an optimiser, whose steps count from the last one taken, unless the run has been interrupted."""
+        if self.interrupted is not None:
+            return replace(self.interrupted, theta=theta)
+        done = len(self.records)
+        # The losses of different samples do not compare, so that only steps, time or the user end the run.
+        stop = StopRule(steps, tolerance=0.0, patience=steps + 1, seconds=seconds)
+        solution = method.run(lambda number, theta: self.problem_at(done + number, theta), theta, stop)
+        self.records += [replace(record, step=done + record.step) for record in solution.history]
+        solution = replace(solution, history=tuple(self.records))
+        self.interrupted = solution if solution.interrupted else None
+        return solution
+
+    def narrow(self, network: Network) -> None:
+        """Go on with a narrower network; what was best of the wider one is no answer any more."""
+        self.problem, self.best, self.mean = replace(self.problem, network=network), None, None
 
     def average(self, theta: Tensor) -> None:
         """Take parameters into their mean."""
@@ -123,6 +154,7 @@ def learn(
     seed: int = 0,
     learning_rate: float = 1e-3,
     heard: Heard | None = None,
+    wider: int = 0,
 ) -> Learned:
     """Learn a shape.
 
@@ -137,11 +169,13 @@ def learn(
     seed : of the network's start and of all points
     learning_rate : of Adam
     heard : told of each measurement
+    wider : hidden units more that each layer begins with; they are gone in the end. Gauss-Newton only
 
     Raises
     ------
     UsageError
-        When the optimiser is unknown, or neither a budget nor steps end the run.
+        When the optimiser is unknown, neither a budget nor steps end the run, or `wider` is negative or for another
+        optimiser than Gauss-Newton.
     FitError
         When the start cannot be fitted, or the surface has vanished before it was ever measured.
     """
@@ -153,25 +187,75 @@ def learn(
         or (steps is not None and steps < 1)
     ):
         raise UsageError("A positive budget of seconds or number of steps must say when the run ends.")
+    if wider < 0 or (wider and optimiser != "gn"):
+        raise UsageError("A network can begin wider by a number of units from 0 on, and by Gauss-Newton alone.")
     rng = np.random.default_rng(seed)
-    run = _Run(problem, rng, seed, budget is None, heard)
-    theta = pretrained(problem, seed, rng, None if budget is None else PRETRAINING * budget)
+    wide = replace(problem, network=widened(problem.network, wider))
+    run = _Run(wide, rng, seed, budget is None, heard)
+    theta = pretrained(wide, seed, rng, None if budget is None else PRETRAINING * budget)
     run.note(0, theta)
-    return _finished(run, theta, _solved(run, theta, OPTIMISERS[optimiser](problem, learning_rate), budget, steps))
+    limits = _Limits(run, MOST_STEPS if steps is None else steps, budget)
+    method = OPTIMISERS[optimiser](problem, learning_rate)
+    if wider:
+        assert isinstance(method, GaussNewton), "the others have been refused"
+        method, theta = _narrowed(run, theta, method, limits, problem)
+    return _finished(run, theta, _solved(run, theta, method, limits))
 
 
-def _solved(run: _Run, theta: Tensor, method: Optimiser, budget: float | None, steps: int | None) -> Solution:
+@dataclass(frozen=True)
+class _Limits:
+    """What ends a run: a number of steps, or seconds since it began."""
+
+    run: _Run
+    steps: int
+    budget: float | None
+
+    @property
+    def steps_left(self) -> int:
+        """Steps that may still be taken."""
+        return max(self.steps - len(self.run.records), 0)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds that are left, if they are limited."""
+        return None if self.budget is None else self.budget - (perf_counter() - self.run.started)
+
+    def share(self, share: float) -> tuple[int, float | None]:
+        """Return steps and seconds of a share of the whole, no more than are left."""
+        seconds = self.seconds_left
+        if self.budget is not None and seconds is not None:
+            return self.steps_left, min(seconds, share * self.budget)
+        return min(self.steps_left, round(share * self.steps)), None
+
+
+def _narrowed(
+    run: _Run, theta: Tensor, method: GaussNewton, limits: _Limits, problem: ShapeProblem
+) -> tuple[GaussNewton, Tensor]:
+    """Take steps with the wider network, and units away until it is the problem's own; return how to go on."""
+    goal = problem.network.widths
+    steps, seconds = limits.share(WIDE)
+    while True:
+        if steps and (seconds is None or seconds > 0):
+            theta = run.go_on(method, theta, steps, seconds).theta
+        if run.records:
+            method = replace(method, damping=min(EASED * run.records[-1].damping, MOST_DAMPED))
+        if run.problem.network.widths == goal:
+            run.note(len(run.records), theta)
+            return method, theta
+        network, theta = narrower(run.problem.freeze(len(run.records) + 1, theta, run.rng), goal)
+        run.narrow(network)
+        method = replace(method, solver=problem.solver())  # a new one, as it may keep matrices of the wider network
+        steps, seconds = min(BETWEEN, limits.steps_left), limits.seconds_left
+
+
+def _solved(run: _Run, theta: Tensor, method: Optimiser, limits: _Limits) -> Solution:
     """Run the optimiser, and take the loss of the surface for the end of the run."""
-    most = MOST_STEPS if steps is None else steps
-    left = None if budget is None else budget - (perf_counter() - run.started)
-    # The losses of different samples do not compare, so that only steps, time or the user end the run.
-    stop = StopRule(most, tolerance=0.0, patience=most + 1, seconds=left)
     try:
-        return method.run(run.problem_at, theta, stop)
+        return run.go_on(method, theta, limits.steps_left, limits.seconds_left)
     except FitError as error:
         if run.best is None:
             raise
-        return Solution(run.best[1], str(error), ())
+        return Solution(run.best[1], str(error), tuple(run.records))
 
 
 def _finished(run: _Run, start: Tensor, solution: Solution) -> Learned:

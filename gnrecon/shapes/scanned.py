@@ -30,6 +30,7 @@ from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance, least_values
 from gnrecon.shapes.problem import ShapeProblem, Start
 from gnrecon.shapes.term import (
+    LAST,
     Drawn,
     Moment,
     Sampler,
@@ -65,6 +66,11 @@ FREE, POOL, IN_FREE = 1.0, 150_000, 20_000
 """Weight of the free space, points of the box whose sign may be known, and those that are drawn in each step to be
 looked at. Hardly any of them has a residual. Once the eikonal term is gone small pockets open far from the points; ten
 makes them a fifth as large, but holds the surface up."""
+
+HELD = 400
+"""Steps for which the free space is held where points and normals determine the network. By then steps hardly move the
+surface; what the free space asks costs a sixteenth of the loss that is left, and pockets that grow far from the points
+are not in the mesh."""
 
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
@@ -106,14 +112,14 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     name : of the problem
     seed : of the coarse distance
     """
-    normals = samples.normals
+    normals, residuals = samples.normals, 2 * len(samples)
     box = Box.around(samples.points, MARGIN)
     coarse = CoarseDistance(samples.points, normals, np.random.default_rng(seed))
     terms = (
         Term("interface", interface, at_points(samples.points, count=POINTS)),
         Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
-        Term("eikonal", eikonal, in_box(IN_BOX), _eikonal_weight(2 * len(samples)), 0.0),
-        Term("free space", free_space, _free(coarse, box, np.random.default_rng(seed)), FREE, 0.0),
+        Term("eikonal", eikonal, in_box(IN_BOX), _eikonal_weight(residuals), 0.0),
+        Term("free space", free_space, _free(coarse, box, np.random.default_rng(seed)), _free_weight(residuals), 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))
     search = GainRatioDamping(initial_damping=1e-2, metric=jacobian_layer_scaled, geodesic=True)
@@ -131,8 +137,20 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
 
 def _eikonal_weight(residuals: int) -> Weight:
     """Return the weight at each step, for so many residuals of points and normals."""
-    determined = residuals >= DETERMINED * NETWORK.layout.count
-    return fading(EIKONAL, 0, FALL, LEAST) if determined else falling(EIKONAL, FALL, LEAST)
+    if _determine(residuals):
+        return fading(EIKONAL, 0, FALL, LEAST)
+    return falling(EIKONAL, FALL, LEAST)
+
+
+def _free_weight(residuals: int) -> Weight:
+    """Return the weight at each step, for so many residuals of points and normals."""
+    last = HELD if _determine(residuals) else LAST
+    return lambda step: FREE if step <= last else 0.0
+
+
+def _determine(residuals: int) -> bool:
+    """Return whether so many residuals of points and normals determine the network."""
+    return residuals >= DETERMINED * NETWORK.layout.count
 
 
 def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler:

@@ -53,6 +53,8 @@ def test_a_few_steps_of_the_catenoid(gnrecon: CommandLine, tmp_path: Path) -> No
         (("cone", "--steps", "0"), "steps"),
         (("cone", "--resolution", "2"), "resolution"),
         (("cone", "--threads", "0"), "threads"),
+        (("cone", "--wider", "-1"), "at least 0"),
+        (("cone", "--wider", "2", "--optimiser", "adam"), "Gauss-Newton alone"),
         (("cone", "--share", "0.2"), "is for scans, not for cone"),
         (("bunny", "--share", "1.5"), "above 0 and at most 1"),
     ],
@@ -85,11 +87,12 @@ def test_a_scan_of_ones_own_comes_back_in_its_own_coordinates(
 ) -> None:
     mesh, report = tmp_path / "mesh.ply", tmp_path / "r.json"
     scan = repository / "sample_data" / "bracket_sparse.ply"
-    words = ("-o", mesh, "--report", report, "--steps", 1, "--share", 0.5, "--resolution", 24)
+    words = ("-o", mesh, "--report", report, "--steps", 1, "--share", 0.5, "--resolution", 24, "--wider", 1)
     done = gnrecon("learn", scan, *words)
     assert done.returncode == 0, done.stderr
     written = json.loads(report.read_text())
     assert written["network"] == {"widths": [32, 32, 32], "activation": "sine", "parameters": 2273}
+    assert written["wider"] == 1
     assert written["chamfer"] < 0.3
     lower, upper = (getattr(read_cloud(scan).points, end)(axis=0) for end in ("min", "max"))
     middle = read_mesh(mesh).vertices.mean(axis=0)
