@@ -115,7 +115,8 @@ class _Run:
         stop = StopRule(steps, tolerance=0.0, patience=steps + 1, seconds=seconds)
         solution = method.run(lambda number, theta: self.problem_at(done + number, theta), theta, stop)
         self.records += [replace(record, step=done + record.step) for record in solution.history]
-        solution = replace(solution, history=tuple(self.records))
+        earlier = f" Before these, {done} steps had more units." if done else ""
+        solution = replace(solution, history=tuple(self.records), status=solution.status + earlier)
         self.interrupted = solution if solution.interrupted else None
         return solution
 
@@ -234,18 +235,17 @@ def _narrowed(
     """Take steps with the wider network, and units away until it is the problem's own; return how to go on."""
     goal = problem.network.widths
     steps, seconds = limits.share(WIDE)
-    while True:
+    while run.problem.network.widths != goal:
         if steps and (seconds is None or seconds > 0):
             theta = run.go_on(method, theta, steps, seconds).theta
         if run.records:
             method = replace(method, damping=min(EASED * run.records[-1].damping, MOST_DAMPED))
-        if run.problem.network.widths == goal:
-            run.note(len(run.records), theta)
-            return method, theta
         network, theta = narrower(run.problem.freeze(len(run.records) + 1, theta, run.rng), goal)
         run.narrow(network)
         method = replace(method, solver=problem.solver())  # a new one, as it may keep matrices of the wider network
         steps, seconds = min(BETWEEN, limits.steps_left), limits.seconds_left
+    run.note(len(run.records), theta)
+    return method, theta
 
 
 def _solved(run: _Run, theta: Tensor, method: Optimiser, limits: _Limits) -> Solution:

@@ -67,7 +67,7 @@ FREE, POOL, IN_FREE = 1.0, 150_000, 20_000
 looked at. Hardly any of them has a residual. Once the eikonal term is gone small pockets open far from the points; ten
 makes them a fifth as large, but holds the surface up."""
 
-HELD = 400
+HELD = 250
 """Steps for which the free space is held where points and normals determine the network. By then steps hardly move the
 surface; what the free space asks costs a sixteenth of the loss that is left, and pockets that grow far from the points
 are not in the mesh."""

@@ -81,6 +81,7 @@ def test_a_run_that_began_wider_ends_with_the_problems_network() -> None:
     assert learned.field.network.widths == (8, 8)
     assert len(learned.field.theta) == problem.network.layout.count
     assert [record.step for record in learned.solution.history] == list(range(1, 31))
+    assert "had more units" in learned.solution.status
     assert learned.best.loss < 0.1 * learned.history[0].loss
     assert learned.best in learned.history
 
