@@ -67,10 +67,11 @@ FREE, POOL, IN_FREE = 1.0, 150_000, 20_000
 looked at. Hardly any of them has a residual. Once the eikonal term is gone small pockets open far from the points; ten
 makes them a fifth as large, but holds the surface up."""
 
-HELD = 250
-"""Steps for which the free space is held where points and normals determine the network. By then steps hardly move the
-surface; what the free space asks costs a sixteenth of the loss that is left, and pockets that grow far from the points
-are not in the mesh."""
+HELD, SETTLED, ASKED = 250, 5e-3, 2000
+"""Steps for which the free space is held where points and normals determine the network; root mean square of f at the
+points, that many of them asked, above which it is held longer. Then steps hardly move the surface, what the free space
+asks costs a sixteenth of the loss that is left, and pockets that grow far from the points are not in the mesh. Adam,
+and L-BFGS for long, do not come so near."""
 
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
@@ -112,14 +113,14 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     name : of the problem
     seed : of the coarse distance
     """
-    normals, residuals = samples.normals, 2 * len(samples)
+    normals = samples.normals
     box = Box.around(samples.points, MARGIN)
     coarse = CoarseDistance(samples.points, normals, np.random.default_rng(seed))
     terms = (
         Term("interface", interface, at_points(samples.points, count=POINTS)),
         Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
-        Term("eikonal", eikonal, in_box(IN_BOX), _eikonal_weight(residuals), 0.0),
-        Term("free space", free_space, _free(coarse, box, np.random.default_rng(seed)), _free_weight(residuals), 0.0),
+        Term("eikonal", eikonal, in_box(IN_BOX), _eikonal_weight(2 * len(samples)), 0.0),
+        Term("free space", free_space, _free(samples, coarse, box, np.random.default_rng(seed)), FREE, 0.0),
     )
     known = ScannedSurface(torch.as_tensor((all_points or samples).points))
     search = GainRatioDamping(initial_damping=1e-2, metric=jacobian_layer_scaled, geodesic=True)
@@ -142,22 +143,18 @@ def _eikonal_weight(residuals: int) -> Weight:
     return falling(EIKONAL, FALL, LEAST)
 
 
-def _free_weight(residuals: int) -> Weight:
-    """Return the weight at each step, for so many residuals of points and normals."""
-    last = HELD if _determine(residuals) else LAST
-    return lambda step: FREE if step <= last else 0.0
-
-
 def _determine(residuals: int) -> bool:
     """Return whether so many residuals of points and normals determine the network."""
     return residuals >= DETERMINED * NETWORK.layout.count
 
 
-def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler:
-    """Return a sampler of the points whose sign the field has lost.
+def _free(samples: Samples, coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler:
+    """Return a sampler of the points whose sign the field has lost, as long as the free space is held.
 
     Where that has once been seen is looked at in every step from then on, so that two steps ask for the same.
     """
+    asked = torch.as_tensor(samples.points[:: -(-len(samples) // ASKED)])
+    held = HELD if _determine(2 * len(samples)) else LAST
     pool = box.sample(POOL, rng)
     known, signed, distance, _ = coarse.at(pool, CLEAR_DISKS)
     clear = distance > CLEAR
@@ -168,6 +165,8 @@ def _free(coarse: CoarseDistance, box: Box, rng: np.random.Generator) -> Sampler
     def draw(moment: Moment) -> Drawn:
         if moment.step == 1:  # a run that begins owes nothing to an earlier one of the same problem
             watched.zero_()
+        if moment.step > held and float(moment.level_set.values(asked).square().mean()) < SETTLED**2:
+            return Drawn(points[:0], least[:0], share=0.0)
         # A cloud of few points may leave nothing of the box so far from it that its sign is known.
         drawn = moment.rng.integers(len(points), size=IN_FREE if len(points) else 0)
         rows = watched.index_fill(0, torch.as_tensor(drawn), True).nonzero()[:, 0]

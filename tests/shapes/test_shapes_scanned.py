@@ -49,10 +49,25 @@ def test_the_eikonal_term_ends_where_the_points_determine_the_network() -> None:
     assert eikonal.weight_at(20) == 0
 
 
-@pytest.mark.parametrize(("count", "late"), [(5000, 0.0), (30, 1.0)])
-def test_the_free_space_is_let_go_late_where_the_points_determine_the_network(count: int, late: float) -> None:
-    free = next(term for term in scanned(ball(count)).terms if term.name == "free space")
-    assert [free.weight_at(step) for step in (1, 250, 251, 10_000)] == [1.0, 1.0, late, late]
+@pytest.mark.parametrize(
+    ("count", "error", "step", "held"),
+    [(5000, 1e-3, 251, False), (5000, 1e-3, 250, True), (5000, 1e-2, 251, True), (2000, 1e-3, 251, True)],
+    ids=["settled", "early", "far from the points", "too few points"],
+)
+def test_the_free_space_is_let_go_once_the_points_determine_the_network(
+    count: int, error: float, step: int, held: bool
+) -> None:
+    problem = scanned(ball(count))
+    sampler = next(term for term in problem.terms if term.name == "free space").sampler
+
+    def values(x: torch.Tensor) -> torch.Tensor:
+        # About the distance to the ellipsoid, and of the wrong sign in a corner of the box.
+        near = (x / torch.tensor([0.9, 0.7, 0.6])).norm(dim=1) - 1.0
+        return torch.where((x > 0.7).all(1), -1.0, near) + error
+
+    level_set = LevelSet(values, lambda x: (values(x), torch.zeros_like(x)), problem.box)
+    drawn = sampler(Moment(step, level_set, np.random.default_rng(0)))
+    assert (len(drawn.points) > 0) == held
 
 
 def test_the_free_space_is_asked_for_where_the_field_has_lost_its_sign() -> None:
