@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -101,12 +101,7 @@ class Mesh:
         """Unit vertex normals, of shape (V, 3): the stored ones, else the area-weighted mean of the faces'."""
         if self.normals is not None:
             return self.normals
-        sums = np.zeros_like(self.vertices)
-        vectors = self.face_vectors
-        for corner in range(3):
-            np.add.at(sums, self.faces[:, corner], vectors)
-        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        return sums
+        return self._directions([self.face_vectors] * 3)
 
     def smooth_normals(self) -> Float:
         """Unit normals of the smooth surface that the vertices sample, of shape (V, 3): the stored ones, else by faces.
@@ -119,16 +114,22 @@ class Mesh:
         by_area = self.vertex_normals()
         if self.normals is not None:
             return by_area
+        corners = self.corners
+        squares = np.square(np.roll(corners, -1, axis=1) - corners).sum(axis=2)
+        both = squares * np.roll(squares, 1, axis=1)  # of the edges after and before each corner
+        both = np.maximum(both, np.finfo(np.float64).tiny)
+        vectors = self.face_vectors
+        normals = self._directions([vectors / both[:, corner, None] for corner in range(3)])
+        folded = np.einsum("ij,ij->i", normals, by_area) < math.cos(FOLDED)
+        return np.where(folded[:, None], by_area, normals)
+
+    def _directions(self, additions: Sequence[Float]) -> Float:
+        """Return the vertices' sums, of unit length, of what the faces' first, second and third corners add, (F, 3)."""
         sums = np.zeros_like(self.vertices)
-        for corner in range(3):
-            at, following, before = (self.vertices[np.roll(self.faces, -corner, axis=1)[:, k]] for k in range(3))
-            a, b = following - at, before - at
-            squares = np.einsum("ij,ij->i", a, a) * np.einsum("ij,ij->i", b, b)
-            weighted = np.cross(a, b) / np.maximum(squares, np.finfo(np.float64).tiny)[:, None]
-            np.add.at(sums, self.faces[:, corner], weighted)
+        for corner, added in enumerate(additions):
+            np.add.at(sums, self.faces[:, corner], added)
         sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        folded = np.einsum("ij,ij->i", sums, by_area) < math.cos(FOLDED)
-        return np.where(folded[:, None], by_area, sums)
+        return sums
 
     def with_vertices(self, vertices: Float) -> Mesh:
         """Return the same faces, normals and attributes over moved vertices, of shape (V, 3)."""

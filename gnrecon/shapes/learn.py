@@ -87,7 +87,8 @@ class _Run:
     problem: ShapeProblem
     rng: np.random.Generator
     seed: int
-    by_steps: bool
+    steps: int
+    budget: float | None
     heard: Heard | None
     started: float = field(default_factory=perf_counter)
     due: float = FIRST
@@ -97,12 +98,22 @@ class _Run:
     records: list[Record] = field(default_factory=list)
     interrupted: Solution | None = None
 
+    @property
+    def steps_left(self) -> int:
+        """Steps that may still be taken."""
+        return max(self.steps - len(self.records), 0)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds that are left, if they are limited."""
+        return None if self.budget is None else self.budget - (perf_counter() - self.started)
+
     def problem_at(self, number: int, theta: Tensor) -> Problem:
         """Measure what the last step led to, if that is due, and freeze the next problem."""
         self.average(theta)
-        passed = number - 1 if self.by_steps else perf_counter() - self.started
+        passed = number - 1 if self.budget is None else perf_counter() - self.started
         if passed >= self.due and number > 1:
-            self.due = max(self.due * GROWTH, passed + (1 if self.by_steps else 0.0))
+            self.due = max(self.due * GROWTH, passed + (1 if self.budget is None else 0.0))
             self.note(number - 1, theta)
         return self.problem.freeze(number, theta, self.rng)
 
@@ -178,7 +189,7 @@ def learn(
         When the optimiser is unknown, neither a budget nor steps end the run, or `wider` is negative or for another
         optimiser than Gauss-Newton.
     FitError
-        When the start cannot be fitted, or the surface has vanished before it was ever measured.
+        When the start cannot be fitted, or the surface has vanished before it was ever measured, or while units go.
     """
     if optimiser not in OPTIMISERS:
         raise UsageError(f"The optimiser is {optimiser!r}, but must be one of {', '.join(OPTIMISERS)}.")
@@ -192,49 +203,24 @@ def learn(
         raise UsageError("A network can begin wider by a number of units from 0 on, and by Gauss-Newton alone.")
     rng = np.random.default_rng(seed)
     wide = replace(problem, network=widened(problem.network, wider))
-    run = _Run(wide, rng, seed, budget is None, heard)
+    run = _Run(wide, rng, seed, MOST_STEPS if steps is None else steps, budget, heard)
     theta = pretrained(wide, seed, rng, None if budget is None else PRETRAINING * budget)
     run.note(0, theta)
-    limits = _Limits(run, MOST_STEPS if steps is None else steps, budget)
     method = OPTIMISERS[optimiser](problem, learning_rate)
     if wider:
         assert isinstance(method, GaussNewton), "the others have been refused"
-        method, theta = _narrowed(run, theta, method, limits, problem)
-    return _finished(run, theta, _solved(run, theta, method, limits))
+        method, theta = _narrowed(run, theta, method, problem)
+    return _finished(run, theta, _solved(run, theta, method))
 
 
-@dataclass(frozen=True)
-class _Limits:
-    """What ends a run: a number of steps, or seconds since it began."""
-
-    run: _Run
-    steps: int
-    budget: float | None
-
-    @property
-    def steps_left(self) -> int:
-        """Steps that may still be taken."""
-        return max(self.steps - len(self.run.records), 0)
-
-    @property
-    def seconds_left(self) -> float | None:
-        """Seconds that are left, if they are limited."""
-        return None if self.budget is None else self.budget - (perf_counter() - self.run.started)
-
-    def share(self, share: float) -> tuple[int, float | None]:
-        """Return steps and seconds of a share of the whole, no more than are left."""
-        seconds = self.seconds_left
-        if self.budget is not None and seconds is not None:
-            return self.steps_left, min(seconds, share * self.budget)
-        return min(self.steps_left, round(share * self.steps)), None
-
-
-def _narrowed(
-    run: _Run, theta: Tensor, method: GaussNewton, limits: _Limits, problem: ShapeProblem
-) -> tuple[GaussNewton, Tensor]:
+def _narrowed(run: _Run, theta: Tensor, method: GaussNewton, problem: ShapeProblem) -> tuple[GaussNewton, Tensor]:
     """Take steps with the wider network, and units away until it is the problem's own; return how to go on."""
     goal = problem.network.widths
-    steps, seconds = limits.share(WIDE)
+    steps, seconds = run.steps_left, run.seconds_left
+    if run.budget is None or seconds is None:
+        steps = round(WIDE * run.steps)
+    else:
+        seconds = min(seconds, WIDE * run.budget)
     while run.problem.network.widths != goal:
         if steps and (seconds is None or seconds > 0):
             theta = run.go_on(method, theta, steps, seconds).theta
@@ -243,15 +229,15 @@ def _narrowed(
         network, theta = narrower(run.problem.freeze(len(run.records) + 1, theta, run.rng), goal)
         run.narrow(network)
         method = replace(method, solver=problem.solver())  # a new one, as it may keep matrices of the wider network
-        steps, seconds = min(BETWEEN, limits.steps_left), limits.seconds_left
+        steps, seconds = min(BETWEEN, run.steps_left), run.seconds_left
     run.note(len(run.records), theta)
     return method, theta
 
 
-def _solved(run: _Run, theta: Tensor, method: Optimiser, limits: _Limits) -> Solution:
+def _solved(run: _Run, theta: Tensor, method: Optimiser) -> Solution:
     """Run the optimiser, and take the loss of the surface for the end of the run."""
     try:
-        return run.go_on(method, theta, limits.steps_left, limits.seconds_left)
+        return run.go_on(method, theta, run.steps_left, run.seconds_left)
     except FitError as error:
         if run.best is None:
             raise

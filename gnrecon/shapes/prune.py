@@ -9,6 +9,7 @@ Gauss-Newton matrix in the place of the Hessian.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from gnrecon.field import Network
 from gnrecon.linalg.cholesky import damped_factor
+from gnrecon.optim.problem import loss_of
 from gnrecon.shapes.frozen import FrozenProblem
 
 SHIFT = 1e-7
@@ -25,12 +27,12 @@ SHIFT = 1e-7
 TRIED = 4
 """Units of the least predicted cost whose removal is evaluated."""
 
-WHOLE, HALF = 1.0, 0.5
+SHARES = 1.0, 0.5
 """Shares of what the model says the others should move by that are tried; it reaches far beyond where it holds."""
 
 
 @dataclass(frozen=True)
-class Removal:
+class _Removal:
     """What taking away a hidden unit of a layer would cost, and how the other parameters, of shape (p,), would move."""
 
     layer: int
@@ -60,7 +62,7 @@ def narrower(problem: FrozenProblem, goal: tuple[int, ...]) -> tuple[Network, Te
     trials = [
         without_unit(problem.network, problem.theta + share * removal.move, removal.layer, removal.unit)
         for removal in found
-        for share in (WHOLE, HALF)
+        for share in SHARES
     ]
     return min(trials, key=lambda trial: _loss(problem, *trial))
 
@@ -78,7 +80,7 @@ def without_unit(network: Network, theta: Tensor, layer: int, unit: int) -> tupl
     return made, made.layout.flatten(layers)
 
 
-def _removals(problem: FrozenProblem, goal: tuple[int, ...]) -> Iterator[Removal]:
+def _removals(problem: FrozenProblem, goal: tuple[int, ...]) -> Iterator[_Removal]:
     """Yield what each unit of the layers wider than the goal would cost."""
     network, theta = problem.network, problem.theta
     jacobian, _ = problem.linearise(theta)
@@ -94,11 +96,10 @@ def _removals(problem: FrozenProblem, goal: tuple[int, ...]) -> Iterator[Removal
             weights = theta[outgoing].to(inverse)
             pull = torch.linalg.solve(inverse[outgoing][:, outgoing], weights)
             move = -(inverse[:, outgoing] @ pull)
-            yield Removal(layer, unit, 0.5 * float(weights @ pull), move.to(theta))
+            yield _Removal(layer, unit, 0.5 * float(weights @ pull), move.to(theta))
 
 
 def _loss(problem: FrozenProblem, network: Network, theta: Tensor) -> float:
     """Return |r|^2 / 2 of another network on the same points; infinite where it is not finite."""
-    residual = replace(problem, network=network, theta=theta).residual(theta)
-    loss = 0.5 * float(residual @ residual)
-    return loss if loss < float("inf") else float("inf")
+    loss = loss_of(replace(problem, network=network, theta=theta), theta)
+    return loss if math.isfinite(loss) else math.inf
