@@ -17,6 +17,10 @@ and the adjoints d_l = s' e with e = W_{l+1}^T d_{l+1} follow backwards by the p
 so that there is one forward and one backward pass for the axes, whatever the number of residuals, and one for each
 residual's P. Units of several numbers (wavelets) sum over them. Nothing is differentiated by nesting; `torch.func` is
 the tests' oracle.
+
+The axes may be other directions u_1 .. u_K, of each point's own: D_i = u_i . grad, and P's second part is sum_ij (U M
+U^T)_ij D_i D_j where M has no part off their span. A surface's curvatures need its two tangents alone, which spares a
+third of the axes' passes and one of the five outer products.
 """
 
 from __future__ import annotations
@@ -36,7 +40,7 @@ Derivatives = dict[Index, Tensor]
 
 @dataclass(frozen=True)
 class Axes:
-    """D_i z and D_i a of the layers, D_i e and D_i d, each of shape (3, N, width); z and d with their q parts."""
+    """D_i z and D_i a of the layers, D_i e and D_i d, each of shape (K, N, width); z and d with their q parts."""
 
     z: list[Tensor]
     activations: list[Tensor]
@@ -58,6 +62,7 @@ class CurvedJet:
     adjoints : d_l of all layers, of shape (N, q units), the last being one
     value : f, of shape (N,)
     gradient : grad f in space, of shape (N, 3)
+    directions : orthonormal, of shape (K, N, 3), along which second derivatives are taken; by default the axes of space
     """
 
     layers: Layers
@@ -68,6 +73,7 @@ class CurvedJet:
     adjoints: list[Tensor]
     value: Tensor
     gradient: Tensor
+    directions: Tensor | None = None
 
     @classmethod
     def of(cls, layers: Layers, activation: Activation, x: Tensor, order: int = 3) -> CurvedJet:
@@ -91,13 +97,15 @@ class CurvedJet:
 
     @cached_property
     def axes(self) -> Axes:
-        """Derivatives of everything along the three axes of space."""
-        start = torch.eye(3).to(self.gradient)[:, None, :].expand(3, len(self.value), 3)
+        """Derivatives of everything along the directions."""
+        start = self.directions
+        if start is None:
+            start = torch.eye(3).to(self.gradient)[:, None, :].expand(3, len(self.value), 3)
         z, activations = [], [start]
         for made, (weights, _) in zip(self.derivatives, self.layers, strict=False):
             z.append(self._parts(activations[-1] @ weights.T))
             activations.append(self._chain(made, (), z[-1]))
-        adjoints = [torch.zeros_like(self.adjoints[-1]).expand(3, -1, -1)]
+        adjoints = [torch.zeros_like(self.adjoints[-1]).expand(len(start), -1, -1)]
         outer: list[Tensor] = []
         for level in reversed(range(len(self.derivatives))):
             made, weights = self.derivatives[level], self.layers[level + 1][0]
@@ -111,8 +119,15 @@ class CurvedJet:
 
     @cached_property
     def hessian(self) -> Tensor:
-        """Second derivatives of f in space, of shape (N, 3, 3), exactly symmetric."""
+        """Second derivatives of f in space, of shape (N, 3, 3), exactly symmetric.
+
+        Of two directions' complement, those along it twice are unknown, and zero here.
+        """
         found = (self.axes.adjoints[0] @ self.layers[0][0]).permute(1, 0, 2)
+        if self.directions is not None:
+            # H = T T^T H + H T T^T - T T^T H T T^T, with T = U^T and U H found, but for the complement's own part.
+            U = self.directions.permute(1, 0, 2)
+            found = U.mT @ (2 * found - (found @ U.mT) @ U)
         return (found + found.mT) / 2
 
     def rows(
@@ -124,13 +139,17 @@ class CurvedJet:
         ----------
         by_value : of shape (N,), or None where the residuals do not depend on the value
         by_gradient : of shape (N, 3), or None where they do not depend on the gradient
-        by_hessian : of shape (N, 3, 3), symmetric, or None where they do not depend on second derivatives
+        by_hessian : of shape (N, 3, 3), symmetric, with no part off the jet's directions, or None where they do not
+            depend on second derivatives
         """
         if by_gradient is None and by_hessian is None:
             assert by_value is not None, "a residual depends on the value or on a derivative"
             scale = by_value[:, None]
             return [LayerRows(d * scale, a) for d, a in zip(self.adjoints, self.activations, strict=True)]
         v = torch.zeros_like(self.gradient) if by_gradient is None else by_gradient
+        if by_hessian is not None and self.directions is not None:
+            U = self.directions.permute(1, 0, 2)
+            by_hessian = U @ by_hessian @ U.mT
         tangents, lefts = self._operated(v, by_hessian)
         if by_value is not None:
             lefts = [t.addcmul(d, by_value[:, None]) for t, d in zip(lefts, self.adjoints, strict=True)]
@@ -197,8 +216,15 @@ class CurvedJet:
 
 
 def _turned(M: Tensor, along: Tensor) -> Tensor:
-    """Return sum_j M_ij X_j for X of shape (3, N, width), M of shape (N, 3, 3)."""
-    return torch.einsum("nij,jnw->inw", M, along)
+    """Return sum_j M_ij X_j for X of shape (K, N, width), M of shape (N, K, K)."""
+    turned = torch.empty_like(along, memory_format=torch.contiguous_format)
+    # K^2 passes over what lies in the cache are several times as fast as N products of small matrices.
+    for row, place in zip(M.unbind(1), turned.unbind(0), strict=True):
+        first, *others = row[:, :, None].unbind(1)
+        torch.mul(first, along[0], out=place)
+        for factor, part in zip(others, along[1:], strict=True):
+            place.addcmul_(factor, part)
+    return turned
 
 
 def _with(index: Index, *more: int) -> Index:

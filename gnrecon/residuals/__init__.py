@@ -20,6 +20,7 @@ from gnrecon.residuals.second_order import (
     gauss_curvature,
     mean_curvature,
     surface_strain,
+    tangents,
 )
 
 __all__ = [
@@ -40,4 +41,5 @@ __all__ = [
     "normal_vector",
     "signed_distance",
     "surface_strain",
+    "tangents",
 ]

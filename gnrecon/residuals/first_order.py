@@ -25,6 +25,17 @@ class Linearised:
     by_gradient: Tensor | None
     by_hessian: Tensor | None = None
 
+    def rate(self, value: Tensor, gradient: Tensor, hessian: Tensor | None) -> Tensor:
+        """Return dr, of shape (N, m), for df, (N,), d(grad f), (N, 3), and, if it is known, d(Hess f), (N, 3, 3)."""
+        rate = torch.zeros_like(self.residual)
+        if self.by_value is not None:
+            rate = rate + self.by_value * value[:, None]
+        if self.by_gradient is not None:
+            rate = rate + (self.by_gradient * gradient[:, None]).sum(2)
+        if self.by_hessian is not None and hessian is not None:
+            rate = rate + (self.by_hessian * hessian[:, None]).sum((2, 3))
+        return rate
+
 
 Residual = Callable[[Tensor, Tensor, Tensor | None], Linearised]
 

@@ -70,7 +70,7 @@ def _second(plugin: Plugin, residual: SecondOrder) -> SecondOrder:
         with plugin.guarded(FitError):
             return _require(plugin, residual(value, gradient, hessian, target), len(value))
 
-    return SecondOrder(residual.name, checked)
+    return SecondOrder(residual.name, checked, residual.tangential)
 
 
 def _require(plugin: Plugin, found: object, count: int) -> Linearised:

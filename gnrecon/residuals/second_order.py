@@ -36,11 +36,17 @@ SHORTEST = 1e-12
 class SecondOrder:
     """A residual that needs second derivatives.
 
-    `linearise` takes values (N,), gradients (N, 3), Hessians (N, 3, 3) and targets or None.
+    Parameters
+    ----------
+    name : str
+    linearise : takes values (N,), gradients (N, 3), Hessians (N, 3, 3) and targets or None
+    tangential : whether n . H n is not looked at, and only tangential parts of H have a derivative, as with all
+        curvatures of a level set; the second derivative across it then need not be known
     """
 
     name: str
     linearise: Callable[[Tensor, Tensor, Tensor, Tensor | None], Linearised]
+    tangential: bool = False
 
     def __call__(self, value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | None = None) -> Linearised:
         """Return the residuals with their derivatives."""
@@ -104,13 +110,13 @@ def _strain(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | N
     return Linearised(torch.stack(entries, 1), None, torch.stack(by_gradient, 1), torch.stack(by_hessian, 1))
 
 
-mean_curvature = SecondOrder("mean curvature", _mean)
+mean_curvature = SecondOrder("mean curvature", _mean, tangential=True)
 """The surface is minimal, or k1 + k2 is the target, of shape (N,)."""
 
-gauss_curvature = SecondOrder("Gauss curvature", _gauss)
+gauss_curvature = SecondOrder("Gauss curvature", _gauss, tangential=True)
 """The surface is developable, or k1 k2 is the target, of shape (N,)."""
 
-surface_strain = SecondOrder("surface strain", _strain)
+surface_strain = SecondOrder("surface strain", _strain, tangential=True)
 """The surface is as flat as can be: k1^2 + k2^2 as the sum of three squares."""
 
 
@@ -133,7 +139,12 @@ def clipped_strain(maximum: float) -> SecondOrder:
             torch.where(beyond[:, None, None, None], 0.0, _known(linear.by_hessian)),
         )
 
-    return SecondOrder(f"surface strain, at most {maximum:g}", linearise)
+    return SecondOrder(f"surface strain, at most {maximum:g}", linearise, tangential=True)
+
+
+def tangents(gradient: Tensor) -> Tensor:
+    """Return two orthonormal tangents, of shape (2, N, 3), of level sets, by their gradients, of shape (N, 3)."""
+    return tangent_frame(_unit(gradient)[1]).permute(2, 0, 1)
 
 
 def tangent_frame(normals: Tensor) -> Tensor:

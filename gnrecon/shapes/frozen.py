@@ -15,22 +15,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gnrecon.field import CurvedJet, Network
-from gnrecon.levelset import derivative_along, transported
+from gnrecon.levelset import transported
 from gnrecon.linalg import Block, LayeredJacobian
-from gnrecon.residuals import Linearised, Residual, SecondOrder
+from gnrecon.residuals import Linearised, Residual, SecondOrder, tangents
 from gnrecon.slices import slices
 
 CHUNK = 8192
 FOLLOWED, LONGEST = 2, 0.1
 """Newton steps by which surface points follow a trial, and the longest one, in the coordinates' unit."""
-ASIDE = 1e-3
-"""Step of the differences that give the derivative of a residual along the normal."""
+ASIDE = 1e-5
+"""Step of the differences that give derivatives along the normal, in the coordinates' unit: some nine digits."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ class FrozenProblem:
 
     def _residuals(self, free: Tensor, term: FrozenTerm) -> Iterator[Tensor]:
         for points, target in self._pieces(free, term):
-            yield (self._evaluated(free, term.residual, points, target).residual * term.scale).T.flatten()
+            linear = evaluate(term.residual, self._jet(free, term.residual, points, 0), target)
+            yield (linear.residual * term.scale).T.flatten()
 
     def _linearised(
         self, free: Tensor, term: FrozenTerm, jet: CurvedJet, target: Tensor | None, points: Tensor
@@ -111,19 +112,36 @@ class FrozenProblem:
         linear = evaluate(term.residual, jet, target)
         if not term.moves:
             return linear
-        normals = torch.nn.functional.normalize(jet.gradient, dim=1)
-        beside = derivative_along(
-            lambda x: self._evaluated(free, term.residual, x, target).residual, points, normals, ASIDE
-        )
-        return transported(linear, jet.gradient, torch.zeros_like(jet.value), beside)
+        along = self._rates_along_normals(free, term.residual, jet, points)
+        return transported(linear, jet.gradient, torch.zeros_like(jet.value), linear.rate(*along))
 
-    def _evaluated(
-        self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, target: Tensor | None
-    ) -> Linearised:
-        return evaluate(residual, self._jet(free, residual, points, 0), target)
+    def _rates_along_normals(
+        self, free: Tensor, residual: Residual | SecondOrder, jet: CurvedJet, points: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return the derivatives of f, grad f and Hess f, if the residual has it, along the normals.
+
+        By central differences: a third derivative of f in closed form would cost more. Differences of the residual
+        itself would not do, because that of the strain is in frames of its own, which may jump between two points.
+        """
+        slope: Tensor = torch.linalg.vector_norm(jet.gradient, dim=1)
+        beside = ASIDE * torch.nn.functional.normalize(jet.gradient, dim=1)
+        before, after = (
+            replace(self._plain_jet(free, residual, points + side, 0), directions=jet.directions)
+            for side in (-beside, beside)
+        )
+        turn = (after.gradient - before.gradient) / (2 * ASIDE)
+        if not isinstance(residual, SecondOrder):
+            return slope, turn, None
+        return slope, turn, (after.hessian - before.hessian) / (2 * ASIDE)
 
     def _jet(self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, further: int) -> CurvedJet:
         """Return the field with the derivatives that a residual takes, and `further` ones for its rows."""
+        jet = self._plain_jet(free, residual, points, further)
+        if isinstance(residual, SecondOrder) and residual.tangential:
+            return replace(jet, directions=tangents(jet.gradient))
+        return jet
+
+    def _plain_jet(self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, further: int) -> CurvedJet:
         order = (2 if isinstance(residual, SecondOrder) else 1) + further
         return CurvedJet.of(self.network.layout.layers(free), self.network.activation, points, order)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -167,3 +168,23 @@ def test_no_points_are_allowed() -> None:
     jet = network.curved_jet(theta, x[:0])
     assert jet.hessian.shape == (0, 3, 3)
     assert dense(jet.rows(None, None, jet.hessian)).shape == (0, network.layout.count)
+
+
+@each_activation
+@each_depth
+@few
+@seeds
+def test_two_directions_know_all_but_what_is_across_them_twice(name: str, widths: tuple[int, ...], seed: int) -> None:
+    network, theta, x = draw(seed, name, widths)
+    generator = torch.Generator().manual_seed(seed + 1)
+    turned = torch.linalg.qr(torch.randn(len(x), 3, 3, generator=generator, dtype=torch.float64)).Q
+    T, n = turned[:, :, :2], turned[:, :, 2:]
+    jet = network.curved_jet(theta, x)
+    some = replace(jet, directions=T.permute(2, 0, 1))
+    across = n.mT @ jet.hessian @ n
+    torch.testing.assert_close(some.hessian, jet.hessian - across * (n @ n.mT), **EXACT)
+    M = torch.randn(len(x), 2, 2, generator=generator, dtype=torch.float64)
+    M = T @ (M + M.mT) @ T.mT
+    v = torch.randn(len(x), 3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(dense(some.rows(None, v, M)), dense(jet.rows(None, v, M)), **EXACT)
+    assert len(some.rows(None, v, M)[0].pairs) == 3, "one outer product fewer"

@@ -68,7 +68,7 @@ def test_free_space_has_two_sides() -> None:
 def test_every_residual_is_tested() -> None:
     # Those with second derivatives are in test_residuals_second_order.
     second = {name for name in residuals.__all__ if isinstance(getattr(residuals, name), residuals.SecondOrder)}
-    makers = {"Linearised", "Residual", "SecondOrder", "clipped_strain", "from_formula", "named"}
+    makers = {"Linearised", "Residual", "SecondOrder", "clipped_strain", "from_formula", "named", "tangents"}
     assert set(residuals.__all__) - makers - second == set(FORMULAS)
 
 

@@ -21,6 +21,7 @@ from gnrecon.residuals import (
     gauss_curvature,
     mean_curvature,
     surface_strain,
+    tangents,
 )
 from gnrecon.residuals.second_order import tangent_frame
 
@@ -143,6 +144,47 @@ def test_derivatives_agree_with_autodiff(residual: SecondOrder, seed: int) -> No
     by_gradient, by_hessian = vmap(jacrev(formula, argnums=(0, 1)))(gradient, hessian, frames)
     torch.testing.assert_close(linear.by_gradient, by_gradient, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(linear.by_hessian, (by_hessian + by_hessian.mT) / 2, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "residual", [mean_curvature, gauss_curvature, surface_strain, clipped_strain(2.0)], ids=lambda r: r.name
+)
+@few
+@seeds
+def test_curvatures_are_tangential(residual: SecondOrder, seed: int) -> None:
+    assert residual.tangential
+    generator = torch.Generator().manual_seed(seed)
+    gradient = torch.randn(9, 3, generator=generator, dtype=F64)
+    hessian = torch.randn(9, 3, 3, generator=generator, dtype=F64)
+    hessian = hessian + hessian.mT
+    n = torch.nn.functional.normalize(gradient, dim=1)
+    across = 5.0 * n[:, :, None] * n[:, None, :]
+    value = torch.zeros(9, dtype=F64)
+    linear, other = residual(value, gradient, hessian), residual(value, gradient, hessian + across)
+    torch.testing.assert_close(other.residual, linear.residual, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(other.by_gradient, linear.by_gradient, rtol=1e-9, atol=1e-9)
+    assert linear.by_hessian is not None
+    assert float((linear.by_hessian @ n[:, None, :, None]).abs().max()) < 1e-9
+    first, second = tangents(gradient)
+    for one, other_one, product in ((first, first, 1.0), (second, second, 1.0), (first, second, 0.0), (first, n, 0.0)):
+        torch.testing.assert_close((one * other_one).sum(1), torch.full((9,), product, dtype=F64))
+
+
+@each_residual
+def test_the_rate_is_the_derivative_along_a_change(residual: SecondOrder) -> None:
+    generator = torch.Generator().manual_seed(0)
+    value, gradient = torch.zeros(9, dtype=F64), torch.randn(9, 3, generator=generator, dtype=F64)
+    hessian, change = torch.randn(2, 9, 3, 3, generator=generator, dtype=F64)
+    hessian, change = hessian + hessian.mT, change + change.mT
+    linear = residual(value, gradient, hessian)
+    h = 1e-6
+    ahead, behind = (residual(value, gradient, hessian + side * change).residual for side in (h, -h))
+    rate = linear.rate(value, torch.zeros_like(gradient), change)
+    torch.testing.assert_close(rate, (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
+    if residual is not surface_strain:  # its frame turns with the gradient
+        ahead, behind = (residual(value, gradient + side * change[:, 0], hessian).residual for side in (h, -h))
+        rate = linear.rate(value, change[:, 0], None)
+        torch.testing.assert_close(rate, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
 from gnrecon.field import SINE, WAVELET, Network
@@ -81,6 +84,28 @@ def test_the_jacobian_is_the_derivative_of_what_a_trial_measures(
             along = J @ direction
         found = (ahead - behind) / (2 * h)
         torch.testing.assert_close(along, found, rtol=1e-3, atol=1e-4 * float(found.abs().max() + 1e-6))
+
+
+def test_the_strains_rows_are_right_where_its_frame_jumps() -> None:
+    """Frames are chosen by the sign of the normal's z; along the normal of such a point it changes."""
+    theta = 0.7 * torch.randn(NETWORK.layout.count, generator=torch.Generator().manual_seed(3), dtype=F64)
+
+    def upward(t: float) -> float:
+        return float(NETWORK.value_and_gradient(theta, torch.tensor([[0.1, t, 0.2]], dtype=F64))[1][0, 2])
+
+    places = np.linspace(-2.0, 2.0, 41)
+    before = next(a for a, b in pairwise(places) if upward(a) * upward(b) < 0.0)
+    level = brentq(upward, before, before + 0.1, xtol=1e-14)
+    points = torch.tensor([[0.1, level, 0.2]], dtype=F64)
+    normal = torch.nn.functional.normalize(NETWORK.value_and_gradient(theta, points)[1], dim=1)
+    beside = [NETWORK.value_and_gradient(theta, points + side * 1e-5 * normal)[1][0, 2] for side in (-1, 1)]
+    assert float(beside[0] * beside[1]) < 0.0
+    problem = FrozenProblem(NETWORK, [FrozenTerm("strain", surface_strain, points, None, 1.0, True)], theta)
+    J, r = dense(problem, theta)
+    direction = torch.randn(len(theta), generator=torch.Generator().manual_seed(1), dtype=F64)
+    ahead, behind = problem.residual(theta + 1e-5 * direction), problem.residual(theta - 1e-5 * direction)
+    found = (ahead @ ahead - behind @ behind) / 2e-5
+    torch.testing.assert_close(2 * (r @ J @ direction), found, rtol=1e-3, atol=0.0)
 
 
 def test_points_that_move_stay_on_the_surface(tube: tuple[Tensor, Tensor]) -> None:
