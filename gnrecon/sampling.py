@@ -25,6 +25,7 @@ from gnrecon.slices import slices
 from gnrecon.threads import abreast
 
 Mask = npt.NDArray[np.bool_]
+Int = npt.NDArray[np.int64]
 
 _SOURCES = 4000
 _NEIGHBOURS = 8
@@ -42,6 +43,10 @@ STEEPNESS = 0.3
 """Least magnitude of a field in the free space, as a share of the distance from the surface."""
 
 
+LEAST_HALF = 4
+"""Points that `halved` leaves together: their order within says nothing."""
+
+
 @dataclass(frozen=True)
 class Box:
     """An axis-aligned box, unit coordinates."""
@@ -57,6 +62,27 @@ class Box:
     def sample(self, count: int, rng: np.random.Generator) -> Float:
         """Return uniform points, of shape (count, 3)."""
         return rng.uniform(self.lower, self.upper, (count, 3))
+
+
+def halved(points: Float) -> Int:
+    """Return an order of points, of shape (N, 3), in which any aligned run of 4, 8, 16 ... of them is a compact patch.
+
+    Groups are cut in half across their longest side until four are left, the first half of each a power of two.
+    """
+    points = np.asarray(points)
+    rows = np.arange(len(points))
+    order = rows
+    size = 1 << max(len(points) - 1, 0).bit_length()
+    while size > LEAST_HALF:
+        ordered, group = points[order], rows // size
+        lower = np.minimum.reduceat(ordered, rows[::size])
+        sides = np.maximum.reduceat(ordered, rows[::size]) - lower
+        longest = sides.argmax(axis=1)
+        place = (ordered - lower[group])[rows, longest[group]]
+        # The groups stay in their order, and points of a group are sorted along its side.
+        order = order[np.argsort(group + 0.5 * place / np.maximum(sides.max(axis=1), np.finfo(float).tiny)[group])]
+        size //= 2
+    return order
 
 
 def near_surface(points: Float, spread: float, count: int, rng: np.random.Generator) -> Float:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnrecon.sampling import Box, CoarseDistance, near_surface, winding_number
+from gnrecon.sampling import Box, CoarseDistance, halved, near_surface, winding_number
 
 Float = NDArray[np.float64]
 Shape = Callable[[int], tuple[Float, Float]]
@@ -186,3 +186,21 @@ def test_a_large_cloud_is_summed_by_a_subset() -> None:
     """9,000 points are more than the sum takes; the subset's areas must make up for the rest."""
     coarse = CoarseDistance(*sphere(9000), np.random.default_rng(0))
     assert coarse.winding_number(np.zeros((1, 3))) == pytest.approx(1.0, abs=0.05)
+
+
+def test_halved_points_come_in_compact_patches() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(size=(1000, 3)) * [4.0, 2.0, 0.0]
+    order = halved(points)
+    assert sorted(order) == list(range(1000))
+    # Runs of 8 and 64 points of a plane, 125 to a unit of area: their patches are about square.
+    for length in (8, 64):
+        sides = [np.ptp(points[order][start : start + length], axis=0).max() for start in range(0, 1000, length)]
+        assert np.mean(sides) < 1.6 * np.sqrt(length / 125)
+    assert np.array_equal(halved(points), order)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 9])
+def test_few_or_equal_points_are_halved(count: int) -> None:
+    assert sorted(halved(np.random.default_rng(count).normal(size=(count, 3)))) == list(range(count))
+    assert sorted(halved(np.ones((count, 3)))) == list(range(count))

@@ -6,6 +6,7 @@
 3. They walk and repel each other on the surface until they are spread evenly (`spread`).
 4. Newton's method brings them onto the level set as precisely as rounding allows (`newton`); what does not arrive
    there, near a critical point, is dropped.
+5. They are put in an order in which neighbours come together, for those who make use of it (`linalg.neighbours`).
 
 Means over the points then are means over the surface, and `area` times them its integrals. The evaluation of the grid
 is nearly all of the cost.
@@ -25,7 +26,7 @@ from gnrecon.levelset.crossings import Crossings, find_crossings
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.newton import project
 from gnrecon.levelset.spread import repel, walk
-from gnrecon.sampling import Box
+from gnrecon.sampling import Box, halved
 
 Places = npt.NDArray[np.int64]
 
@@ -39,7 +40,7 @@ class SurfaceSample:
 
     Parameters
     ----------
-    points : of shape (N, 3), on the level set and in the box
+    points : of shape (N, 3), on the level set and in the box, in the order of `gnrecon.sampling.halved`
     normals : grad f / |grad f| there, of shape (N, 3)
     area : an unbiased estimate of the surface's area in the box, in squared units of the coordinates
     """
@@ -100,5 +101,6 @@ def _curve(points: Float, box: Box) -> Places:
 def _arrived(level_set: LevelSet, points: Tensor, cap: float, area: float) -> SurfaceSample:
     """Project the points and keep those that arrive, within the box."""
     projected = project(level_set, points, cap)
-    kept = projected.converged & level_set.contains(projected.points)
+    kept = (projected.converged & level_set.contains(projected.points)).nonzero()[:, 0]
+    kept = kept[torch.as_tensor(halved(projected.points[kept].cpu().numpy())).to(kept.device)]
     return SurfaceSample(projected.points[kept], torch.nn.functional.normalize(projected.gradients[kept], dim=1), area)

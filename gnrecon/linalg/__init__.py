@@ -12,6 +12,7 @@ from gnrecon.linalg.kronecker import Kronecker
 from gnrecon.linalg.krylov import KrylovResult, conjugate_gradients
 from gnrecon.linalg.metric import Metric, identity, jacobian_layer_scaled, jacobian_scaled, layer_scaled
 from gnrecon.linalg.minres import minres
+from gnrecon.linalg.neighbours import Neighbours
 from gnrecon.linalg.nystrom import Nystrom
 from gnrecon.linalg.preconditioner import BlockJacobi, Jacobi, Preconditioner, Prepared
 from gnrecon.linalg.qr import QR
@@ -28,6 +29,7 @@ SOLVERS: dict[str, Callable[..., LinearSolver]] = {
     "cg-jacobi": lambda energy=0.0: Iterative("cg", Jacobi(), energy=energy),
     "cg-block-jacobi": lambda energy=0.0: Iterative("cg", BlockJacobi(), energy=energy),
     "cg-nystrom": lambda energy=0.0: Iterative("cg", Nystrom(100), energy=energy),
+    "cg-neighbours": lambda energy=0.0: Iterative("cg", Neighbours(), energy=energy),
     "cg-sampled": lambda energy=0.0: Iterative("cg", SampledGram(4000), energy=energy),
     "cg-kronecker": lambda energy=0.0: Iterative("cg", Kronecker(), energy=energy),
     "minres": lambda energy=0.0: Iterative("minres", Jacobi()),  # noqa: ARG005
@@ -58,6 +60,7 @@ __all__ = [
     "LayeredJacobian",
     "LinearSolver",
     "Metric",
+    "Neighbours",
     "Nystrom",
     "Preconditioner",
     "Prepared",

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-BLOCK = 256
+BLOCK = 192
 
 
 def gram(chunks: Iterable[Tensor], size: int, like: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ Factors may be stored in float32 while sums over chunks of rows are kept, and ve
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -99,6 +100,18 @@ class Jacobian(Protocol):
         """Return the Jacobian of the given rows, of shape (m,), in ascending order."""
         ...
 
+    @property
+    def stretches(self) -> tuple[int, ...]:
+        """Numbers of successive rows that belong to one constraint."""
+        ...
+
+    def runs(self, lengths: Sequence[int]) -> Tensor:
+        """Return sums of runs of successive rows over the roots of their numbers, in `dtype`, of shape (m, p).
+
+        There is one length for each stretch; the last run of a stretch may be shorter.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class DenseJacobian:
@@ -177,6 +190,18 @@ class DenseJacobian:
     def sample(self, rows: Tensor) -> DenseJacobian:
         """Return the Jacobian of the given rows."""
         return DenseJacobian(self.matrix[rows], self.group_sizes, self.chunk)
+
+    @property
+    def stretches(self) -> tuple[int, ...]:
+        """All rows as one stretch."""
+        return (self.rows,)
+
+    def runs(self, lengths: Sequence[int]) -> Tensor:
+        """Return sums of runs of rows over the roots of their numbers."""
+        starts = range(0, self.rows, lengths[0])
+        parts = [self.matrix[start : start + lengths[0]] for start in starts]
+        sums = [part.sum(0, keepdim=True) / math.sqrt(len(part)) for part in parts]
+        return torch.cat([self.matrix.new_zeros(0, self.columns), *sums])
 
 
 @dataclass(frozen=True)
@@ -325,6 +350,21 @@ class LayeredJacobian:
                 blocks.append([layer.take(inside) for layer in block])
             start = stop
         return LayeredJacobian(lambda: blocks, len(rows), self.group_sizes, self.device, self.dtype, self.stored)
+
+    @property
+    def stretches(self) -> tuple[int, ...]:
+        """The blocks' numbers of rows."""
+        return tuple(len(block[0]) for block in self.blocks())
+
+    def runs(self, lengths: Sequence[int]) -> Tensor:
+        """Return sums of runs of rows over the roots of their numbers, never forming the rows."""
+        parts = []
+        for block, length in zip(self.blocks(), lengths, strict=True):
+            place = block[0].left.new_empty(-(-len(block[0]) // length), self.columns)
+            for layer, group in zip(block, self.groups, strict=True):
+                layer.write_runs(length, place[:, group])
+            parts.append(place.to(self.dtype))
+        return torch.cat([self._zeros(0, self.columns), *parts])
 
 
 def _filled(block: Block) -> Block:

@@ -13,7 +13,9 @@ p).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -50,6 +52,12 @@ class LayerRows:
             return self.further
         return ((self.right, self.tangents), *self.further)
 
+    @cached_property
+    def _stacked(self) -> tuple[Tensor, Tensor]:
+        """All left factors, of shape (M, k, out), and their right ones, of shape (M, k, in)."""
+        pairs = ((self.left, self.inputs), *self.pairs)
+        return torch.stack([left for left, _ in pairs], 1), torch.stack([inputs for _, inputs in pairs], 1)
+
     @property
     def bytes(self) -> int:
         """Memory of the factors, shared ones counted here too."""
@@ -81,18 +89,42 @@ class LayerRows:
         weights = block[:, : out * into].view(len(block), out, into)
         if self.further:
             # One small product a row passes over the block once, where sums of outer products pass over it each time.
-            lefts = torch.stack([self.left, *(right for right, _ in self.pairs)], dim=2)
-            torch.bmm(lefts, torch.stack([self.inputs, *(t for _, t in self.pairs)], dim=1), out=weights)
+            lefts, rights = self._stacked
+            torch.bmm(lefts.mT, rights, out=weights)
         else:
             torch.mul(self.left[:, :, None], self.inputs[:, None, :], out=weights)
             for right, tangents in self.pairs:
                 weights.addcmul_(right[:, :, None], tangents[:, None, :])
         block[:, out * into :] = self.left
 
+    def write_runs(self, length: int, block: Tensor) -> None:
+        """Write the sum of each `length` successive rows over the root of that into `block`, of shape (runs, size).
+
+        Where M is no multiple of the length, one more has the rows that are left, over the root of their number.
+        """
+        if length == 1:
+            self.write(block)
+            return
+        out, into = self.left.shape[1], self.inputs.shape[1]
+        lefts, rights = self._stacked
+        for rows, count, place in _runs(len(self), length):
+            runs = place.stop - place.start
+            # The sum of a run's outer products is one product of matrices, (out, k count) by (k count, in).
+            ends = [part[rows].reshape(runs, count * part.shape[1], part.shape[2]) for part in (lefts, rights)]
+            block[place, : out * into] = torch.bmm(ends[0].mT, ends[1]).flatten(1)
+            torch.sum(self.left[rows].view(runs, count, out), 1, out=block[place, out * into :])
+            block[place].div_(math.sqrt(count))
+
     def mv(self, v: Tensor) -> Tensor:
         """Return J v, of shape (M,), for v of shape (size,)."""
         out, into = self.left.shape[1], self.inputs.shape[1]
         weights = v[: out * into].view(out, into)
+        if self.further:
+            # One product for all pairs; where there are two, stacking them costs more than it spares.
+            lefts, rights = self._stacked
+            product = (rights.flatten(0, 1) @ weights.T).view_as(lefts)
+            product[:, 0] += v[out * into :]
+            return product.mul_(lefts).sum((1, 2))
         # l . (V i + b) + r . (V t)
         product = torch.addmm(v[out * into :], self.inputs, weights.T).mul_(self.left)
         for right, tangents in self.pairs:
@@ -101,6 +133,10 @@ class LayerRows:
 
     def tmv(self, u: Tensor) -> Tensor:
         """Return J^T u, of shape (size,), for u of shape (M,)."""
+        if self.further:
+            lefts, rights = self._stacked
+            along = (lefts * u[:, None, None]).flatten(0, 1).T @ rights.flatten(0, 1)
+            return torch.cat([along.flatten(), self.left.T @ u])
         scaled = self.left * u[:, None]
         weights = scaled.T @ self.inputs
         for right, tangents in self.pairs:
@@ -146,3 +182,11 @@ def _of(left: Tensor, inputs: Tensor, pairs: list[Pair]) -> LayerRows:
     """Return rows from their outer products."""
     right, tangents = pairs[0] if pairs else (None, None)
     return LayerRows(left, inputs, right, tangents, tuple(pairs[1:]))
+
+
+def _runs(rows: int, length: int) -> list[tuple[slice, int, slice]]:
+    """Return the rows of whole runs, and those that are left for a shorter one; the rows of a run; the runs' places."""
+    count = rows // length
+    whole = count * length
+    parts = [(slice(0, whole), length, slice(0, count)), (slice(whole, rows), rows - whole, slice(count, count + 1))]
+    return [(part, run, place) for part, run, place in parts if part.stop > part.start]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 
 import pytest
@@ -78,6 +79,23 @@ def test_matrices(make: Callable[[int, torch.dtype], Made], stored: torch.dtype,
     close(jacobian.gram().tril(), (J.T @ J).tril(), stored)
     close(jacobian.diagonal(), J.square().sum(0), stored)
     close(jacobian.row_squares(), J.square().sum(1), stored)
+    assert sum(jacobian.stretches) == len(J)
+
+
+@each_maker
+@each_storage
+@pytest.mark.parametrize("length", [1, 2, 3, 100])
+def test_runs(make: Callable[[int, torch.dtype], Made], stored: torch.dtype, length: int) -> None:
+    jacobian, J = make(0, stored)
+    sums = [
+        part.sum(0) / math.sqrt(len(part))
+        for stretch in J.split(list(jacobian.stretches))
+        for part in stretch.split(length)
+        if len(part)
+    ]
+    found = jacobian.runs([length] * len(jacobian.stretches))
+    assert found.dtype == jacobian.dtype
+    close(found, torch.stack(sums) if sums else J[:0], stored)
     close(jacobian.kernel().tril(), (J @ J.T).tril(), stored)
     assert [group.stop - group.start for group in jacobian.groups] == [len(part) for part in jacobian.group_grams()]
     for group, part in zip(jacobian.groups, jacobian.group_grams(), strict=True):

@@ -16,6 +16,7 @@ from gnrecon.linalg import (
     Kronecker,
     LayeredJacobian,
     LayerRows,
+    Neighbours,
     Nystrom,
     Preconditioner,
     SampledGram,
@@ -23,11 +24,14 @@ from gnrecon.linalg import (
     conjugate_gradients,
 )
 from gnrecon.linalg.draw import inclusion
-from gnrecon.linalg.krylov import Apply
+from gnrecon.linalg.krylov import Apply, KrylovResult
+from gnrecon.linalg.neighbours import run_lengths
 
 PRECONDITIONERS: dict[str, Preconditioner] = {
     "jacobi": Jacobi(),
     "block jacobi": BlockJacobi(),
+    "neighbours": Neighbours(),
+    "neighbours, alike or not": Neighbours(-2.0),
     "nystrom": Nystrom(5),
     "nystrom, full": Nystrom(1000),
     "sampled": SampledGram(15),
@@ -70,6 +74,55 @@ def test_symmetric_definite_and_finite(name: str, problem: str, damping: float) 
     assert float((P - P.T).norm()) <= 1e-6 * float(P.norm())
     assert float(values[0]) > -1e-10 * float(values[-1])
     assert bool((P.diagonal() > 0.0).all())
+
+
+def smooth(seed: int, count: int) -> tuple[DenseJacobian, Tensor]:
+    """Rows along a curve, as many columns: products of few waves, so that a row differs little from the next one."""
+    generator = torch.Generator().manual_seed(seed)
+    t = torch.linspace(0, 1, count, dtype=F64)[:, None]
+    J = torch.cos(t * torch.arange(12) + randn(generator, 12)) @ randn(generator, 12, count)
+    return DenseJacobian(J), J
+
+
+def test_neighbours_that_are_alike_take_few_iterations() -> None:
+    jacobian, J = smooth(0, 400)
+    assert run_lengths(jacobian, 0.8) == [16]
+    D = metric_of(J)
+    b = J.T @ randn(torch.Generator().manual_seed(1), 400)
+    for damping in (1e-4, 1.0):
+        A = J.T @ J + damping * torch.diag(D)
+        expected = torch.linalg.solve(A, b)
+
+        def solved(
+            preconditioner: Preconditioner, tolerance: float, energy: float, A: Tensor = A, damping: float = damping
+        ) -> KrylovResult:
+            P = at(preconditioner, jacobian, D, damping)
+            return conjugate_gradients(lambda v: A @ v, b, P, tolerance, 200, energy)
+
+        off = solved(Neighbours(), 0.0, 0.01).solution - expected
+        assert float(off @ A @ off) < 4e-4 * float(expected @ A @ expected), "the error is measured as it is"
+        assert solved(Neighbours(), 1e-6, 0.0).iterations < solved(Jacobi(), 1e-6, 0.0).iterations / 2
+
+
+def test_runs_are_as_long_as_their_ends_are_alike() -> None:
+    generator = torch.Generator().manual_seed(0)
+    assert run_lengths(DenseJacobian(randn(generator, 400, 30)), 0.8) == [1]
+    # Rows that turn by 0.1 each: 0.3 and 0.7 between the ends of 4 and 8 rows, whose cosines are 0.96 and 0.76.
+    angle = 0.1 * torch.arange(400, dtype=F64)
+    turning = torch.stack([angle.cos(), angle.sin()], 1)
+    assert run_lengths(DenseJacobian(turning), 0.8) == [4]
+    assert run_lengths(DenseJacobian(turning), 0.7) == [8]
+    assert run_lengths(DenseJacobian(0.0 * turning), 0.8) == [1], "rows of zeros are alike to nothing"
+    assert run_lengths(DenseJacobian(turning[:10]), 0.0) == [1], "a stretch shorter than the longest run"
+    blocks = layered(0, [(9, 1), (40, 1), (0, 0)])[0]
+    assert run_lengths(blocks, -2.0) == [1, 16, 1], "each block has its own runs"
+
+
+def test_neighbours_that_are_no_fewer_than_the_columns_give_the_inverse() -> None:
+    J = randn(torch.Generator().manual_seed(2), 60, 20)
+    D = metric_of(J)
+    P = as_matrix(at(Neighbours(), DenseJacobian(J), D, 0.1), 20)
+    torch.testing.assert_close(P, torch.linalg.inv(J.T @ J + 0.1 * torch.diag(D)))
 
 
 @pytest.mark.parametrize("damping", [1e-3, 1.0])
