@@ -84,10 +84,10 @@ def near_values(level_set: LevelSet, grid: Tensor) -> Tensor:
     than 1.5 of their sides, where a half of sqrt(3) would do.
     """
     corners = grid[::_BLOCK, ::_BLOCK, ::_BLOCK]
-    coarse = level_set.values(corners.reshape(-1, 3)).reshape(corners.shape[:-1])
+    coarse = level_set.rough_values(corners.reshape(-1, 3)).reshape(corners.shape[:-1])
     wanted = _nodes_of(_may_hold_zero(coarse), grid.shape[:-1])
     values = torch.full(grid.shape[:-1], torch.nan, dtype=grid.dtype, device=grid.device)
-    values[wanted] = level_set.values(grid[wanted])
+    values[wanted] = level_set.rough_values(grid[wanted])
     return values
 
 
@@ -147,7 +147,7 @@ def _search(level_set: LevelSet, below: Tensor, above: Tensor, at_below: Tensor,
     place = _false_position(low, high, f_low, f_high)
     was_low = torch.full_like(place, torch.nan)
     for _ in range(_TRIES):
-        value = level_set.values(below + place[:, None] * edge)
+        value = level_set.rough_values(below + place[:, None] * edge)
         is_low = value < 0
         again = was_low == is_low
         # An end that stays while the other one moves twice counts half, so that the next try lands beyond the zero.

@@ -32,12 +32,15 @@ class LevelSet:
     value_and_gradient : the same with grad f, of shape (N, 3)
     box : where the surface is looked for, in the coordinates that f takes
     device : where f wants its points
+    roughly : f to about a millionth, such as in float32, which is enough to find where it changes its sign; by default
+        `value`
     """
 
     value: Value
     value_and_gradient: ValueAndGradient
     box: Box
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    roughly: Value | None = None
 
     @property
     def diagonal(self) -> float:
@@ -51,7 +54,15 @@ class LevelSet:
     @torch.no_grad()
     def values(self, points: Tensor) -> Tensor:
         """Return f, of shape (N,), at any number of points, of shape (N, 3), by chunks."""
-        return torch.cat([self.value(points[rows]) for rows in _chunks(len(points))])
+        return self._by_chunks(self.value, points)
+
+    @torch.no_grad()
+    def rough_values(self, points: Tensor) -> Tensor:
+        """Return f as `roughly` gives it, of shape (N,), at any number of points, of shape (N, 3), by chunks."""
+        return self._by_chunks(self.roughly or self.value, points)
+
+    def _by_chunks(self, value: Value, points: Tensor) -> Tensor:
+        return torch.cat([value(points[rows]) for rows in _chunks(len(points))])
 
     @torch.no_grad()
     def values_and_gradients(self, points: Tensor) -> tuple[Tensor, Tensor]:

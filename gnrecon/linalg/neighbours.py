@@ -33,7 +33,7 @@ from gnrecon.linalg.krylov import Apply
 from gnrecon.linalg.preconditioner import Prepared, definite_factor
 from gnrecon.linalg.sampled_gram import PreparedGram
 
-LENGTHS = (2, 4, 8, 16)
+LENGTHS = (2, 4, 8)
 """Rows of a run, if it is more than one."""
 
 ASKED = 8
@@ -70,10 +70,10 @@ class Neighbours:
     Parameters
     ----------
     alike : least mean cosine of the angle between the first and the last row of a run. Each constraint has the longest
-        runs that keep to it, of at most 16 rows; of one that has none, each row counts by itself
+        runs that keep to it, of at most 8 rows; of one that has none, each row counts by itself
     """
 
-    alike: float = 0.8
+    alike: float = 0.7
 
     def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> Prepared:  # noqa: ARG002
         """Choose the runs, sum them and multiply them with one another; or take J^T J, where runs would be no fewer."""

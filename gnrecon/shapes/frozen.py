@@ -29,8 +29,9 @@ from gnrecon.slices import slices
 CHUNK = 8192
 FOLLOWED, LONGEST = 2, 0.1
 """Newton steps by which surface points follow a trial, and the longest one, in the coordinates' unit."""
-ASIDE = 1e-5
-"""Step of the differences that give derivatives along the normal, in the coordinates' unit: some nine digits."""
+ASIDE = 2e-3
+"""Step of the differences that give derivatives along the normal, in the coordinates' unit: about as far as a step
+moves a surface. Where curvature changes fast, at a part's edges, what it does over that way is what counts."""
 
 
 @dataclass(frozen=True)

@@ -78,8 +78,12 @@ class ShapeProblem:
 
     def level_set(self, theta: Tensor) -> LevelSet:
         """Return the zero level of the network with parameters theta, of shape (p,)."""
+        rounded = theta.float()
         return LevelSet(
-            lambda x: self.network.value(theta, x), lambda x: self.network.value_and_gradient(theta, x), self.box
+            lambda x: self.network.value(theta, x),
+            lambda x: self.network.value_and_gradient(theta, x),
+            self.box,
+            roughly=lambda x: self.network.value(rounded, x.float()).to(x),
         )
 
     def freeze(

@@ -12,56 +12,85 @@ import torch
 from torch import Tensor
 
 from benchmarks.learn.nested import nested_step, papers_step
-from gnrecon.linalg import Cholesky, identity
-from gnrecon.shapes import catenoid
+from gnrecon.linalg import Cholesky, LinearSolver, identity
+from gnrecon.shapes import ShapeProblem, catenoid, learn
 from gnrecon.shapes.frozen import FrozenProblem
-from gnrecon.shapes.pretrain import pretrained
 
-DAMPING = 1e-6
-OURS, NESTED = 5, 2
-"""Repetitions, of which the fastest counts."""
+STEPS = 60
+"""Of the run, before the step that is timed; the surface has its shape then, and the eikonal term is gone."""
+
+OURS, NESTED = 9, 3
+"""Repetitions, of which the median counts."""
 
 
 def step_figures(seed: int) -> dict[str, Any]:
-    """Return the seconds of both, and how far their steps differ, as a share of the step's length.
-
-    Both take the same points, which rest, the same rows in the same precision, and the same linear solver; the nested
-    one is also solved as the paper does, and ours is also timed with points that move with the surface, as `gnrecon
-    learn` takes it.
-    """
+    """Return the figures of the first step of a run (`first`) and of a later one (`later`)."""
     problem = catenoid()
+    begun = learn(problem, budget=None, steps=1, seed=seed).solution
+    run = learn(problem, budget=None, steps=STEPS, seed=seed).solution
     rng = np.random.default_rng(seed)
-    theta = pretrained(problem, seed, rng)
-    moving = problem.freeze(1, theta, rng)
-    resting = replace(moving, terms=[replace(term, moves=False) for term in moving.terms])
-    ours, closed = timed(lambda: closed_step(resting, theta), OURS)
-    with_motion, _ = timed(lambda: closed_step(moving, theta), OURS)
-    theirs, nested = timed(lambda: nested_step(resting, theta, DAMPING), NESTED)
-    papers, _ = timed(lambda: papers_step(resting, theta, DAMPING), NESTED)
     return {
-        "rows": sum(len(term.points) for term in resting.terms),
-        "parameters": len(theta),
-        "closed_seconds": ours,
-        "moving_seconds": with_motion,
-        "nested_seconds": theirs,
-        "papers_seconds": papers,
-        "speedup": theirs / ours,
-        "papers_speedup": papers / ours,
-        "difference": float((closed - nested).norm() / nested.norm()),
+        "first": figures_at(problem, begun.theta, 1, begun.history[-1].damping, rng),
+        "later": figures_at(problem, run.theta, STEPS + 1, run.history[-1].damping, rng),
         "threads": torch.get_num_threads(),
     }
 
 
-def closed_step(problem: FrozenProblem, theta: Tensor) -> Tensor:
+def figures_at(
+    problem: ShapeProblem, theta: Tensor, step: int, damping: float, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Return the seconds of a step by each way, and how far ours is from the exact one.
+
+    All take the same points, which rest, and the same residuals and damping in float64: ours as `gnrecon learn` does,
+    also with points that move with the surface as it does, and with J^T J and its Cholesky factor; the nested one with
+    the same factor, and as the paper does.
+    """
+    moving = problem.freeze(step, theta, rng)
+    resting = replace(moving, terms=[replace(term, moves=False) for term in moving.terms])
+
+    def ours(frozen: FrozenProblem, solver: LinearSolver) -> Callable[[], Tensor]:
+        return lambda: closed_step(frozen, theta, damping, solver)
+
+    seconds, found = timed(ours(resting, problem.solver()), OURS)
+    with_motion, _ = timed(ours(moving, problem.solver()), OURS)
+    factored, _ = timed(ours(resting, Cholesky()), OURS)
+    nested, exact = timed(lambda: nested_step(resting, theta, damping), NESTED)
+    papers, _ = timed(lambda: papers_step(resting, theta, damping), NESTED)
+    return {
+        "rows": sum(len(term.points) for term in resting.terms),
+        "parameters": len(theta),
+        "damping": damping,
+        "seconds": seconds,
+        "moving_seconds": with_motion,
+        "factored_seconds": factored,
+        "nested_seconds": nested,
+        "papers_seconds": papers,
+        "speedup": nested / seconds,
+        "papers_speedup": papers / seconds,
+        "error": energy_error(resting, theta, damping, found, exact),
+    }
+
+
+def closed_step(problem: FrozenProblem, theta: Tensor, damping: float, solver: LinearSolver) -> Tensor:
     """Return the step, of shape (p,)."""
-    return Cholesky().linearise(*problem.linearise(theta), identity).solve(DAMPING).direction
+    return solver.linearise(*problem.linearise(theta), identity).solve(damping).direction
+
+
+def energy_error(problem: FrozenProblem, theta: Tensor, damping: float, found: Tensor, exact: Tensor) -> float:
+    """Return a step's error in the norm of the damped matrix, as a share of the step's own."""
+    jacobian, _ = problem.linearise(theta)
+
+    def norm(step: Tensor) -> Tensor:
+        return (jacobian.mv(step).square().sum() + damping * step.square().sum()).sqrt()
+
+    return float(norm(found - exact) / norm(exact))
 
 
 def timed(work: Callable[[], Tensor], repetitions: int) -> tuple[float, Tensor]:
-    """Return the seconds of the fastest of several runs, and the result."""
-    least = float("inf")
+    """Return the median seconds of several runs, and the result."""
+    spent = []
     for _ in range(repetitions):
         start = time.perf_counter()
         result = work()
-        least = min(least, time.perf_counter() - start)
-    return least, result
+        spent.append(time.perf_counter() - start)
+    return float(np.median(spent)), result
