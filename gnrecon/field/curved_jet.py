@@ -125,7 +125,7 @@ class CurvedJet:
         """
         found = (self.axes.adjoints[0] @ self.layers[0][0]).permute(1, 0, 2)
         if self.directions is not None:
-            # H = T T^T H + H T T^T - T T^T H T T^T, with T = U^T and U H found, but for the complement's own part.
+            # U H is what was found, and H = U^T U H + H U^T U - U^T U H U^T U, but for the complement's own part.
             U = self.directions.permute(1, 0, 2)
             found = U.mT @ (2 * found - (found @ U.mT) @ U)
         return (found + found.mT) / 2

@@ -18,7 +18,7 @@ Formula = Callable[[Tensor, Tensor, Tensor], Tensor]
 """From one point's value (), gradient (3,) and Hessian (3, 3) to m residuals, of shape (m,)."""
 
 
-def from_formula(name: str, formula: Formula) -> SecondOrder:
+def from_formula(name: str, formula: Formula, tangential: bool = False) -> SecondOrder:
     """Return the residual of a formula.
 
     Parameters
@@ -26,6 +26,8 @@ def from_formula(name: str, formula: Formula) -> SecondOrder:
     name : what the history calls it
     formula : from one point's value (), gradient (3,) and Hessian (3, 3) to residuals, of shape (m,), by torch
         functions that can be differentiated where they are evaluated
+    tangential : whether it is the same whatever n . H n is, with n the normal g / |g|, as all curvatures of level sets
+        are; two tangents then serve for three axes
     """
 
     def linearise(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | None) -> Linearised:
@@ -34,4 +36,4 @@ def from_formula(name: str, formula: Formula) -> SecondOrder:
         by_value, by_gradient, by_hessian = vmap(jacrev(formula, argnums=(0, 1, 2)))(value, gradient, hessian)
         return Linearised(residual, by_value, by_gradient, (by_hessian + by_hessian.mT) / 2)
 
-    return SecondOrder(name, linearise)
+    return SecondOrder(name, linearise, tangential)

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
-from gnrecon.linalg import Iterative, LinearSolver, Neighbours
 from gnrecon.residuals import SecondOrder, eikonal, interface
 from gnrecon.sampling import Box
 from gnrecon.shapes.problem import ShapeProblem, Start, plane_through
@@ -23,9 +22,6 @@ ON_SURFACE, ON_CURVE, IN_BOX = 2000, 500, 300
 
 HOLD, FACTOR = 10, 0.7
 """Steps for which the eikonal term keeps its weight, and its factor from step to step after them."""
-
-ENERGY = 0.1
-"""Error of a step in the norm of the damped matrix: Gauss-Newton's model is no more exact than that."""
 
 MARGIN = 0.25
 """How far the box reaches beyond a curve, as a share of the curve's longest side."""
@@ -61,16 +57,7 @@ def through_curves(
         Term(curvature.name, curvature, on_surface(ON_SURFACE)),
         Term("eikonal", eikonal, in_box(IN_BOX), fading(1.0, HOLD, FACTOR)),
     )
-    return ShapeProblem(name, terms, box or box_around(points), start or plane_through(points), solver=by_neighbours)
-
-
-def by_neighbours() -> LinearSolver:
-    """Return conjugate gradients that sums of neighbouring rows precondition, afresh at each step.
-
-    The rows of points on a smooth surface, in the order in which `sample_surface` gives them, change little from one
-    to the next, and few of J^T J's eigenvalues are above the damping.
-    """
-    return Iterative("cg", Neighbours(), energy=ENERGY, reuse=False)
+    return ShapeProblem(name, terms, box or box_around(points), start or plane_through(points))
 
 
 def curve_points(curve: npt.ArrayLike) -> Float:

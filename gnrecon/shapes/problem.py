@@ -12,7 +12,7 @@ from torch import Tensor
 from gnrecon.cloud import Float
 from gnrecon.field import TANH, Network
 from gnrecon.levelset import KnownSurface, LevelSet
-from gnrecon.linalg import Cholesky, LinearSolver, identity
+from gnrecon.linalg import Iterative, LinearSolver, Neighbours, identity
 from gnrecon.optim import GainRatioDamping, Search
 from gnrecon.sampling import Box
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
@@ -23,6 +23,19 @@ PAPERS = Network((32, 32), TANH)
 
 CAUTIOUS = GainRatioDamping(initial_damping=1.0, metric=identity)
 """Step control that does not tear a surface in its first steps."""
+
+ENERGY = 0.1
+"""Error of a step in the norm of the damped matrix: Gauss-Newton's model is no more exact than that."""
+
+
+def by_neighbours() -> LinearSolver:
+    """Return conjugate gradients that sums of neighbouring rows precondition, afresh at each step.
+
+    The rows of points on a smooth surface, in the order in which `sample_surface` gives them, change little from one
+    to the next, and few of J^T J's eigenvalues are above the damping. Where rows do change, J^T J itself is taken.
+    """
+    return Iterative("cg", Neighbours(), energy=ENERGY, reuse=False)
+
 
 Start = Callable[[Tensor], Tensor]
 """From points, of shape (N, 3), to values, of shape (N,): about a distance to a surface much like the wanted one."""
@@ -72,7 +85,7 @@ class ShapeProblem:
     known: KnownSurface | None = None
     shown: Box | None = None
     search: Search = CAUTIOUS
-    solver: Callable[[], LinearSolver] = Cholesky
+    solver: Callable[[], LinearSolver] = by_neighbours
     stored: torch.dtype = torch.float64
     pretraining: Pretraining | None = None
 

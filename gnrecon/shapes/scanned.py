@@ -24,7 +24,7 @@ from torch import Tensor
 from gnrecon.cloud import Samples
 from gnrecon.field import Network
 from gnrecon.field.activation import SINE
-from gnrecon.linalg import jacobian_layer_scaled
+from gnrecon.linalg import Cholesky, jacobian_layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.sampling import Box, CoarseDistance, least_values
@@ -132,6 +132,7 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
         NETWORK,
         known,
         search=search,
+        solver=Cholesky,
         stored=torch.float32,
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -33,6 +35,21 @@ def test_points_lie_on_the_level_set(shape: Shape, rng: np.random.Generator) -> 
     assert shape.level_set.contains(sample.points).all()
     gradient = shape.level_set.value_and_gradient(sample.points)[1]
     torch.testing.assert_close(sample.normals, gradient / gradient.norm(dim=1, keepdim=True))
+
+
+def test_rough_values_find_the_same_surface(shape: Shape, rng: np.random.Generator) -> None:
+    exact = shape.level_set
+
+    def roughly(x: torch.Tensor) -> torch.Tensor:
+        return exact.value(x.float().double()).float().to(x)
+
+    rough = replace(exact, roughly=roughly)
+    sample = sample_surface(rough, 2000, rng)
+    assert len(sample) >= 1980
+    assert shape.distance(sample.points).max() < 1e-12
+    assert abs(sample.area / sample_surface(exact, 2000, rng).area - 1) < 0.05
+    # Values that are needed to rounding are never rough ones.
+    assert torch.equal(rough.values(sample.points), exact.values(sample.points))
 
 
 @pytest.mark.parametrize("sweeps", [0, 3])

@@ -287,6 +287,8 @@ def test_a_formula_becomes_the_closed_form(seed: int) -> None:
     hessian = torch.randn(5, 3, 3, generator=generator, dtype=F64)
     hessian = hessian + hessian.mT
     made = from_formula("div n", lambda f, g, H: 0 * f + principal(g, H)[0][None])
+    assert not made.tangential
+    assert from_formula("div n", lambda f, g, H: 0 * f + principal(g, H)[0][None], tangential=True).tangential
     found, expected = made(value, gradient, hessian), mean_curvature(value, gradient, hessian)
     torch.testing.assert_close(found.residual, expected.residual)
     torch.testing.assert_close(found.by_gradient, expected.by_gradient)

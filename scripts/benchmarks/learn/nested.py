@@ -16,8 +16,8 @@ from torch.func import grad, jacrev, vmap
 from gnrecon.linalg import Cholesky, DenseJacobian, identity
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
 
-CHUNK = 256
-"""Points that are differentiated together: more take gigabytes."""
+CHUNK = 512
+"""Points that are differentiated together: of 64 to 2,000, those with which it is fastest."""
 
 
 def nested_step(problem: FrozenProblem, theta: Tensor, damping: float) -> Tensor:
