@@ -11,6 +11,7 @@ with one for all within a factor of four).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -118,6 +119,7 @@ class Iterative:
     reuse : whether a preconditioner serves more than one linearisation
     patience : iterations more than its first solve took after which an older one is made anew
     seed : of the preconditioners' chance
+    adapt : from the preconditioner and the effort to the preconditioner of the next linearisation; by default it stays
     effort : iterations that a linearisation took of late, a running mean
     """
 
@@ -129,6 +131,7 @@ class Iterative:
     reuse: bool = True
     patience: int = 8
     seed: int = 0
+    adapt: Callable[[Preconditioner, float], Preconditioner] | None = None
     kept: Kept | None = field(default=None, init=False, repr=False)
     effort: float = field(default=0.0, init=False, repr=False)
     spent: int = field(default=0, init=False, repr=False)
@@ -141,6 +144,8 @@ class Iterative:
         """Take J, and set up a preconditioner unless the last one still serves."""
         equations = Equations.of(jacobian, residual, metric)
         self.effort, self.spent = FADING * self.effort + (1 - FADING) * self.spent, 0
+        if self.adapt is not None:
+            self.preconditioner = self.adapt(self.preconditioner, self.effort)
         # What cannot be solved with a damping that stands for all, cannot be with any.
         if equations.obstacle(1.0):
             return IterativeSystem(equations, self, [])

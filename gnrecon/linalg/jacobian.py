@@ -21,6 +21,7 @@ from torch import Tensor
 
 from gnrecon.linalg.gram import gram
 from gnrecon.linalg.rows import LayerRows
+from gnrecon.slices import slices
 
 Block = Sequence[LayerRows]
 """Rows as one `LayerRows` a layer."""
@@ -105,8 +106,8 @@ class Jacobian(Protocol):
         """Numbers of successive rows that belong to one constraint."""
         ...
 
-    def runs(self, lengths: Sequence[int]) -> Tensor:
-        """Return sums of runs of successive rows over the roots of their numbers, in `dtype`, of shape (m, p).
+    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of successive rows over the roots of their numbers, of shape (m, p), chunk by chunk.
 
         There is one length for each stretch; the last run of a stretch may be shorter.
         """
@@ -196,14 +197,12 @@ class DenseJacobian:
         """All rows as one stretch."""
         return (self.rows,)
 
-    def runs(self, lengths: Sequence[int]) -> Tensor:
-        """Return sums of runs of rows over the roots of their numbers."""
-        if lengths[0] == 1:
-            return self.matrix.clone()
-        starts = range(0, self.rows, lengths[0])
-        parts = [self.matrix[start : start + lengths[0]] for start in starts]
-        sums = [part.sum(0, keepdim=True) / math.sqrt(len(part)) for part in parts]
-        return torch.cat([self.matrix.new_zeros(0, self.columns), *sums])
+    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of rows over the roots of their numbers, chunk by chunk."""
+        for start in range(0, self.rows, self.chunk * lengths[0]):
+            rows = self.matrix[start : start + self.chunk * lengths[0]]
+            runs = [rows[run] for run in slices(len(rows), lengths[0])]
+            yield torch.stack([run.sum(0) / math.sqrt(len(run)) for run in runs])
 
 
 @dataclass(frozen=True)
@@ -358,15 +357,16 @@ class LayeredJacobian:
         """The blocks' numbers of rows."""
         return tuple(len(block[0]) for block in self.blocks())
 
-    def runs(self, lengths: Sequence[int]) -> Tensor:
-        """Return sums of runs of rows over the roots of their numbers, never forming the rows."""
-        parts = []
+    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of rows over the roots of their numbers, in the precision of storage, never forming J."""
         for block, length in zip(self.blocks(), lengths, strict=True):
-            place = block[0].left.new_empty(-(-len(block[0]) // length), self.columns)
-            for layer, group in zip(block, self.groups, strict=True):
-                layer.write_runs(length, place[:, group])
-            parts.append(place.to(self.dtype))
-        return torch.cat([self._zeros(0, self.columns), *parts])
+            count = max(64, CHUNK_BYTES // max(block[0].left.element_size() * self.columns, 1))
+            for rows in slices(len(block[0]), count * length):
+                part = [layer.take(rows) for layer in block]
+                sums = block[0].left.new_empty(-(-len(part[0]) // length), self.columns)
+                for layer, group in zip(part, self.groups, strict=True):
+                    layer.write_runs(length, sums[:, group])
+                yield sums
 
 
 def _filled(block: Block) -> Block:

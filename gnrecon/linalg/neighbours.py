@@ -16,8 +16,11 @@ catenoid (2,800 rows, 1,217 parameters, 156 eigenvalues above the damping) 613 r
 hundredth in the norm of the damped matrix and 3 to 1e-4, where as many sums of a count sketch make 9 and 15, and as
 many drawn rows 20 and 37.
 
-Where neighbours are not alike, it is a poor approximation, but still definite. Source: aggregation in multigrid
-methods, such as Vanek, Mandel, Brezina, Algebraic multigrid by smoothed aggregation (1996), applied to rows.
+Where runs are more than columns, C^T C itself is the preconditioner, in which the scans of `shapes.scanned` spare three
+quarters of J^T J. Where neighbours are not alike, it is a poor approximation, but still definite.
+
+Source: aggregation in multigrid methods, such as Vanek, Mandel, Brezina, Algebraic multigrid by smoothed aggregation
+(1996), applied to rows.
 """
 
 from __future__ import annotations
@@ -66,24 +69,27 @@ class PreparedNeighbours:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Sums of runs of m rows in all: O(M p + m^2 p) to set up, O(m^3) a damping.
+    """Sums of runs of m rows in all: O(M p + m^2 p) to set up, O(m^3) a damping; O(M p + m p^2) and O(p^3) if m > p.
 
     Parameters
     ----------
     alike : least mean cosine of the angle between the first and the last row of a run. Each constraint has the longest
-        runs that keep to it, of at most 8 rows; of one that has none, each row counts by itself
+        runs that keep to it; of one that has none, each row counts by itself
+    longest : most rows of a run: the smaller the damping, the shorter they should be
     """
 
     alike: float = 0.7
+    longest: int = LENGTHS[-1]
 
     def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> Prepared:  # noqa: ARG002
-        """Choose the runs, sum them and multiply them with one another; or take J^T J, where runs would be no fewer."""
-        lengths = run_lengths(jacobian, self.alike)
+        """Choose the runs, sum them, and multiply them with one another or, where they are many, into C^T C."""
+        lengths = [min(length, self.longest) for length in run_lengths(jacobian, self.alike)]
         runs = sum(-(-rows // length) for rows, length in zip(jacobian.stretches, lengths, strict=True))
         if runs >= jacobian.columns:
-            return PreparedGram(jacobian.gram(), metric)
+            product = jacobian.gram() if runs == jacobian.rows else gram(jacobian.runs(lengths), len(metric), metric)
+            return PreparedGram(product, metric)
         scale = metric.rsqrt()
-        E = jacobian.runs(lengths).to(metric).mul_(scale)
+        E = torch.cat([metric.new_zeros(0, len(metric)), *jacobian.runs(lengths)]).mul_(scale)
         return PreparedNeighbours(E, gram([E.T], len(E), E), scale)
 
     def describe(self) -> str:

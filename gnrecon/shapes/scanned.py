@@ -14,7 +14,7 @@ For a product's sake use `gnrecon.reconstruct`: it fits more finely, and holds t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,10 +24,10 @@ from torch import Tensor
 from gnrecon.cloud import Samples
 from gnrecon.field import Network
 from gnrecon.field.activation import SINE
-from gnrecon.linalg import Cholesky, jacobian_layer_scaled
+from gnrecon.linalg import Iterative, LinearSolver, Neighbours, Preconditioner, jacobian_layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
-from gnrecon.sampling import Box, CoarseDistance, least_values
+from gnrecon.sampling import Box, CoarseDistance, halved, least_values
 from gnrecon.shapes.problem import ShapeProblem, Start
 from gnrecon.shapes.term import (
     LAST,
@@ -73,6 +73,10 @@ points, that many of them asked, above which it is held longer. Then steps hardl
 asks costs a sixteenth of the loss that is left, and pockets that grow far from the points are not in the mesh. Adam,
 and L-BFGS for long, do not come so near."""
 
+LONGEST, MANY, EXACT = 4, 40.0, 0.03
+"""Rows that are summed for the preconditioner; iterations a step from which on they are two; and the error of a step in
+the norm of the damped matrix. With a tenth the same time takes more steps, and comes less far."""
+
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
 sign of sparse points is a guess here and there."""
@@ -113,12 +117,13 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     name : of the problem
     seed : of the coarse distance
     """
-    normals = samples.normals
+    order = halved(samples.points)
+    samples = replace(samples, points=samples.points[order], normals=samples.normals[order])
     box = Box.around(samples.points, MARGIN)
-    coarse = CoarseDistance(samples.points, normals, np.random.default_rng(seed))
+    coarse = CoarseDistance(samples.points, samples.normals, np.random.default_rng(seed))
     terms = (
         Term("interface", interface, at_points(samples.points, count=POINTS)),
-        Term("normal", normal_projection, at_points(samples.points, normals, count=POINTS)),
+        Term("normal", normal_projection, at_points(samples.points, samples.normals, count=POINTS)),
         Term("eikonal", eikonal, in_box(IN_BOX), _eikonal_weight(2 * len(samples)), 0.0),
         Term("free space", free_space, _free(samples, coarse, box, np.random.default_rng(seed)), FREE, 0.0),
     )
@@ -132,9 +137,22 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
         NETWORK,
         known,
         search=search,
-        solver=Cholesky,
+        solver=by_few_neighbours,
         stored=torch.float32,
     )
+
+
+def by_few_neighbours() -> LinearSolver:
+    """Return conjugate gradients that sums of few neighbouring rows precondition, afresh at each step.
+
+    The network's waves are short, and the dampings small: of the rocker arm's rows after forty steps, runs of four make
+    10 iterations and a quarter of J^T J's cost, runs of eight 33, runs of two 4. Late, pairs are cheaper than fours.
+    """
+
+    def adapt(neighbours: Preconditioner, iterations: float) -> Preconditioner:
+        return Neighbours(longest=2) if iterations > MANY else neighbours
+
+    return Iterative("cg", Neighbours(longest=LONGEST), energy=EXACT, reuse=False, adapt=adapt)
 
 
 def _eikonal_weight(residuals: int) -> Weight:
