@@ -37,6 +37,13 @@ def test_points_lie_on_the_level_set(shape: Shape, rng: np.random.Generator) -> 
     torch.testing.assert_close(sample.normals, gradient / gradient.norm(dim=1, keepdim=True))
 
 
+def test_neighbours_come_together(shape: Shape, rng: np.random.Generator) -> None:
+    sample = sample_surface(shape.level_set, 2000, rng)
+    sides = [float(np.ptp(run.numpy(), axis=0).max()) for run in sample.points.split(8)]
+    # A square of eight points' area has sides of three spacings; at random places their patches are the larger.
+    assert np.mean(sides) < 5 * np.sqrt(sample.area / 2000)
+
+
 def test_rough_values_find_the_same_surface(shape: Shape, rng: np.random.Generator) -> None:
     exact = shape.level_set
 

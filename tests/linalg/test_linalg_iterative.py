@@ -9,7 +9,16 @@ import torch
 from damped_problems import F64, PROBLEMS, layered, randn
 from torch import Tensor
 
-from gnrecon.linalg import DenseJacobian, Iterative, Jacobi, Jacobian, Prepared, SampledGram, identity
+from gnrecon.linalg import (
+    DenseJacobian,
+    Iterative,
+    Jacobi,
+    Jacobian,
+    Preconditioner,
+    Prepared,
+    SampledGram,
+    identity,
+)
 from gnrecon.linalg.krylov import Apply
 
 
@@ -63,6 +72,21 @@ def test_without_reuse_every_linearisation_prepares() -> None:
     for _ in range(3):
         solver.linearise(*system(0), identity).solve(1e-2)
     assert counting.prepared == 3
+
+
+def test_a_preconditioner_can_be_changed_by_how_it_served() -> None:
+    heard = []
+
+    def adapt(preconditioner: Preconditioner, effort: float) -> Preconditioner:
+        heard.append(effort)
+        return SampledGram(1000) if effort > 1.0 else preconditioner
+
+    solver = Iterative("cg", Jacobi(), reuse=False, adapt=adapt)
+    counts = [solver.linearise(*system(0), identity).solve(1e-2).iterations for _ in range(5)]
+    assert heard[0] == 0.0
+    assert heard[1] == pytest.approx(0.3 * counts[0])
+    assert counts[0] > 10
+    assert counts[1:] == [1] * 4, "all rows make the exact inverse"
 
 
 def test_an_old_preconditioner_is_made_anew_when_it_serves_badly() -> None:

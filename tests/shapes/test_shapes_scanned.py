@@ -10,6 +10,7 @@ import torch
 
 from gnrecon.cloud import Frame, Samples
 from gnrecon.levelset import LevelSet
+from gnrecon.linalg import Iterative, Neighbours
 from gnrecon.shapes import ScannedSurface, learn, scanned
 from gnrecon.shapes.term import LAST, Drawn, Moment
 
@@ -135,3 +136,19 @@ def test_points_as_a_surface() -> None:
     feet, inside = surface.nearest(surface.points[[7, 2]] + 0.1)
     assert feet.tolist() == surface.points[[7, 2]].tolist()
     assert inside.all()
+
+
+def test_neighbours_come_together_for_the_solver() -> None:
+    problem = scanned(ball(2000))
+    drawn = next(term for term in problem.terms if term.name == "interface").sampler(
+        Moment(
+            5, problem.level_set(problem.network.initial(torch.Generator().manual_seed(0))), np.random.default_rng(0)
+        )
+    )
+    sides = [float(np.ptp(run.numpy(), axis=0).max()) for run in drawn.points.split(4)]
+    assert np.mean(sides) < 6 * np.sqrt(4 * np.pi / len(drawn.points))
+    solver = problem.solver()
+    assert isinstance(solver, Iterative)
+    assert solver.adapt is not None
+    assert solver.adapt(solver.preconditioner, 5.0) == Neighbours(longest=4)
+    assert solver.adapt(solver.preconditioner, 50.0) == Neighbours(longest=2)
