@@ -21,7 +21,6 @@ from torch import Tensor
 
 from gnrecon.linalg.gram import gram
 from gnrecon.linalg.rows import LayerRows
-from gnrecon.slices import slices
 
 Block = Sequence[LayerRows]
 """Rows as one `LayerRows` a layer."""
@@ -201,7 +200,7 @@ class DenseJacobian:
         """Yield sums of runs of rows over the roots of their numbers, chunk by chunk."""
         for start in range(0, self.rows, self.chunk * lengths[0]):
             rows = self.matrix[start : start + self.chunk * lengths[0]]
-            runs = [rows[run] for run in slices(len(rows), lengths[0])]
+            runs = [rows[first : first + lengths[0]] for first in range(0, len(rows), lengths[0])]
             yield torch.stack([run.sum(0) / math.sqrt(len(run)) for run in runs])
 
 
@@ -360,9 +359,9 @@ class LayeredJacobian:
     def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
         """Yield sums of runs of rows over the roots of their numbers, in the precision of storage, never forming J."""
         for block, length in zip(self.blocks(), lengths, strict=True):
-            count = max(64, CHUNK_BYTES // max(block[0].left.element_size() * self.columns, 1))
-            for rows in slices(len(block[0]), count * length):
-                part = [layer.take(rows) for layer in block]
+            count = length * max(64, CHUNK_BYTES // max(block[0].left.element_size() * self.columns, 1))
+            for start in range(0, len(block[0]), count):
+                part = [layer.take(slice(start, start + count)) for layer in block]
                 sums = block[0].left.new_empty(-(-len(part[0]) // length), self.columns)
                 for layer, group in zip(part, self.groups, strict=True):
                     layer.write_runs(length, sums[:, group])
