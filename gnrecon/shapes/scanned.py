@@ -73,9 +73,10 @@ points, that many of them asked, above which it is held longer. Then steps hardl
 asks costs a sixteenth of the loss that is left, and pockets that grow far from the points are not in the mesh. Adam,
 and L-BFGS for long, do not come so near."""
 
-LONGEST, MANY, EXACT = 4, 40.0, 0.03
-"""Rows that are summed for the preconditioner; iterations a step from which on they are two; and the error of a step in
-the norm of the damped matrix. With a tenth the same time takes more steps, and comes less far."""
+LONGEST, MANY, WAIT, EXACT = 4, 40.0, 8, 0.03
+"""Rows that are summed for the preconditioner; iterations a step from which on they are half as many, and steps before
+they are so again; and the error of a step in the norm of the damped matrix. With a tenth the same time takes more
+steps, and comes less far."""
 
 CLEAR, CLEAR_DISKS = 0.05, 3.0
 """Least distance of such a point from the scan, and in radii of the nearest point's disk: nearer to them than that, the
@@ -146,13 +147,25 @@ def by_few_neighbours() -> LinearSolver:
     """Return conjugate gradients that sums of few neighbouring rows precondition, afresh at each step.
 
     The network's waves are short, and the dampings small: of the rocker arm's rows after forty steps, runs of four make
-    10 iterations and a quarter of J^T J's cost, runs of eight 33, runs of two 4. Late, pairs are cheaper than fours.
+    10 iterations and a quarter of J^T J's cost, runs of eight 33, runs of two 4. Later pairs are cheaper than fours,
+    and in the end J^T J itself is cheaper than both.
     """
+    return Iterative("cg", Neighbours(longest=LONGEST), energy=EXACT, reuse=False, adapt=_Shorter())
 
-    def adapt(neighbours: Preconditioner, iterations: float) -> Preconditioner:
-        return Neighbours(longest=2) if iterations > MANY else neighbours
 
-    return Iterative("cg", Neighbours(longest=LONGEST), energy=EXACT, reuse=False, adapt=adapt)
+@dataclass
+class _Shorter:
+    """Halves the runs, down to single rows, when steps take many iterations; not again before it shows what it does."""
+
+    waited: int = 0
+
+    def __call__(self, preconditioner: Preconditioner, iterations: float) -> Preconditioner:
+        """Return the preconditioner of the next step, by the mean number of iterations of the last ones."""
+        self.waited += 1
+        if not isinstance(preconditioner, Neighbours) or iterations <= MANY or self.waited < WAIT:
+            return preconditioner
+        self.waited = 0
+        return replace(preconditioner, longest=max(preconditioner.longest // 2, 1))
 
 
 def _eikonal_weight(residuals: int) -> Weight:

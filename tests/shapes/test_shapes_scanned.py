@@ -150,5 +150,9 @@ def test_neighbours_come_together_for_the_solver() -> None:
     solver = problem.solver()
     assert isinstance(solver, Iterative)
     assert solver.adapt is not None
-    assert solver.adapt(solver.preconditioner, 5.0) == Neighbours(longest=4)
-    assert solver.adapt(solver.preconditioner, 50.0) == Neighbours(longest=2)
+    longest = []
+    for iterations in [5.0] * 10 + [50.0] * 30:
+        solver.preconditioner = solver.adapt(solver.preconditioner, iterations)
+        assert isinstance(solver.preconditioner, Neighbours)
+        longest.append(solver.preconditioner.longest)
+    assert longest == [4] * 10 + [2] * 8 + [1] * 22, "shorter runs wait until they have shown what they do"
