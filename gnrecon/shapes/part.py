@@ -63,7 +63,7 @@ ON_SURFACE, ON_INTERFACES, IN_BOX, AROUND = 600, 1000, 600, 12_000
 POOL = 100_000
 """Points around the region and on the interfaces that each step draws from, so that distances are computed once."""
 
-MARGIN, THINNER = 0.015, 0.33
+MARGIN, THINNER = 0.018, 0.33
 """Depth of the layer within the region's border that is kept free as well."""
 
 CLEARANCE = 0.5
