@@ -268,15 +268,16 @@ class LayeredJacobian:
         """Yield chunks of rows, in the precision in which the factors are stored, of at most `CHUNK_BYTES`."""
         return self._dense(self.blocks())
 
+    def _chunk(self, block: Block) -> int:
+        """Return how many rows are multiplied out at a time."""
+        return max(64, CHUNK_BYTES // max(block[0].left.element_size() * self.columns, 1))
+
     def _dense(self, blocks: Iterable[Block]) -> Iterator[Tensor]:
         buffer: Tensor | None = None
         for block in blocks:
             if buffer is None:
-                item = block[0].left.element_size()
-                length = max(64, CHUNK_BYTES // max(item * self.columns, 1))
-                buffer = torch.empty(
-                    max(1, min(length, self.rows)), self.columns, dtype=_stored(block), device=self.device
-                )
+                length = max(1, min(self._chunk(block), self.rows))
+                buffer = torch.empty(length, self.columns, dtype=_stored(block), device=self.device)
             for start in range(0, len(block[0]), len(buffer)):
                 part = [layer.take(slice(start, start + len(buffer))) for layer in block]
                 chunk = buffer[: len(part[0])]
@@ -359,7 +360,7 @@ class LayeredJacobian:
     def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
         """Yield sums of runs of rows over the roots of their numbers, in the precision of storage, never forming J."""
         for block, length in zip(self.blocks(), lengths, strict=True):
-            count = length * max(64, CHUNK_BYTES // max(block[0].left.element_size() * self.columns, 1))
+            count = length * self._chunk(block)
             for start in range(0, len(block[0]), count):
                 part = [layer.take(slice(start, start + count)) for layer in block]
                 sums = block[0].left.new_empty(-(-len(part[0]) // length), self.columns)
