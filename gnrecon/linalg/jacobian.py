@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -98,6 +98,10 @@ class Jacobian(Protocol):
 
     def sample(self, rows: Tensor) -> Jacobian:
         """Return the Jacobian of the given rows, of shape (m,), in ascending order."""
+        ...
+
+    def rounded(self) -> Jacobian:
+        """Return J stored in float32, its vectors as they are, or itself where both must be of one precision."""
         ...
 
     @property
@@ -190,6 +194,10 @@ class DenseJacobian:
     def sample(self, rows: Tensor) -> DenseJacobian:
         """Return the Jacobian of the given rows."""
         return DenseJacobian(self.matrix[rows], self.group_sizes, self.chunk)
+
+    def rounded(self) -> DenseJacobian:
+        """Return itself: vectors have the matrix's precision."""
+        return self
 
     @property
     def stretches(self) -> tuple[int, ...]:
@@ -351,6 +359,13 @@ class LayeredJacobian:
                 blocks.append([layer.take(inside) for layer in block])
             start = stop
         return LayeredJacobian(lambda: blocks, len(rows), self.group_sizes, self.device, self.dtype, self.stored)
+
+    def rounded(self) -> LayeredJacobian:
+        """Return J with factors in float32, which are kept, or itself where they are."""
+        if self.stored == torch.float32:
+            return self
+        blocks = [[layer.to(torch.float32) for layer in block] for block in self.blocks()]
+        return replace(self, blocks=lambda: blocks, stored=torch.float32)
 
     @property
     def stretches(self) -> tuple[int, ...]:

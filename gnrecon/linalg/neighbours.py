@@ -25,7 +25,7 @@ Source: aggregation in multigrid methods, such as Vanek, Mandel, Brezina, Algebr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -42,6 +42,9 @@ LENGTHS = (2, 4, 8)
 
 ASKED = 8
 """Places in a constraint's rows at which neighbours are compared."""
+
+AGAIN = 8
+"""Linearisations after which they are compared again, as rows change little from one to the next."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +83,11 @@ class Neighbours:
 
     alike: float = 0.7
     longest: int = LENGTHS[-1]
+    _found: list[list[int]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> Prepared:  # noqa: ARG002
         """Choose the runs, sum them, and multiply them with one another or, where they are many, into C^T C."""
-        lengths = [min(length, self.longest) for length in run_lengths(jacobian, self.alike)]
+        lengths = self._lengths(jacobian)
         runs = sum(-(-rows // length) for rows, length in zip(jacobian.stretches, lengths, strict=True))
         if runs >= jacobian.columns:
             product = jacobian.gram() if runs == jacobian.rows else gram(jacobian.runs(lengths), len(metric), metric)
@@ -91,6 +95,13 @@ class Neighbours:
         scale = metric.rsqrt()
         E = torch.cat([metric.new_zeros(0, len(metric)), *jacobian.runs(lengths)]).mul_(scale)
         return PreparedNeighbours(E, gram([E.T], len(E), E), scale)
+
+    def _lengths(self, jacobian: Jacobian) -> list[int]:
+        """Return the runs' lengths, those found of late where there are as many constraints."""
+        if not self._found or len(self._found[-1]) != len(jacobian.stretches):
+            found = [min(length, self.longest) for length in run_lengths(jacobian, self.alike)]
+            self._found[:] = [found] * AGAIN
+        return self._found.pop()
 
     def describe(self) -> str:
         """Name it."""

@@ -123,17 +123,19 @@ class FrozenProblem:
 
         By central differences: a third derivative of f in closed form would cost more. Differences of the residual
         itself would not do, because that of the strain is in frames of its own, which may jump between two points.
+        In float32: over `ASIDE` its rounding is 1e-4 of the derivatives, which say how points move, to first order.
         """
         slope: Tensor = torch.linalg.vector_norm(jet.gradient, dim=1)
         beside = ASIDE * torch.nn.functional.normalize(jet.gradient, dim=1)
+        directions = None if jet.directions is None else jet.directions.float()
         before, after = (
-            replace(self._plain_jet(free, residual, points + side, 0), directions=jet.directions)
+            replace(self._plain_jet(free.float(), residual, (points + side).float(), 0), directions=directions)
             for side in (-beside, beside)
         )
-        turn = (after.gradient - before.gradient) / (2 * ASIDE)
+        turn = (after.gradient - before.gradient).to(free) / (2 * ASIDE)
         if not isinstance(residual, SecondOrder):
             return slope, turn, None
-        return slope, turn, (after.hessian - before.hessian) / (2 * ASIDE)
+        return slope, turn, (after.hessian - before.hessian).to(free) / (2 * ASIDE)
 
     def _jet(self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, further: int) -> CurvedJet:
         """Return the field with the derivatives that a residual takes, and `further` ones for its rows."""

@@ -27,6 +27,13 @@ CAUTIOUS = GainRatioDamping(initial_damping=1.0, metric=identity)
 ENERGY = 0.1
 """Error of a step in the norm of the damped matrix: Gauss-Newton's model is no more exact than that."""
 
+ALIKE = 0.5
+"""Least mean cosine of rows whose sums stand for them. The first steps' dampings are large, and what is not much alike
+serves them too; later ones have points on the surface alone, which are."""
+
+ROUNDING = 0.05
+"""What products with J in float32 may move a step by, in the same norm."""
+
 
 def by_neighbours() -> LinearSolver:
     """Return conjugate gradients that sums of neighbouring rows precondition, afresh at each step.
@@ -34,7 +41,7 @@ def by_neighbours() -> LinearSolver:
     The rows of points on a smooth surface, in the order in which `sample_surface` gives them, change little from one
     to the next, and few of J^T J's eigenvalues are above the damping. Where rows do change, J^T J itself is taken.
     """
-    return Iterative("cg", Neighbours(), energy=ENERGY, reuse=False)
+    return Iterative("cg", Neighbours(ALIKE), energy=ENERGY, reuse=False, rounding=ROUNDING)
 
 
 Start = Callable[[Tensor], Tensor]

@@ -19,7 +19,7 @@ from torch import Tensor
 from gnrecon.errors import FitError
 from gnrecon.levelset import LevelSet, sample_surface
 from gnrecon.residuals import Residual, SecondOrder
-from gnrecon.sampling import Box
+from gnrecon.sampling import Box, halved
 
 LAST = 10**9
 """The number of a step that is never reached: weights have ended there."""
@@ -114,10 +114,11 @@ def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count
 
 
 def in_box(count: int, box: Box | None = None) -> Sampler:
-    """Return a sampler of uniform points in a box, by default the problem's."""
+    """Return a sampler of uniform points in a box, by default the problem's, neighbours one after the other."""
 
     def draw(moment: Moment) -> Drawn:
-        return Drawn(torch.as_tensor((box or moment.level_set.box).sample(count, moment.rng)))
+        points = (box or moment.level_set.box).sample(count, moment.rng)
+        return Drawn(torch.as_tensor(points[halved(points)]))
 
     return draw
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 import torch
-from damped_problems import F64, PROBLEMS, layered, randn
+from damped_problems import F64, PROBLEMS, layered, multiplied_out, randn
 from torch import Tensor
 
 from gnrecon.linalg import (
@@ -14,6 +14,8 @@ from gnrecon.linalg import (
     Iterative,
     Jacobi,
     Jacobian,
+    LayeredJacobian,
+    LayerRows,
     Preconditioner,
     Prepared,
     SampledGram,
@@ -171,3 +173,33 @@ def test_the_seed_decides() -> None:
     ]
     assert torch.equal(steps[0].direction, steps[1].direction)
     assert not torch.equal(steps[0].direction, steps[2].direction)
+
+
+def nearly_dependent(seed: int) -> tuple[LayeredJacobian, Tensor]:
+    """Rows whose inputs are nearly the same, and the matrix of them."""
+    generator = torch.Generator().manual_seed(seed)
+    inputs = 1.0 + randn(generator, 300, 3) * torch.tensor([1.0, 1e-4, 1e-8], dtype=F64)
+    rows = LayerRows(randn(generator, 300, 6), inputs)
+    return LayeredJacobian(lambda: [[rows]], len(rows), (rows.size,), torch.device("cpu")), multiplied_out(rows)
+
+
+@pytest.mark.parametrize("damping", [1e-12, 1e-10, 1e-8, 1e-5, 1.0])
+def test_rounding_moves_a_step_by_no_more_than_its_share(damping: float) -> None:
+    """Products in float32 throughout would move the steps of the three smallest dampings by more."""
+    jacobian, J = nearly_dependent(0)
+    r = J.mean(1) + 1e-3 * randn(torch.Generator().manual_seed(1), len(J))
+    A = J.T @ J + damping * torch.eye(J.shape[1], dtype=F64)
+    exact = torch.linalg.solve(A, -J.T @ r)
+    solver = Iterative("cg", SampledGram(1000), 1e-13, reuse=False, rounding=0.01)
+    error = solver.linearise(jacobian, r, identity).solve(damping).direction - exact
+    assert float(error @ A @ error) <= 0.01**2 * float(exact @ A @ exact)
+
+
+def test_small_dampings_take_the_rows_as_they_are() -> None:
+    jacobian, J = layered(0, [(200, 2), (60, 1)], widths=(3, 6, 1))
+    r = torch.ones(len(J), dtype=F64)
+    system = Iterative("cg", rounding=0.01).linearise(jacobian, r, identity)
+    least = (torch.finfo(torch.float32).eps / 0.01) ** 2 * float(J.square().sum())
+    assert system._products(1.5 * least).stored == torch.float32
+    assert system._products(least / 1.5) is jacobian
+    assert Iterative("cg").linearise(jacobian, r, identity)._products(1.0) is jacobian

@@ -119,6 +119,19 @@ def test_scaled_kernel_and_sample(make: Callable[[int, torch.dtype], Made], stor
     close(sampled.mv(torch.ones(J.shape[1], dtype=jacobian.dtype)), J[some].sum(1), stored)
 
 
+def test_rounded_factors_keep_the_precision_of_vectors() -> None:
+    jacobian, J = layered(0)
+    rounded = jacobian.rounded()
+    assert all(layer.left.dtype == torch.float32 for block in rounded.blocks() for layer in block)
+    v = torch.ones(J.shape[1], dtype=F64)
+    assert rounded.mv(v).dtype == F64
+    close(rounded.mv(v), J @ v, torch.float32)
+    assert not torch.equal(rounded.mv(v), jacobian.mv(v))
+    assert rounded.rounded() is rounded
+    matrix = DenseJacobian(J)
+    assert matrix.rounded() is matrix, "its vectors would be rounded with it"
+
+
 def test_long_blocks_are_cut_into_tiles_and_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "TILE", 5)
     monkeypatch.setattr(module, "CHUNK_BYTES", 1)

@@ -13,6 +13,7 @@ from gnrecon.linalg import (
     BlockJacobi,
     DenseJacobian,
     Jacobi,
+    Jacobian,
     Kronecker,
     LayeredJacobian,
     LayerRows,
@@ -25,7 +26,7 @@ from gnrecon.linalg import (
 )
 from gnrecon.linalg.draw import inclusion
 from gnrecon.linalg.krylov import Apply, KrylovResult
-from gnrecon.linalg.neighbours import run_lengths
+from gnrecon.linalg.neighbours import AGAIN, PreparedNeighbours, run_lengths
 
 PRECONDITIONERS: dict[str, Preconditioner] = {
     "jacobi": Jacobi(),
@@ -116,6 +117,21 @@ def test_runs_are_as_long_as_their_ends_are_alike() -> None:
     assert run_lengths(DenseJacobian(turning[:7]), 0.0) == [1], "a stretch shorter than the longest run"
     blocks = layered(0, [(7, 1), (40, 1), (0, 0)])[0]
     assert run_lengths(blocks, -2.0) == [1, 8, 1], "each block has its own runs"
+
+
+def test_runs_are_looked_for_again_after_some_linearisations() -> None:
+    generator = torch.Generator().manual_seed(0)
+    turning, unlike = smooth(0, 400)[0], DenseJacobian(randn(generator, 400, 400))
+    neighbours = Neighbours()
+
+    def summed(jacobian: Jacobian) -> bool:
+        prepared = neighbours.prepare(jacobian, torch.ones(jacobian.columns, dtype=F64), generator)
+        return isinstance(prepared, PreparedNeighbours)
+
+    assert summed(turning)
+    # The first rows' runs hold for some more, and are given up in time for rows that are unlike.
+    assert [summed(unlike) for _ in range(AGAIN)] == [True] * (AGAIN - 1) + [False]
+    assert not summed(layered(0, [(40, 1), (40, 0)])[0]), "other constraints have runs of their own"
 
 
 def test_neighbours_that_are_no_fewer_than_the_columns_give_the_inverse() -> None:

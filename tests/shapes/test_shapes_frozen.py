@@ -83,7 +83,9 @@ def test_the_jacobian_is_the_derivative_of_what_a_trial_measures(
         else:
             along = J @ direction
         found = (ahead - behind) / (2 * h)
-        torch.testing.assert_close(along, found, rtol=1e-3, atol=1e-4 * float(found.abs().max() + 1e-6))
+        # How points move is known in float32 alone.
+        least = (1e-2 if moves else 1e-4) * float(found.abs().max() + 1e-6)
+        torch.testing.assert_close(along, found, rtol=1e-3, atol=least)
 
 
 def test_the_strains_rows_are_right_where_its_frame_jumps() -> None:

@@ -61,6 +61,8 @@ def test_volume_and_surface_samples_are_where_they_say() -> None:
     now = moment(ball, cube(1.0))
     inside = in_box(200)(now).points
     assert float(inside.abs().max()) <= 1.0
+    far = torch.linalg.vector_norm(inside - inside.flip(0), dim=1).median()
+    assert float(torch.linalg.vector_norm(inside.diff(dim=0), dim=1).median()) < float(far) / 2, "neighbours are near"
     corner = Box(np.zeros(3), np.full(3, 0.1))
     assert float(in_box(50, corner)(now).points.max()) <= 0.1
     drawn = on_surface(100, nodes=10_000)(now)
