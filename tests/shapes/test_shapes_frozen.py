@@ -83,8 +83,8 @@ def test_the_jacobian_is_the_derivative_of_what_a_trial_measures(
         else:
             along = J @ direction
         found = (ahead - behind) / (2 * h)
-        # How points move is known in float32 alone.
-        least = (1e-2 if moves else 1e-4) * float(found.abs().max() + 1e-6)
+        # How points move is known in float32, whose rounding shows in the product of curvatures, one of them zero here.
+        least = (5e-3 if moves and residual is gauss_curvature else 1e-4) * float(found.abs().max() + 1e-6)
         torch.testing.assert_close(along, found, rtol=1e-3, atol=least)
 
 
