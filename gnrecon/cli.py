@@ -198,7 +198,19 @@ def reconstruct_command(
     truth = reference or options.pop(REFERENCE, None)
     options.pop(REFERENCE, None)
     del debug  # read from the arguments by `main`, which handles failures
-    files = Files(tuple(scans), output, truth, report, preview, save, html, overwrite, format, config=save_config)
+    files = Files(
+        tuple(scans),
+        output,
+        truth,
+        report,
+        preview,
+        save,
+        html,
+        overwrite,
+        format,
+        config=save_config,
+        settings=config,
+    )
     if dry_run:
         from gnrecon.commands.info import info
 

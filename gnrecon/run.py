@@ -16,7 +16,7 @@ from gnrecon.atomic import atomic_write
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import render, render_sheet
 from gnrecon.files import require_files
-from gnrecon.io import check_writable, written_origin
+from gnrecon.io import all_members, check_writable, written_origin
 from gnrecon.logs import logged
 from gnrecon.optim import Record
 from gnrecon.page import page_text
@@ -47,7 +47,7 @@ THUMBNAIL = (240, 180)
 
 @dataclass(frozen=True)
 class Files:
-    """What one run reads and writes."""
+    """What one run reads and writes; `config` is written, `settings` is the configuration that was read."""
 
     scans: tuple[Path, ...]
     output: Path
@@ -60,6 +60,7 @@ class Files:
     format: str | None = None
     thumbnail: Path | None = None
     config: Path | None = None
+    settings: Path | None = None
 
     def check(self) -> None:
         """Refuse before any work what would fail after it.
@@ -84,10 +85,10 @@ class Files:
         require_files(inputs, targets, self.overwrite)
 
     def named(self) -> tuple[list[Path], list[Path]]:
-        """Return the files that are read, and those that are written."""
+        """Return the files that are read, those that scans name among them, and the files that are written."""
         asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
-        inputs = [path for path in (*self.scans, self.reference) if path is not None]
-        return inputs, [path for path in asked if path is not None]
+        inputs = [path for path in (self.reference, self.settings) if path is not None]
+        return [*all_members(self.scans, self.format), *all_members(inputs)], [path for path in asked if path is not None]
 
 
 def run(

@@ -41,11 +41,13 @@ class Settings:
     general : of all scans
     tables : pattern of paths, and what holds for the scans that match it
     given : of the command line
+    source : the configuration that was read, or None
     """
 
     general: Mapping[str, Any] = field(default_factory=dict)
     tables: tuple[tuple[str, Mapping[str, Any]], ...] = ()
     given: Mapping[str, Any] = field(default_factory=dict)
+    source: Path | None = None
 
     def of(self, scan: Path) -> dict[str, Any]:
         """Return the values that hold for a scan: options, perhaps a reference, and limits."""
@@ -83,7 +85,7 @@ def read_settings(path: Path | None, words: Sequence[str], given: Mapping[str, A
     chosen = _checked(dict(map(_split, words)), "--set: ", Path())
     if twice := [name for name in chosen if name in given]:
         raise UsageError(f"The option {twice[0]} is given twice, by --set and by its own name.")
-    return Settings(general, particular, {**chosen, **given})
+    return Settings(general, particular, {**chosen, **given}, path)
 
 
 def settings_text(values: Mapping[str, Any], scan: Path) -> str:

@@ -136,6 +136,41 @@ def test_usage(out: Path, scan: Path, here: Here, words: tuple[str, ...], senten
     assert scan.read_bytes() == before
 
 
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_scan_that_a_conf_names_is_never_written(out: Path, scan: Path, here: Here, linked: bool) -> None:
+    part, poses = out / "part.ply", out / "poses.txt"
+    part.write_bytes(scan.read_bytes())
+    poses.write_text("bmesh part.ply 0 0 0 0 0 0 1\n")
+    target = out / "link.ply" if linked else part
+    if linked:
+        target.symlink_to(part)
+    before = names(out)
+    done = here(poses, "--format", "conf", "-o", target, "--overwrite")
+    assert_refused(done, ExitCode.USAGE, "an input or another output is never overwritten")
+    done = here(poses, "--format", "conf", "-o", out / "mesh.obj", "--report", target, "--overwrite")
+    assert_refused(done, ExitCode.USAGE, "an input or another output is never overwritten")
+    assert names(out) == before
+    assert part.read_bytes() == scan.read_bytes()
+
+
+def test_a_buffer_that_a_gltf_names_is_never_written(out: Path, here: Here) -> None:
+    scene, buffer = out / "scene.gltf", out / "points.ply"
+    buffer.write_bytes(np.zeros((3, 3), np.float32).tobytes())
+    scene.write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": "points.ply", "byteLength": 36}]}))
+    for words in (("convert", scene, buffer), (scene, "-o", buffer)):
+        assert_refused(here(*words, "--overwrite"), ExitCode.USAGE, "an input or another output is never overwritten")
+    assert buffer.read_bytes() == bytes(36)
+
+
+def test_a_configuration_that_is_read_is_never_written(out: Path, scan: Path, here: Here) -> None:
+    config = out / "c.toml"
+    config.write_text("seed = 3\n")
+    words = (scan, "-o", out / "mesh.obj", "--config", config, "--save-config", config, "--overwrite")
+    assert_refused(here(*words), ExitCode.USAGE, "an input or another output is never overwritten")
+    assert_refused(here(*words[:5], "--log", config), ExitCode.USAGE, "is named twice")
+    assert config.read_text() == "seed = 3\n"
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there(out: Path, scan: Path) -> None:
     assert_refused(gnrecon(scan, "-o", out / "a.obj", "--device", "cuda"), ExitCode.USAGE, "no CUDA GPU")

@@ -12,6 +12,7 @@ from gnrecon.batch.pair import reference_of
 from gnrecon.batch.quantity import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
 from gnrecon.errors import UsageError
+from gnrecon.io import all_members
 from gnrecon.options import Options
 from gnrecon.settings import settings_text
 
@@ -39,7 +40,7 @@ def plan(request: Request) -> list[Job]:
     if request.references is not None and not any(pairs):
         raise UsageError(f"None of the scans has a reference in {request.references}; see --reference-name.")
     jobs = [_job(request, one, name, reference) for one, name, reference in zip(found, names, pairs, strict=True)]
-    _require_harmless(jobs, [one.scan for one in found])
+    _require_harmless(jobs, [*request.lists, *([config] if (config := request.settings.source) else [])])
     return jobs
 
 
@@ -68,10 +69,11 @@ def _job(request: Request, found: Found, name: str, paired: Path | None) -> Job:
     )
 
 
-def _require_harmless(jobs: Sequence[Job], scans: Sequence[Path]) -> None:
-    """Refuse outputs that are inputs."""
-    inputs = {path.resolve() for path in scans}
+def _require_harmless(jobs: Sequence[Job], others: Sequence[Path]) -> None:
+    """Refuse outputs that are inputs: scans, files that scans name, references, or the `others`."""
+    read = [path for job in jobs for path in (job.scan, job.reference) if path is not None]
+    inputs = {path.resolve() for path in [*all_members(read), *others]}
     for job in jobs:
         for name in job.file_names().values():
             if (job.output / name).resolve() in inputs:
-                raise UsageError(f"{job.output / name} is a scan itself; choose another folder for the meshes.")
+                raise UsageError(f"{job.output / name} is an input of the batch; choose another folder for the meshes.")

@@ -11,6 +11,7 @@ from gnrecon.errors import ExitCode, UsageError
 from gnrecon.files import require_files
 from gnrecon.io import (
     CLOUD_WRITERS,
+    all_members,
     holds,
     read_any,
     unverified,
@@ -38,7 +39,7 @@ def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool 
     MeshError, OutputError
         When the target cannot be written.
     """
-    require_files([source], [target], overwrite)
+    require_files(all_members([source]), [target], overwrite)
     extension = target.suffix.lower()
     if extension not in (known := dict.fromkeys([*writable(), *CLOUD_WRITERS])):
         named = ", ".join(suffix[1:] for suffix in known)

@@ -9,7 +9,7 @@ from gnrecon.atomic import write_text
 from gnrecon.errors import ExitCode
 from gnrecon.export import measure
 from gnrecon.files import require_files
-from gnrecon.io import read_mesh, read_reference
+from gnrecon.io import all_members, read_mesh, read_reference
 
 
 def evaluate(
@@ -35,7 +35,7 @@ def evaluate(
     OutputError
         When the report cannot be written.
     """
-    require_files([path, reference], [] if report is None else [report], overwrite)
+    require_files(all_members([path, reference]), [] if report is None else [report], overwrite)
     metrics = measure(read_mesh(path), read_reference(reference), samples=samples, seed=seed)
     if report is not None:
         figures = {"mesh": str(path), "reference": str(reference), "seed": seed, **metrics.as_dict()}

@@ -19,7 +19,7 @@ from gnrecon.design import Design, DesignFacts, judge
 from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
 from gnrecon.files import require_files
-from gnrecon.io import check_writable, write_mesh
+from gnrecon.io import all_members, check_writable, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.pipeline import limited
 from gnrecon.report import plain, versions
@@ -105,7 +105,7 @@ def run_learn(
         raise UsageError(f"A design is for the problem {NAME} alone, not for {name}.")
     check_writable(output)
     sources = [*files.named(), *([scan.path(name)] if is_scan(name) else [])]
-    require_files(sources, [path for path in (output, report) if path is not None], overwrite)
+    require_files(all_members(sources), [path for path in (output, report) if path is not None], overwrite)
     design = files.read() if name == NAME else None
     problem, frame = _posed(name, design, files, scan, options.seed)
     console = Console(stderr=True, quiet=quiet)

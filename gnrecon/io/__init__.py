@@ -3,6 +3,7 @@
 from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
 from gnrecon.io.handed import to_open3d, to_pymeshlab, to_trimesh
+from gnrecon.io.members import all_members
 from gnrecon.io.objects import as_cloud, as_mesh, as_shape
 from gnrecon.io.plugged import readable, writable
 from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
@@ -16,6 +17,7 @@ __all__ = [
     "READERS",
     "WRITERS",
     "Reading",
+    "all_members",
     "as_cloud",
     "as_mesh",
     "as_shape",

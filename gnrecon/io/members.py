@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -13,17 +14,28 @@ from gnrecon.io.text import read_text
 from gnrecon.io.unpack import extension_of
 
 
-def members(path: Path) -> list[Path]:
-    """Return a scan's file and all that it names and that are there, each once.
+def members(path: Path, format: str | None = None) -> list[Path]:
+    """Return a scan's file and all files that it names and that exist, each once.
 
-    A file that cannot be understood names none: what is wrong with it, its reader will say.
+    A file that cannot be parsed names none: its reader reports what is wrong with it.
+
+    Parameters
+    ----------
+    path : the scan's file
+    format : extension that says how the file is read, such as ``"conf"``; by default its own
     """
+    extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
     try:
-        named = _NAMES.get(extension_of(path), lambda _: [])(path)
+        named = _NAMES.get(extension, lambda _: [])(path)
         there = [beside(path.parent, name, "file") for name in named]
-    except (InputError, ValueError, KeyError, TypeError, AttributeError):
+    except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError):
         there = []
     return list(dict.fromkeys([path, *(member for member in there if member.is_file())]))
+
+
+def all_members(paths: Iterable[Path], format: str | None = None) -> list[Path]:
+    """Return all files that scans are read from, see `members`: none of them may be written."""
+    return [member for path in paths for member in members(path, format)]
 
 
 def _of_conf(path: Path) -> list[str]:

@@ -30,7 +30,7 @@ from gnrecon.cli import main
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.export import verify_file
 from gnrecon.schema import report_schema
-from gnrecon.settings import Settings, read_settings
+from gnrecon.settings import Settings, read_settings, read_settings
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
 WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")
@@ -254,13 +254,31 @@ def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="There are no scans in"):
         run_batch(Request((str(tmp_path),), out))
     (tmp_path / "a.obj").touch()
-    with pytest.raises(UsageError, match=r"a\.obj is a scan itself"):
+    with pytest.raises(UsageError, match=r"a\.obj is an input of the batch"):
         run_batch(Request((str(tmp_path),), tmp_path))
     with pytest.raises(UsageError, match="resolution must be at least 16"):
         run_batch(Request((str(tmp_path),), out, settings=Settings({"resolution": 3})))
     with pytest.raises(OutputError, match="cannot be made"):
         run_batch(Request((str(tmp_path),), tmp_path / "README.md" / "meshes"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "a.obj"]
+
+
+def test_what_scans_and_options_name_is_no_output(tmp_path: Path) -> None:
+    scans, other = tmp_path / "scans", tmp_path / "other"
+    scans.mkdir()
+    other.mkdir()
+    (scans / "poses.conf").write_text("bmesh poses.ply 0 0 0 0 0 0 1\n")
+    for path in (scans / "poses.ply", other / "poses.config.toml", other / "poses.ply"):
+        path.write_text("seed = 1\n")
+    source = str(scans / "poses.conf")
+    with pytest.raises(UsageError, match=r"poses\.ply is an input of the batch"):
+        run_batch(Request((source,), scans, mesh_format="ply", overwrite=True))
+    with pytest.raises(UsageError, match=r"poses\.ply is an input of the batch"):
+        run_batch(Request((source,), other, mesh_format="ply", references=other, overwrite=True))
+    settings = read_settings(other / "poses.config.toml", (), {})
+    with pytest.raises(UsageError, match=r"poses\.config\.toml is an input of the batch"):
+        run_batch(Request((source,), other, settings=settings, overwrite=True))
+    assert (scans / "poses.ply").read_text() == "seed = 1\n"
 
 
 def test_a_missing_folder_has_its_exit_code(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
