@@ -11,10 +11,11 @@ from functools import cached_property
 from pathlib import Path
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Float, PointCloud, Samples
+from gnrecon.cloud import PointCloud, Samples
 from gnrecon.errors import FitError, UsageError
 from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
 from gnrecon.fit import NeuralSDF, Uncertainty
+from gnrecon.geometry.arrays import Float
 from gnrecon.io import holds
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options

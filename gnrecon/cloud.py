@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.errors import InputError
-
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float, Int, Mask, Values
 
 
 def _as_rows(name: str, values: npt.ArrayLike) -> Float:
@@ -43,7 +42,7 @@ class PointCloud:
 
     points: Float
     normals: Float | None = None
-    attributes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    attributes: Mapping[str, Values] = field(default_factory=dict)
     origins: Float | None = None
 
     def __post_init__(self) -> None:
@@ -63,7 +62,7 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.integer]) -> PointCloud:
+    def select(self, rows: Mask | Int) -> PointCloud:
         """Return the cloud of the given rows (a mask of shape (N,), or indices), attributes included."""
         return PointCloud(
             self.points[rows],

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float, Values
+
 Bytes = npt.NDArray[np.uint8]
 
 _KNEE = 0.04045
@@ -18,7 +19,7 @@ _KNEE = 0.04045
 _FULL_16 = 65535 / 255
 
 
-def as_bytes(colors: npt.NDArray[np.generic]) -> Bytes:
+def as_bytes(colors: Values) -> Bytes:
     """Return colours, of shape (N, 3 or 4), in 8 bits, whichever way a file held them.
 
     Floating-point numbers that are all within 0 to 1 are shares of full brightness. Otherwise 255 is full, or 65535

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.options import Options
 
 _FIT_SECONDS, _FIT_POINTS, _FIT_POWER = 6.8, 500, 0.545

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float
+
 
 @dataclass(frozen=True)
 class Histogram:
@@ -45,7 +47,7 @@ class Histogram:
         return cls(float(low), float(high), tuple(counts.tolist()), below, above)
 
     @property
-    def edges(self) -> npt.NDArray[np.float64]:
+    def edges(self) -> Float:
         """Borders of the bins, of shape (bins + 1,)."""
         return np.linspace(self.low, self.high, len(self.counts) + 1)
 

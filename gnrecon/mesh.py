@@ -7,13 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.slices import slices
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 
 FOLDED = math.radians(45.0)
 """Angle from the area-weighted normal at which edge-weighted ones are no longer believed."""
@@ -43,7 +40,7 @@ class Mesh:
     vertices: Float
     faces: Int
     normals: Float | None = None
-    attributes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    attributes: Mapping[str, Values] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64).reshape(-1, 3)
@@ -135,7 +132,7 @@ class Mesh:
         """Return the same faces, normals and attributes over moved vertices, of shape (V, 3)."""
         return replace(self, vertices=vertices)
 
-    def with_attributes(self, attributes: Mapping[str, npt.NDArray[np.generic]]) -> Mesh:
+    def with_attributes(self, attributes: Mapping[str, Values]) -> Mesh:
         """Return the same mesh with these attributes, each of V rows, added to what it carries."""
         return replace(self, attributes={**self.attributes, **attributes})
 

@@ -14,11 +14,11 @@ from typing import Protocol
 import numpy as np
 
 from gnrecon.advance import Advance, part, unheard
-from gnrecon.cloud import Float
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.export.protocol import sdf_and_gradient
 from gnrecon.fit import NeuralSDF
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.large import LARGE
 from gnrecon.fit.options import FitOptions
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.orient import require_orientation
 from gnrecon.ingest.spacing import neighbour_spacing

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float, Mask
 
 Box = tuple[Sequence[float], Sequence[float]]
 
@@ -32,7 +31,7 @@ class Region:
         """Whether nothing is cut away."""
         return not self.boxes and not self.planes
 
-    def holds(self, points: Float) -> npt.NDArray[np.bool_]:
+    def holds(self, points: Float) -> Mask:
         """Return the mask, of shape (N,), of wanted points; one that is not finite is not told to lie outside."""
         wanted = np.full(len(points), not self.boxes)
         for lower, upper in self.boxes:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
+
+from gnrecon.geometry.arrays import Float
 
 
-def deviation(off: npt.NDArray[np.float64]) -> float:
+def deviation(off: Float) -> float:
     """Return the standard deviation of what is off its middle, of shape (N,), by the median of its size.
 
     It is that of a normal distribution of as large a median.

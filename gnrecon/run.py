@@ -88,7 +88,9 @@ class Files:
         """Return the files that are read, those that scans name among them, and the files that are written."""
         asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
         inputs = [path for path in (self.reference, self.settings) if path is not None]
-        return [*all_members(self.scans, self.format), *all_members(inputs)], [path for path in asked if path is not None]
+        return [*all_members(self.scans, self.format), *all_members(inputs)], [
+            path for path in asked if path is not None
+        ]
 
 
 def run(

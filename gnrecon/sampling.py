@@ -17,15 +17,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.slices import slices
 from gnrecon.threads import abreast
-
-Mask = npt.NDArray[np.bool_]
-Int = npt.NDArray[np.int64]
 
 _SOURCES = 4000
 _NEIGHBOURS = 8

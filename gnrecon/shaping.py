@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Float
 from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.cut import crop, subtract
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.fit import NeuralSDF
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import StageTimer, mesh_field, untimed
 from gnrecon.options import Options

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 
 
 def cube(count: int, side: float, seed: int = 0) -> tuple[Float, Float]:

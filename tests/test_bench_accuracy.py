@@ -12,6 +12,8 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from gnrecon.geometry.arrays import Float
+
 # The benchmarks are scripts beside the package, as ./scripts/bench puts them on the path.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
@@ -32,7 +34,7 @@ from benchmarks.problem import Problem
 from benchmarks.samples_apart import between_samples
 from benchmarks.trial import Job, run_trial
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.errors import UsageError
 from gnrecon.export import require_sound, verify
 from gnrecon.export.nearest import Surface

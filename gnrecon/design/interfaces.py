@@ -10,14 +10,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.topology import face_components, submesh
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.mesh import Mesh
-
-Int = npt.NDArray[np.int64]
 
 
 class InterfaceSample(NamedTuple):

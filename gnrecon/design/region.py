@@ -6,11 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.nearest import Surface
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.mesh import Mesh
-from gnrecon.sampling import Box, Mask
+from gnrecon.sampling import Box
 
 _NEAR_SHARE, _NEAR_SPREAD = 0.5, 0.03
 

@@ -6,10 +6,10 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
-from gnrecon.cloud import Float
 from gnrecon.export.nearest import ray_scene
 from gnrecon.export.shading import open_sky, sphere_directions
 from gnrecon.export.solid import centre_and_size
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 REACH = 0.7

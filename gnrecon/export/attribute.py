@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
+from gnrecon.geometry.arrays import Values
 
 
 @dataclass(frozen=True)
@@ -21,5 +20,5 @@ class Attribute:
     """
 
     name: str
-    values: npt.NDArray[np.generic]
+    values: Values
     origin: str

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.advance import Advance, part, unheard
-from gnrecon.cloud import Float
-from gnrecon.export.lattice import Int, Lattice
+from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.export.search import Coarse, search
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.slices import slices
 
 NUDGE = 1e-4

@@ -11,14 +11,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes, to_linear, to_srgb
 from gnrecon.export.attribute import Attribute
 from gnrecon.export.neighbours import COUNT, Neighbourhood
-
-Values = npt.NDArray[np.generic]
+from gnrecon.geometry.arrays import Float, Values
 
 MEASURED = ("amplitude", "confidence", "intensity", "quality", "reflectance")
 """Names of measured values, which are averaged even where a file holds whole numbers."""

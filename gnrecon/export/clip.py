@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.trim import cut_along, used
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 ON = 1e-9

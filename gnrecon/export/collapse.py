@@ -14,12 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 
-from gnrecon.cloud import Float
 from gnrecon.export.independent import ranks, rings_apart
 from gnrecon.export.split import LONG
 from gnrecon.export.surface import CORNER, SMOOTH, EdgeTable, Surface, area_vectors, face_normals, unit
-from gnrecon.export.topology import Mask
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 SHORT = 4.0 / 5.0
 """An edge is too short below this share of the target length: with `LONG`, no halved edge is collapsed again."""

@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.surface import EdgeTable, unit
-from gnrecon.export.topology import Mask
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 NEARER = 0.3
 """Share of the way to the crease that is left between two rounds."""

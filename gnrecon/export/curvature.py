@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 
 
 def curvatures(gradient: Float, hessian: Float) -> tuple[Float, Float]:

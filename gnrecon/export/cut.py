@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
 from gnrecon.errors import MeshError
 from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 SNAP = 1e-9

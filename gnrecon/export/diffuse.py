@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 TOLERANCE, MOST_STEPS = 1e-6, 500

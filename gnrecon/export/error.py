@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.export.nearest import Surface
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 

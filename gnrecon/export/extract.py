@@ -16,12 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.advance import Advance, part, unheard
-from gnrecon.cloud import Float
 from gnrecon.errors import MeshError
 from gnrecon.export.band import Band, narrow_band
-from gnrecon.export.lattice import Int, Lattice
+from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import CHUNK, Values
 from gnrecon.export.protocol import SignedDistance
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.mesh import Mesh
 
 EVALUATED = 0.9
@@ -131,7 +131,7 @@ def _march(band: Band, chunk: Int) -> Piece | None:
     return Piece(names, places + chunk * CHUNK, faces.astype(np.int32))
 
 
-def _crossings(values: Values, nodes: Int, axis: npt.NDArray[np.intp]) -> Float:
+def _crossings(values: Values, nodes: Int, axis: Int) -> Float:
     """Where along its edge, from 0 to 1, the linear interpolant vanishes."""
     low = values[tuple(nodes.T)].astype(np.float64)
     high = values[tuple((nodes + np.eye(3, dtype=np.int64)[axis]).T)]

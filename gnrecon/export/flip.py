@@ -11,11 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.independent import apart, ranks
 from gnrecon.export.surface import EdgeTable, Surface, area_vectors, face_normals
-from gnrecon.export.topology import Mask
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 TURN = 0.7
 """Least cosine between a new face's normal and what those of the two old ones should be."""

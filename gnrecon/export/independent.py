@@ -7,13 +7,11 @@ its vertices: chosen candidates share no vertex then, and as the lowest rank of 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.export.topology import Mask
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 
-def ranks(order_by: npt.NDArray[np.float64]) -> Int:
+def ranks(order_by: Float) -> Int:
     """Ranks from 0 of values of shape (N,), ties in their order."""
     rank = np.empty(len(order_by), dtype=np.int64)
     rank[np.argsort(order_by, kind="stable")] = np.arange(len(order_by))

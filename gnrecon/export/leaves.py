@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export.lattice import Int
+from gnrecon.geometry.arrays import Int
 
 LEAF, CHUNK = 4, 32
 """Cells along a leaf, and along a chunk (what marching cubes sees at once)."""

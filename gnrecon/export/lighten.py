@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.export.nearest import Surface
 from gnrecon.export.solid import centre_and_size
-from gnrecon.mesh import Int, Mesh
+from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.mesh import Mesh
 
 DENSITY = 2.3
 """Faces that clustering leaves for each square of the surface that is as wide as a cube, about."""
@@ -67,7 +66,7 @@ def barycentric(corners: Float, places: Float) -> Float:
     return weights
 
 
-def interpolate(values: npt.NDArray[np.generic], corners: npt.NDArray[np.int64], weights: Float) -> Float:
+def interpolate(values: Values, corners: Int, weights: Float) -> Float:
     """Return values of shape (N, ...) at places in faces, from the values of vertices, of shape (V, ...).
 
     Parameters
@@ -82,11 +81,9 @@ def interpolate(values: npt.NDArray[np.generic], corners: npt.NDArray[np.int64],
     return mixed
 
 
-def _carried(
-    attributes: Mapping[str, npt.NDArray[np.generic]], corners: npt.NDArray[np.int64], weights: Float
-) -> dict[str, npt.NDArray[np.generic]]:
+def _carried(attributes: Mapping[str, Values], corners: Int, weights: Float) -> dict[str, Values]:
     """Interpolated attributes in their own types; whole numbers are rounded."""
-    carried: dict[str, npt.NDArray[np.generic]] = {}
+    carried: dict[str, Values] = {}
     for name, values in attributes.items():
         mixed = interpolate(values, corners, weights)
         whole = np.issubdtype(values.dtype, np.integer)

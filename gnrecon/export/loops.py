@@ -24,9 +24,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
-from gnrecon.export.topology import Edges, Mask, face_components
-from gnrecon.mesh import Int, Mesh
+from gnrecon.export.topology import Edges, face_components
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.mesh import Mesh
 from gnrecon.slices import slices
 
 Words = npt.NDArray[np.uint64]

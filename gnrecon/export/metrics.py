@@ -13,10 +13,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.errors import InputError, UsageError
 from gnrecon.export.definitions import Metrics
 from gnrecon.export.nearest import nearest_on_surface
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 F_SCORE_SHARE = 0.005

@@ -10,11 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.export.solid import centre_and_size
-from gnrecon.mesh import Int, Mesh
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.mesh import Mesh
 from gnrecon.slices import slices
 
 RAYS = 5
@@ -58,7 +57,7 @@ class Surface:
             feet[rows] = np.einsum("ij,ijk->ik", weights, self._corners[faces[rows]])
         return feet, faces
 
-    def inside(self, points: Float) -> npt.NDArray[np.bool_]:
+    def inside(self, points: Float) -> Mask:
         """Return which points, of shape (N, 3), a closed surface encloses, to about 1e-7 of its size."""
         inside = np.empty(len(points), dtype=bool)
         for rows in slices(len(points), self._batch):

@@ -16,11 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.slices import slices
 
 COUNT = 8
@@ -63,7 +61,7 @@ class Neighbourhood:
     """
 
     def __init__(self, points: Float) -> None:
-        self._rows: npt.NDArray[np.intp] = np.flatnonzero(np.isfinite(points).all(axis=1))
+        self._rows: Int = np.flatnonzero(np.isfinite(points).all(axis=1))
         finite = points[self._rows]
         # Far-off coordinates would cancel in the squares of differences.
         self._centre = finite.mean(axis=0)

@@ -12,10 +12,11 @@ from functools import cached_property
 
 import numpy as np
 
-from gnrecon.cloud import Float, Frame
+from gnrecon.cloud import Frame
 from gnrecon.errors import UsageError
 from gnrecon.export.nearest import Surface
 from gnrecon.export.solid import centre_and_size
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 LEAST_LEVEL = 1e-5

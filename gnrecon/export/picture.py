@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.colors import to_linear as to_light
 from gnrecon.errors import UsageError
@@ -20,6 +20,7 @@ from gnrecon.export.camera import Camera, View
 from gnrecon.export.nearest import ray_scene
 from gnrecon.export.shading import shade, sky_share, to_bytes, to_linear
 from gnrecon.export.splats import draw_points
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 CLAY, SLATE = (230, 208, 180), (86, 120, 164)

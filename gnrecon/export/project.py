@@ -12,13 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.protocol import SignedDistance, sdf_and_gradient
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.mesh import Mesh, area_vectors
 from gnrecon.slices import slices
-
-Mask = npt.NDArray[np.bool_]
 
 TURN, COLLAPSE = 0.3, 1e-3
 """Least cosine between a face's old and new normal, and least new area as a share of the old."""
@@ -134,7 +132,7 @@ def newton(
 
 def _steps(
     points: Float, value: Float, gradient: Float, start: Float, limit: float, bounds: Float
-) -> tuple[npt.NDArray[np.int64], Float]:
+) -> tuple[Int, Float]:
     """Rows that may take a Newton step, of shape (S,), and where it leads them, of shape (S, 3)."""
     low, high = bounds
     slopes = np.linalg.norm(gradient, axis=1)

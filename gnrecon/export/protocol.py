@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from gnrecon.cloud import Float, Frame
+from gnrecon.cloud import Frame
+from gnrecon.geometry.arrays import Float
 
 
 class SignedDistance(Protocol):

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 BIN = 5.0

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.crease import meeting_points
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.surface import CREASE, SMOOTH, Surface, area_vectors, face_normals, unit
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int
 
 SIDE = 0.5
 """Where beside a crease its sides are looked at: this share of the way from a vertex to the middle of its face."""

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
 from gnrecon.export.collapse import collapse_short
 from gnrecon.export.crease import crease_edges
@@ -23,6 +22,7 @@ from gnrecon.export.relax import guarded, on_creases, relaxed
 from gnrecon.export.sizing import bent_lengths, even_lengths
 from gnrecon.export.split import split_long
 from gnrecon.export.surface import EdgeTable, Surface, unit
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 ROUNDS = 8

@@ -18,8 +18,9 @@ from scipy.spatial import cKDTree
 from gnrecon.errors import MeshError
 from gnrecon.export.meshlab import from_meshlab, to_meshlab
 from gnrecon.export.solid import from_solid, refusal, to_solid
-from gnrecon.export.topology import Edges, Mask, corner_fans, split_vertices, submesh
+from gnrecon.export.topology import Edges, corner_fans, split_vertices, submesh
 from gnrecon.export.verify import require_sound, verify
+from gnrecon.geometry.arrays import Mask
 from gnrecon.mesh import Mesh
 
 APART = 1e-3

@@ -17,11 +17,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
-from gnrecon.export.lattice import Int, Lattice
+from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import LEAF, Leaves
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.slices import slices
 
 MOST_BLOCKS = 96
@@ -38,8 +37,6 @@ BATCH = 4096
 
 _SAMPLES = 2048
 _CHILDREN = np.stack(np.meshgrid(*3 * [np.arange(2)], indexing="ij"), axis=-1).reshape(-1, 3)
-
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

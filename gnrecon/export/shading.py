@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 
 KEY = (np.array([-0.65, 0.7, 0.45]), 1.45)
 FILL = (np.array([0.85, 0.1, 0.35]), 0.28)

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.crease import meeting_points
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.split import split
 from gnrecon.export.surface import EdgeTable, Surface, area_vectors, unit
-from gnrecon.export.topology import Mask
-from gnrecon.mesh import Int, Mesh
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.mesh import Mesh
 
 REACH = 1.5
 """How far from a chamfer's middle its crease may lie, in lengths of the chamfer."""

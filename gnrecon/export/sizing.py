@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.surface import SMOOTH, EdgeTable, Surface
+from gnrecon.geometry.arrays import Float
 
 BEND = np.radians(15.0)
 """Angle by which an edge may turn: the chord is then 0.9 % of the radius of curvature off."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.export.camera import Camera
 from gnrecon.export.shading import shade
+from gnrecon.geometry.arrays import Float, Int
 
 FADE = 0.6
 """Share of the background in the furthest point's colour."""
@@ -70,7 +69,7 @@ def _offsets(size: float) -> list[tuple[int, int]]:
 
 def _stamp(
     column: Float, row: Float, depth: Float, size: Float, camera: Camera, offset: tuple[int, int]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float, Float]:
+) -> tuple[Int, Int, Float, Float]:
     """Of every ball one pixel, at an offset from the middle's: which balls cover it, where, how deep, what normal."""
     x, y = np.floor(column).astype(np.int64) + offset[0], np.floor(row).astype(np.int64) + offset[1]
     dx, dy = (x + 0.5 - column) / size, (y + 0.5 - row) / size

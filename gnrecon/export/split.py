@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export.surface import EdgeTable, Surface, unit
-from gnrecon.export.topology import Mask
-from gnrecon.mesh import Int
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 LONG = 4.0 / 3.0
 """An edge is too long beyond this many target lengths: its halves are then nearer to the target than itself."""

@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gnrecon.mesh import Int, Mesh
-
-Mask = npt.NDArray[np.bool_]
+from gnrecon.geometry.arrays import Int, Mask
+from gnrecon.mesh import Mesh
 
 
 @dataclass(frozen=True)

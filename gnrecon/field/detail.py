@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
 from gnrecon.field.features import Features
-from gnrecon.field.partition import Int, Partition
+from gnrecon.field.partition import Partition
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.slices import slices
 from gnrecon.threads import abreast
 

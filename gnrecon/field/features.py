@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
 from gnrecon.field.stencil import Stencil
+from gnrecon.geometry.arrays import Float
 
 DEGREES_OF_FREEDOM = 12.0
 """Of the features' spectrum, a Student t distribution: the larger, the smoother; 4 is a Matern kernel's."""

@@ -16,9 +16,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Int
 
-Int = npt.NDArray[np.int64]
 OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 _TURNS = np.array(list(itertools.product((False, True), repeat=3)))
 """Along which axes a cube is the neighbour of a point's own cell."""

@@ -20,7 +20,6 @@ from gnrecon.cloud import Samples
 from gnrecon.errors import UsageError
 from gnrecon.fit.averaged import Told, told
 from gnrecon.fit.ball import Ball
-from gnrecon.fit.choose import Int, Mask
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.detail import CHOSEN, ShapingFor, fit_detail
 from gnrecon.fit.global_field import GlobalField, fit_global
@@ -31,6 +30,7 @@ from gnrecon.fit.outlying import outlying
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Free, Shaping, bend_global
 from gnrecon.fit.sharp import Sharp
+from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.optim import Solution
 from gnrecon.sampling import Density
 

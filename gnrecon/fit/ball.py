@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.fit.primitives import Sphere, feet
 from gnrecon.fit.white import is_white
+from gnrecon.geometry.arrays import Float
 from gnrecon.robust import deviation
 from gnrecon.sampling import Density
 

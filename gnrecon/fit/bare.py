@@ -12,12 +12,11 @@ Neither do such normals tell the noise; the thickness of the flattest neighbourh
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
 from gnrecon.fit.laid import MADE, NEAR, OFF, Face, Laid, Search
 from gnrecon.fit.primitives import LEAST, agreed
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.sampling import Density
 
 NOISE, MOST = 0.1, 0.2
@@ -78,7 +77,7 @@ def _noise(density: Density) -> float:
     return max(float(ROOM * thick), NOISE * density.radius)
 
 
-def _anew(density: Density, normals: Float, rest: npt.NDArray[np.integer]) -> Float:
+def _anew(density: Density, normals: Float, rest: Int) -> Float:
     """Return normals, of shape (N, 3), those of some rows estimated from these alone; their sides stay."""
     found = normals.copy()
     if len(rest) <= BESIDE:

@@ -20,14 +20,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.robust import deviation
 from gnrecon.sampling import Density
 from gnrecon.slices import slices
 
-Int = npt.NDArray[np.integer]
 Part = tuple[slice, Int, Float]
 
 PASSES = 3

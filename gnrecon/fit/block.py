@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
 from gnrecon.field.features import Features
-from gnrecon.field.partition import OFFSETS, Int, Partition
+from gnrecon.field.partition import OFFSETS, Partition
 from gnrecon.field.siren import Siren
 from gnrecon.fit.choose import Leftover, Volume
 from gnrecon.fit.detail import BEYOND, CLEAR, LEAST_POINTS, VOLUME, cube_length
@@ -25,6 +24,7 @@ from gnrecon.fit.dipoles import Dipoles
 from gnrecon.fit.octree import Codes, morton
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.work import Arrays, Work
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.sampling import Box, is_certain, side_of
 
 CHANCE = 3

@@ -18,23 +18,20 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.field.features import Features
 from gnrecon.fit.clean import clean_noise
 from gnrecon.fit.evidence import PATCHES as EVIDENT_PATCHES
 from gnrecon.fit.evidence import POINTS, Evidence
 from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.sampling import Density
 from gnrecon.threads import abreast
-
-Mask = npt.NDArray[np.bool_]
-Int = npt.NDArray[np.integer]
 
 LENGTHS = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)
 POSITIONS = (0.02, 0.1, 0.3, 0.8)

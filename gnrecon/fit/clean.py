@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.fit.creases import over_planes
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Density
 
 Noise = tuple[float, float]

@@ -14,9 +14,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.field.siren import Siren
-from gnrecon.fit.choose import Int
 from gnrecon.fit.loss import distance_term
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
@@ -24,6 +23,7 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.smoothness import LENGTHS, smooth_spectrum
 from gnrecon.fit.start import wide_start
 from gnrecon.fit.terms import Term
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.residuals.first_order import interface
 
 CLEARLY = -0.5

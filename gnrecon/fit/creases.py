@@ -19,15 +19,11 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
 from gnrecon.fit.primitives import cosine_of
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.sampling import Density
-
-Int = npt.NDArray[np.integer]
-Mask = npt.NDArray[np.bool_]
 
 NEAREST, REACH = 40, 3.0
 """Most neighbours of a point, and how far they are at most, in radii of its disk."""

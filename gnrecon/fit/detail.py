@@ -17,15 +17,15 @@ import torch
 from torch import Tensor
 
 from gnrecon.advance import Advance, part, unheard
-from gnrecon.cloud import Float
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
 from gnrecon.fit.averaged import Told
-from gnrecon.fit.choose import Int, Leftover, Volume
+from gnrecon.fit.choose import Leftover, Volume
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.sampling import CoarseDistance
 from gnrecon.threads import abreast
 

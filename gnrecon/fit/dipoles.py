@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.fit.octree import BITS, Codes, morton
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.sampling import winding_number
 
 SIDE = 4.0
@@ -26,8 +26,6 @@ SIDE = 4.0
 
 FEW = 64
 """Cubes of the largest size, up to so many."""
-
-Rows = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Level:
     places: Float
     moments: Float
     radii: Float
-    first: Rows
+    first: Int
 
 
 @dataclass(frozen=True)
@@ -73,6 +71,7 @@ class Dipoles:
         order = np.argsort(codes, kind="stable")
         areas = disks**2
         sums = np.column_stack([areas, areas[:, None] * points, areas[:, None] * normals / 4])[order]
+        first: Int
         codes, first = codes[order], np.arange(len(points) + 1)
         codes, sums, first = _joined(codes, sums)
         levels = [_level(sums, first, origin, side)]
@@ -120,13 +119,13 @@ class Dipoles:
         return winding_number(x, *self.near(center, reach))
 
 
-def _joined(codes: Codes, sums: Float) -> tuple[Codes, Float, Rows]:
+def _joined(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:
     """Sum the rows of equal codes, which are neighbours; where each began, with the end."""
     start = np.flatnonzero(np.r_[True, codes[1:] != codes[:-1]])
     return codes[start], np.add.reduceat(sums, start, axis=0), np.append(start, len(codes))
 
 
-def _level(sums: Float, first: Rows, origin: Float, side: float) -> Level:
+def _level(sums: Float, first: Int, origin: Float, side: float) -> Level:
     areas = np.maximum(sums[:, 0], np.finfo(np.float64).tiny)
     places = sums[:, 1:4] / areas[:, None]
     # The lower corner follows from any point within, such as the mean.

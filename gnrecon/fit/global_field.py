@@ -14,12 +14,12 @@ import numpy as np
 from gnrecon.advance import Advance, part
 from gnrecon.cloud import Samples
 from gnrecon.field.siren import Siren
-from gnrecon.fit.choose import Int, Mask
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.smoothness import global_smoothness, smooth_spectrum
 from gnrecon.fit.wide import fit_wide
+from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.optim import Solution
 from gnrecon.sampling import is_certain
 

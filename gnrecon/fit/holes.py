@@ -14,19 +14,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.min_cut import minimal_inside, shifted
 from gnrecon.fit.mouths import mouths
 from gnrecon.fit.primitives import Seen, Surface, Wanted, agreed, feet, planar_share, surfaces
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.sampling import Box, CoarseDistance, Density
-
-Int = npt.NDArray[np.integer]
-Mask = npt.NDArray[np.bool_]
 
 MOST_POINTS, CLOSER = 6000, 15_000
 """Points that are looked at for holes, and for surfaces; holes that so many do not show are small."""

@@ -15,16 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, feet, surfaces
 from gnrecon.fit.white import is_white
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.robust import deviation
 from gnrecon.sampling import Density
-
-Mask = npt.NDArray[np.bool_]
 
 MADE = 0.5
 """Least share of the points that lie on such surfaces, where a shape is a made one: 0.8 and more on machine parts, 0.2
@@ -110,7 +107,7 @@ class Face:
     """A surface and the rows of the points that it cannot be told from."""
 
     surface: Primitive
-    rows: npt.NDArray[np.integer]
+    rows: Int
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,7 @@ class Search:
         """Radius of their disks."""
         return self.density.radius
 
-    def left(self, found: list[Face]) -> npt.NDArray[np.integer]:
+    def left(self, found: list[Face]) -> Int:
         """Return the rows of the points that are on none of some faces."""
         free = np.ones(len(self.points), dtype=bool)
         for face in found:
@@ -167,9 +164,7 @@ class Search:
                 break
         return found
 
-    def _face(
-        self, seen: Seen, free: npt.NDArray[np.integer], normals: Float, angle: float, near: float
-    ) -> Face | None:
+    def _face(self, seen: Seen, free: Int, normals: Float, angle: float, near: float) -> Face | None:
         """Return the face of a surface and those free points that it cannot be told from, or None if it can.
 
         Parameters

@@ -20,11 +20,11 @@ import numpy.typing as npt
 import torch
 
 from gnrecon.advance import Advance, part, unheard
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
-from gnrecon.field.partition import Int, Partition
-from gnrecon.fit.choose import Leftover, Mask, choose
+from gnrecon.field.partition import Partition
+from gnrecon.fit.choose import Leftover, choose
 from gnrecon.fit.detail import CELL, CHOSEN
 from gnrecon.fit.dipoles import Dipoles
 from gnrecon.fit.octree import morton, octree_blocks
@@ -34,6 +34,7 @@ from gnrecon.fit.scheduled import solve_scheduled
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.work import Work
 from gnrecon.fit.workers import solve_blocks
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.slices import slices
 
 LARGE = 200_000

@@ -13,14 +13,13 @@ points and errors across holes count alike.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.cloud import Float
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import Laplace
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.slices import slices
 
 PATCHES = {1: 200, 8: 40, 40: 12}
@@ -58,7 +57,7 @@ def left_out_scores(data: DataRows, posterior: Laplace, size: int, count: int, r
     return np.concatenate([_scores(data, posterior, patches[rows]) for rows in slices(len(patches), several)])
 
 
-def _scores(data: DataRows, posterior: Laplace, patches: npt.NDArray[np.intp]) -> Float:
+def _scores(data: DataRows, posterior: Laplace, patches: Int) -> Float:
     """Return the scores of some patches, of shape (count, size), flattened."""
     count, size = patches.shape
     rows, residuals, steps = _whitened(data, posterior, torch.as_tensor(patches.ravel(), device=data.theta.device))

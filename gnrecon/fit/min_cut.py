@@ -12,14 +12,10 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from gnrecon.cloud import Float
-
-Int = npt.NDArray[np.integer]
-Mask = npt.NDArray[np.bool_]
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 ALONG = 0.1
 """What an area along a believed surface costs, as a share of any other's."""

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.geometry.arrays import Float
 from gnrecon.histogram import Histogram
 
 MOST = 20_000

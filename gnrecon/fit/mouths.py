@@ -8,13 +8,10 @@ face went on.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from gnrecon.angles import widest_gap
-from gnrecon.cloud import Float
-
-Mask = npt.NDArray[np.bool_]
+from gnrecon.geometry.arrays import Float, Mask
 
 WITHIN = 1.5
 """How far points are looked for around a sample, in distances of the nearest one."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.field.partition import Int
+from gnrecon.geometry.arrays import Int
 
 BITS = 21
 """Of a cell's number along an axis: three of them make one code of 64 bits."""

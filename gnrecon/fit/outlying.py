@@ -8,9 +8,8 @@ scan do, and by more than they are apart.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.sampling import Density
 
 NEIGHBOURS = 8
@@ -26,7 +25,7 @@ LEAST, MOST = 0.002, 0.04
 LEAST_POINTS = 100
 
 
-def outlying(value: Float, density: Density) -> npt.NDArray[np.bool_]:
+def outlying(value: Float, density: Density) -> Mask:
     """Return which points are off the surface, of shape (N,).
 
     Parameters
@@ -40,5 +39,5 @@ def outlying(value: Float, density: Density) -> npt.NDArray[np.bool_]:
     # The first neighbour is the point itself.
     near = density.tree.query(density.points, NEIGHBOURS + 1)[1][:, 1:]
     off = np.abs(value - np.median(value[near], axis=1))
-    found: npt.NDArray[np.bool_] = off > np.maximum(TIMES * np.quantile(off, USUAL), DISKS * density.disks)
+    found: Mask = off > np.maximum(TIMES * np.quantile(off, USUAL), DISKS * density.disks)
     return found if LEAST <= found.mean() <= MOST else np.zeros_like(found)

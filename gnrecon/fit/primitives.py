@@ -13,14 +13,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.sampling import Density
-
-Int = npt.NDArray[np.integer]
-Mask = npt.NDArray[np.bool_]
 
 ANGLE = 10.0
 """Degrees between a point's normal and the surface's that it lies on, at most."""

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Box, CoarseDistance, near_surface
 
 MARGIN = 0.1

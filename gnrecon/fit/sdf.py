@@ -13,9 +13,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float, Frame
+from gnrecon.cloud import Frame
 from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Box
 from gnrecon.slices import slices
 from gnrecon.threads import abreast

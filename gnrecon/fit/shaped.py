@@ -19,11 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
 from gnrecon.errors import FitError
 from gnrecon.field.features import Features
 from gnrecon.fit.bend import Jet, Sines, Wish, bent
-from gnrecon.fit.choose import Mask
 from gnrecon.fit.loss import data_terms, distance_term
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.patch import Belief, PatchSystem
@@ -34,6 +32,7 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.sheet import Sheet
 from gnrecon.fit.start import FINAL_POINTS, RIDGE
 from gnrecon.fit.terms import Term
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.linalg.cholesky import damped_factor
 from gnrecon.residuals import SecondOrder, free_space
 from gnrecon.sampling import Density, least_values

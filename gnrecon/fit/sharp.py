@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.fit.bare import laid_bare
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.creases import Faces
@@ -21,6 +21,7 @@ from gnrecon.fit.holes import Continued, continued
 from gnrecon.fit.laid import Laid, laid
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.spread import spread
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Density
 
 SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.8

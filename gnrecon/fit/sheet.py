@@ -16,9 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.cloud import Float
-from gnrecon.fit.choose import Mask
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.levelset import LevelSet, sample_surface
 from gnrecon.sampling import Density
 

@@ -17,17 +17,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float
 from gnrecon.fit.laid import OFF, Face, Search
 from gnrecon.fit.primitives import LEAST, Cylinder, Plane, agreed, cosine_of
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.sampling import Density, winding_number
 from gnrecon.slices import slices
-
-Int = npt.NDArray[np.integer]
-Mask = npt.NDArray[np.bool_]
 
 NOISE, ANGLE = 0.005, 10.0
 """Noise with which surfaces are looked for, in radii of a point's disk, and degrees between their normals and a

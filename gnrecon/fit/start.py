@@ -24,13 +24,13 @@ import torch
 from torch import Tensor
 
 from gnrecon.advance import Advance, unheard
-from gnrecon.cloud import Float
 from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
 from gnrecon.fit.ghosts import GhostSearch
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.terms import Term
+from gnrecon.geometry.arrays import Float
 from gnrecon.linalg.cholesky import Cholesky
 from gnrecon.linalg.metric import identity
 

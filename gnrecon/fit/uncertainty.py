@@ -24,7 +24,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float, Samples
+from gnrecon.cloud import Samples
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
@@ -32,6 +32,7 @@ from gnrecon.fit.loss import normal_weight
 from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Density
 from gnrecon.slices import slices
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Density
 
 ALIKE, BESIDE = 2.5, 6

@@ -9,13 +9,10 @@ it: at equal steps of the summed chances, so that neighbours are hardly ever cho
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.ingest.outliers import thickness
 from gnrecon.slices import slices
-
-Float = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
 
 _NEIGHBOURS = 16
 _EVENLY = 0.5
@@ -25,7 +22,7 @@ _AT_A_TIME = 50_000
 _BITS = 20
 
 
-def by_curvature(points: Float, count: int, rng: np.random.Generator) -> Rows:
+def by_curvature(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return `count` row indices, more of them where the surface bends.
 
     Parameters
@@ -66,7 +63,7 @@ def _chances(weights: Float, count: int) -> Float:
         certain |= beyond
 
 
-def _along_curve(points: Float) -> Rows:
+def _along_curve(points: Float) -> Int:
     """The rows in the order of Morton's curve: by their cell numbers with the bits of x, y and z interleaved."""
     lower = points.min(axis=0)
     cells = ((points - lower) / max(float(np.ptp(points, axis=0).max()), 1e-300) * (2**_BITS - 1)).astype(np.int64)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import InputError, UsageError
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.ingest.clusters import isolated_clusters
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.outlier_rules import MODES, outliers_by_rule, parse_outliers
 from gnrecon.ingest.outliers import find_outliers
 from gnrecon.ingest.repeats import repeated_points
-
-Float = npt.NDArray[np.float64]
 
 LEAST_POINTS = 10
 _FLAT = 1e-4  # ratio of extents below which a cloud counts as a plane or a line
@@ -98,9 +96,7 @@ def _centred(cloud: PointCloud) -> Float:
     return centred
 
 
-def _without(
-    cloud: PointCloud, mask: npt.NDArray[np.bool_], mode: str, max_share: float
-) -> tuple[PointCloud, int, int]:
+def _without(cloud: PointCloud, mask: Mask, mode: str, max_share: float) -> tuple[PointCloud, int, int]:
     """Drop the points of a mask if the mode allows it; how many were dropped, and how many were left alone."""
     found = int(mask.sum())
     if mode == "on" or (mode == "auto" and found <= max_share * len(cloud)):

@@ -12,14 +12,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.ingest.spacing import neighbour_spacing
 from gnrecon.ingest.voxel import cells_of
-
-Float = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
-Mask = npt.NDArray[np.bool_]
 
 _NEAR_ALL = 10.0
 _CELLS = 4
@@ -53,17 +49,17 @@ def isolated_clusters(points: Float) -> Mask:
     return np.zeros(len(points), bool)
 
 
-def _parts(links: Rows, count: int) -> tuple[Rows, Mask]:
+def _parts(links: Int, count: int) -> tuple[Int, Mask]:
     """The number of each point's part, of shape (N,), and by part whether it is small."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     graph: Any = coo_matrix((np.ones(links.shape[1], np.int8), links), shape=(count, count))
-    parts: Rows = connected_components(graph, directed=False)[1].astype(np.intp)
+    parts: Int = connected_components(graph, directed=False)[1].astype(np.intp)
     return parts, np.bincount(parts) < _SHARE * count
 
 
-def _near_links(points: Float, reach: float) -> Rows:
+def _near_links(points: Float, reach: float) -> Int:
     """Pairs of rows, of shape (2, P), that link points nearer than `reach`, to within its fourth part.
 
     All points of a small cube are linked with its first one, and first ones among each other: there are few of them.
@@ -76,7 +72,7 @@ def _near_links(points: Float, reach: float) -> Rows:
     return np.hstack([np.stack([np.arange(len(points)), first[cells]]), first[pairs].T])
 
 
-def _own_links(points: Float, rows: Rows) -> Rows:
+def _own_links(points: Float, rows: Int) -> Int:
     """Pairs of rows, of shape (2, P), that link points in `rows` to what is near by their own spacing."""
     from scipy.spatial import cKDTree
 
@@ -86,7 +82,7 @@ def _own_links(points: Float, rows: Rows) -> Rows:
     return np.stack([rows[first], neighbours[first, column]])
 
 
-def _alone(points: Float, parts: Rows, suspects: Mask) -> Mask:
+def _alone(points: Float, parts: Int, suspects: Mask) -> Mask:
     """Which of the suspected parts are farther from all that is not suspected than they are large; by part."""
     from scipy.spatial import cKDTree
 

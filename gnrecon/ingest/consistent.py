@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.spacing import mean_distances
 
-Float = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
 _WIDTH = 0.75

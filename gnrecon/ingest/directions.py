@@ -16,10 +16,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.slices import slices
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
 
 _NEIGHBOURS = (12, 24, 48)
 _FIRST, _MORE = 8, 16
@@ -82,7 +80,7 @@ def _sizes(count: int) -> list[int]:
     return [first, *(size for size in _NEIGHBOURS[1:] if size <= count // _MORE)]
 
 
-def _planes(points: Float, rows: npt.NDArray[np.integer]) -> tuple[Float, Float, Float]:
+def _planes(points: Float, rows: Int) -> tuple[Float, Float, Float]:
     """Return centroids and unit normals, of shape (G, 3), and variances along three axes, of groups of rows (G, k)."""
     groups = points[rows]
     centroids = groups.mean(axis=1)

@@ -7,16 +7,14 @@ library buckets the points in a tree, so that a step looks at a few of them only
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
+from gnrecon.geometry.arrays import Float, Int
 
 _SMALL, _LARGE = 3, 7
 """Heights of the tree that suit fewer than 10,000 points, and more."""
 
 
-def farthest_points(points: Float, count: int, rng: np.random.Generator) -> Rows:
+def farthest_points(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return `count` row indices, beginning with a random one.
 
     Parameters
@@ -29,5 +27,5 @@ def farthest_points(points: Float, count: int, rng: np.random.Generator) -> Rows
     # Scaled, because the library works in single precision.
     scaled = (points / np.abs(points).max()).astype(np.float32)
     height = min(_SMALL if len(points) < 10_000 else _LARGE, len(points).bit_length() - 1)
-    chosen: Rows = fpsample.bucket_fps_kdline_sampling(scaled, count, height, first).astype(np.intp)
+    chosen: Int = fpsample.bucket_fps_kdline_sampling(scaled, count, height, first).astype(np.intp)
     return chosen

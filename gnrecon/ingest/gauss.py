@@ -14,11 +14,9 @@ at most a few thousand.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.spacing import mean_distances
-
-Float = npt.NDArray[np.float64]
 
 _ALPHA = 2.0
 

@@ -13,12 +13,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.cloud import Samples
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.ingest.spacing import neighbour_spacing
-
-Float = npt.NDArray[np.float64]
 
 _TESTED = 500
 _WIDTH, _HEIGHT = 3.0, 12.0
@@ -136,7 +134,7 @@ def _offset(local: Float, facing: Float) -> float | None:
     return offset if between < _BETWEEN * len(same) else None
 
 
-def _twice(local: Float) -> tuple[npt.NDArray[np.bool_], Float, float, float]:
+def _twice(local: Float) -> tuple[Mask, Float, float, float]:
     """Fit a quadric twice: which points are on the upper one, the lower quadric, the offset, and what remains."""
     columns, heights = _columns(local), local[:, 2]
     rest = heights - columns @ np.linalg.lstsq(columns, heights, rcond=None)[0]
@@ -158,7 +156,7 @@ def _columns(local: Float) -> Float:
     return np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
 
 
-def _mixed(plane: Float, upper: npt.NDArray[np.bool_]) -> bool:
+def _mixed(plane: Float, upper: Mask) -> bool:
     """Whether both layers are about the same place in the plane."""
     spread = float(np.sqrt(plane.var(axis=0).sum()))
     return float(np.linalg.norm(plane[upper].mean(axis=0) - plane[~upper].mean(axis=0))) < _APART * spread

@@ -12,11 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float
 
 _SIZES = (10, 15)
 """Points of the smallest neighbourhoods."""

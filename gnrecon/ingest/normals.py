@@ -17,17 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.consistent import consistent_normals
 from gnrecon.ingest.directions import directions, tangent_planes
 from gnrecon.ingest.gauss import gauss_normals
 from gnrecon.ingest.propagate import propagated
 from gnrecon.ingest.sight import towards_scanner
 from gnrecon.ingest.winding import agreement, disorder, outwardness
-
-Float = npt.NDArray[np.float64]
 
 _OFF_PLANE_PENALTY = 2.0
 _LOCAL, _SMOOTH = 12, 24

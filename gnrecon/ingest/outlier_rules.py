@@ -12,13 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import UsageError
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.lengths import parse_reach
-
-Float = npt.NDArray[np.float64]
 
 MODES = ("auto", "on", "off")
 _NEIGHBOURS = 16
@@ -76,7 +74,7 @@ def parse_outliers(text: str, units: str | None) -> OutlierRule:
     )
 
 
-def outliers_by_rule(points: Float, rule: OutlierRule, units: str | None) -> npt.NDArray[np.bool_]:
+def outliers_by_rule(points: Float, rule: OutlierRule, units: str | None) -> Mask:
     """Return the mask, of shape (N,), of outliers by the statistical or the radius rule.
 
     Parameters

@@ -13,11 +13,9 @@ scanner saw at a distance or at a grazing angle. Two tests spare it:
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.robust import deviation
-
-Float = npt.NDArray[np.float64]
 
 _NEIGHBOURS = 16
 _DEVIATIONS = 6.0
@@ -27,7 +25,7 @@ _SPARSE_FACTOR = 4.0  # times the median spacing, beyond which thickness is look
 _THICKNESS = 0.08  # smallest eigenvalue's share; about 0.03 at most for a curved sheet, 0.15 for points in a volume
 
 
-def find_outliers(points: Float) -> npt.NDArray[np.bool_]:
+def find_outliers(points: Float) -> Mask:
     """Return the mask, of shape (N,), of scattered points far off the surface.
 
     Parameters
@@ -56,7 +54,7 @@ def find_outliers(points: Float) -> npt.NDArray[np.bool_]:
     return outliers
 
 
-def _spacing(points: Float) -> tuple[Float, npt.NDArray[np.intp]]:
+def _spacing(points: Float) -> tuple[Float, Int]:
     """Return the mean distance to the nearest neighbours, of shape (N,), and their indices, of shape (N, k)."""
     from scipy.spatial import cKDTree
 

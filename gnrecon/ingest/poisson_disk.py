@@ -8,11 +8,9 @@ by bisection for the wanted count. Common libraries' versions are unseeded or wo
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-Float = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
+from gnrecon.geometry.arrays import Float, Int
 
 _CANDIDATES = 8  # times the wanted count; more hardly evens the result out, and the neighbour pairs grow with it
 _TOLERANCE = 0.02  # of the count, within which the search stops
@@ -20,7 +18,7 @@ _GROWTH = 1.2
 _BISECTIONS = 16
 
 
-def poisson_disk(points: Float, count: int, rng: np.random.Generator) -> Rows:
+def poisson_disk(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return `count` row indices of evenly spread points.
 
     Parameters
@@ -40,11 +38,11 @@ def poisson_disk(points: Float, count: int, rng: np.random.Generator) -> Rows:
             low, kept = middle, fewer
         else:
             high = middle
-    chosen: Rows = order[rng.permutation(kept)[:count]]
+    chosen: Int = order[rng.permutation(kept)[:count]]
     return chosen
 
 
-def poisson_disk_apart(points: Float, distance: float, rng: np.random.Generator) -> Rows:
+def poisson_disk_apart(points: Float, distance: float, rng: np.random.Generator) -> Int:
     """Return row indices of points no two of which are closer than a distance, such that no other point can be added.
 
     Parameters
@@ -54,11 +52,11 @@ def poisson_disk_apart(points: Float, distance: float, rng: np.random.Generator)
     """
     order = rng.permutation(len(points))
     tree = cKDTree(points[order])
-    chosen: Rows = order[_spread_in_turn(tree, distance)]
+    chosen: Int = order[_spread_in_turn(tree, distance)]
     return chosen
 
 
-def _spread_in_turn(tree: cKDTree, radius: float) -> Rows:
+def _spread_in_turn(tree: cKDTree, radius: float) -> Int:
     """What `_spread` returns, point by point: a wide radius has more pairs than memory can hold."""
     free = np.ones(tree.n, bool)
     kept = []
@@ -85,7 +83,7 @@ def _bracket(tree: cKDTree, count: int) -> tuple[float, float]:
     return radius / _GROWTH, radius
 
 
-def _spread(tree: cKDTree, radius: float) -> Rows:
+def _spread(tree: cKDTree, radius: float) -> Int:
     """Return the points that stay when earlier ones win against later ones within the radius."""
     pairs = tree.query_pairs(radius, output_type="ndarray")  # rows i < j
     stays = np.zeros(tree.n, bool)

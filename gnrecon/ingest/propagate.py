@@ -8,12 +8,10 @@ sparse regions mislead it.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.winding import outwardness
-
-Float = npt.NDArray[np.float64]
 
 _NEIGHBOURS = 8
 _JITTER = 1e-6  # of the extent

@@ -11,9 +11,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float, Int, Mask
 
 _NEIGHBOURS = 16
 _CLOSE = 0.02  # of the distance to the sixteenth neighbour
@@ -22,7 +21,7 @@ _SHARE = 0.05
 """Of points that have a close one, from which on the scan is repeated."""
 
 
-def repeated_points(points: Float) -> npt.NDArray[np.bool_]:
+def repeated_points(points: Float) -> Mask:
     """Return the mask, of shape (N,), of points that repeat an earlier one; none where it is not the whole scan.
 
     Parameters
@@ -47,7 +46,7 @@ def repeated_points(points: Float) -> npt.NDArray[np.bool_]:
     return mask
 
 
-def _close(tree: Any, queries: Float, count: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+def _close(tree: Any, queries: Float, count: int) -> tuple[Int, Mask]:
     """The nearest other points of each, of shape (Q, count), and which of them are as good as the same."""
     distances, neighbours = tree.query(queries, count + 1)
     return neighbours[:, 1:], distances[:, 1:] < _CLOSE * distances[:, -1:]

@@ -7,9 +7,8 @@ point's origin is not known nothing does. Such points follow the mean normal of 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float, Mask
 
 _GRAZING = float(np.sin(np.radians(10.0)))
 _NEIGHBOURS = 8
@@ -43,7 +42,7 @@ def towards_scanner(points: Float, directions: Float, origins: Float | None) -> 
     return _followed(points, normals, decided), float(decided.mean())
 
 
-def _followed(points: Float, normals: Float, decided: npt.NDArray[np.bool_]) -> Float:
+def _followed(points: Float, normals: Float, decided: Mask) -> Float:
     """Return the normals, those that are not decided with the sign of the nearest that are."""
     from scipy.spatial import cKDTree
 

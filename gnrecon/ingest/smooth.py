@@ -11,12 +11,10 @@ projections (2025.7) end the process.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.spacing import neighbour_spacing
 from gnrecon.slices import slices
-
-Float = npt.NDArray[np.float64]
 
 _LEAST = 9
 """Neighbours, the point itself included, that a quadric needs; points with fewer stay where they are."""

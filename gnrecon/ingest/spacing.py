@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float
 
 _QUERIES = 20_000
 _NEIGHBOURS = 8

@@ -5,25 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import UsageError
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.ingest.by_curvature import by_curvature
 from gnrecon.ingest.farthest import farthest_points
 from gnrecon.ingest.poisson_disk import poisson_disk, poisson_disk_apart
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.voxel import voxel_representatives, voxel_representatives_of_side
 
-Float = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
 
-
-def _random(points: Float, count: int, rng: np.random.Generator) -> Rows:
+def _random(points: Float, count: int, rng: np.random.Generator) -> Int:
     return rng.permutation(len(points))[:count]
 
 
-METHODS: dict[str, Callable[[Float, int, np.random.Generator], Rows]] = {
+METHODS: dict[str, Callable[[Float, int, np.random.Generator], Int]] = {
     "random": _random,
     "voxel": voxel_representatives,
     "poisson": poisson_disk,
@@ -31,7 +28,7 @@ METHODS: dict[str, Callable[[Float, int, np.random.Generator], Rows]] = {
     "curvature": by_curvature,
 }
 
-BY_DISTANCE: dict[str, Callable[[Float, float, np.random.Generator], Rows]] = {
+BY_DISTANCE: dict[str, Callable[[Float, float, np.random.Generator], Int]] = {
     "voxel": voxel_representatives_of_side,
     "poisson": poisson_disk_apart,
 }

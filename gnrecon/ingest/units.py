@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float
 
 _METRES = {".e57": "E57", ".ptx": "PTX", ".gltf": "glTF", ".glb": "glTF", ".las": "LAS", ".laz": "LAZ"}
 _FAR, _FAR_SHARE = 1e4, 30.0

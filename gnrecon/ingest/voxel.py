@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
+from gnrecon.geometry.arrays import Float, Int
 
 _FINEST = 2.0**-20  # of the extent: three cell numbers then fit into one 64-bit key
 _BISECTIONS = 30
 _TOLERANCE = 0.02  # of the count, within which the search stops
 
 
-def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -> Rows:
+def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return `count` row indices, each the point nearest to the mean of its cube.
 
     The cubes are the largest that give at least `count`, and the surplus is cut off at random. Points closer than a
@@ -38,7 +36,7 @@ def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -
     return rng.permutation(_nearest_to_means(points, cells))[:count]
 
 
-def voxel_representatives_of_side(points: Float, side: float, rng: np.random.Generator) -> Rows:
+def voxel_representatives_of_side(points: Float, side: float, rng: np.random.Generator) -> Int:
     """Return a row index for each occupied cube of the given side, the point nearest to the mean of those in it.
 
     Parameters
@@ -50,7 +48,7 @@ def voxel_representatives_of_side(points: Float, side: float, rng: np.random.Gen
     return _nearest_to_means(points, cells_of(points, side))
 
 
-def cells_of(points: Float, size: float) -> Rows:
+def cells_of(points: Float, size: float) -> Int:
     """Return for each point the number, from 0, of the occupied cube of side `size` that holds it; shape (N,).
 
     Cubes are no smaller than a millionth of the extent.
@@ -59,15 +57,15 @@ def cells_of(points: Float, size: float) -> Rows:
     corner = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     sides = corner.max(axis=0) + 1
     key = (corner[:, 0] * sides[1] + corner[:, 1]) * sides[2] + corner[:, 2]
-    cells: Rows = np.unique(key, return_inverse=True)[1]
+    cells: Int = np.unique(key, return_inverse=True)[1]
     return cells
 
 
-def _nearest_to_means(points: Float, cells: Rows) -> Rows:
+def _nearest_to_means(points: Float, cells: Int) -> Int:
     """Return for each cube the row of the point nearest to the mean of the cube's points."""
     sizes = np.bincount(cells)
     means = np.column_stack([np.bincount(cells, weights=points[:, axis]) / sizes for axis in range(3)])
     distances = np.linalg.norm(points - means[cells], axis=1)
     order = np.lexsort((distances, cells))
-    nearest: Rows = order[np.cumsum(sizes) - sizes]
+    nearest: Int = order[np.cumsum(sizes) - sizes]
     return nearest

@@ -9,9 +9,8 @@ outward from inward and says how far the evidence goes: it is near 1 in size onl
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float
 
 _NEIGHBOURS = 8
 _SOURCES = 4000

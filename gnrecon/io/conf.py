@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.io.beside import beside
-from gnrecon.io.contents import Contents, Float, joined
+from gnrecon.io.contents import Contents, joined
 from gnrecon.io.ply import read_ply
 from gnrecon.io.text import numbers, read_text
 

@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float, Int, Values
 
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
-Columns = Mapping[str, npt.NDArray[np.generic]]
+Columns = Mapping[str, Values]
 
 _POSITION = (("x", "y", "z"),)
 _NORMAL = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
@@ -52,7 +50,7 @@ class Contents:
     origins: Float | None = None
 
 
-def _take(columns: dict[str, npt.NDArray[np.generic]], choices: tuple[tuple[str, ...], ...]) -> Columns | None:
+def _take(columns: dict[str, Values], choices: tuple[tuple[str, ...], ...]) -> Columns | None:
     """Remove and return the first complete choice of names (case does not matter), or None."""
     for names in choices:
         spelled = {name.lower(): name for name in columns}
@@ -111,7 +109,7 @@ def joined(pieces: Sequence[Contents]) -> Contents:
     )
 
 
-def _shared(name: str, pieces: Sequence[Contents]) -> list[npt.NDArray[np.generic]] | None:
+def _shared(name: str, pieces: Sequence[Contents]) -> list[Values] | None:
     """The values of an attribute in each piece, or None where they are missing or of differing shape."""
     values = [piece.attributes[name] for piece in pieces if name in piece.attributes]
     same = len(values) == len(pieces) and len({one.shape[1:] for one in values}) == 1

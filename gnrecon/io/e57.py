@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.errors import InputError
-from gnrecon.io.contents import Columns, Contents, Float, joined, no_faces
+from gnrecon.geometry.arrays import Float, Values
+from gnrecon.io.contents import Columns, Contents, joined, no_faces
 from gnrecon.io.foreign import parsing
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -97,7 +98,7 @@ def _contents(values: dict[str, npt.NDArray[Any]], place: tuple[str, ...], heade
     normals = None
     if _NORMAL[0] in values:
         normals = np.column_stack([values[name] for name in _NORMAL]) @ rotation.T
-    attributes: dict[str, npt.NDArray[np.generic]] = dict(_colors(values, header))
+    attributes: dict[str, Values] = dict(_colors(values, header))
     attributes |= {label: values[name] for name, (label, _) in _OTHERS.items() if name in values}
     points = own @ rotation.T + translation
     origins = np.broadcast_to(translation, points.shape) if header.has_pose() else None

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
+from gnrecon.geometry.arrays import Values
 from gnrecon.io.conf import read_conf
 from gnrecon.io.contents import Contents
 from gnrecon.io.e57 import read_e57
@@ -65,8 +63,6 @@ CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".csv": write_xyz,
 }
 """Writers of vertices without faces."""
-
-Values = npt.NDArray[np.generic]
 
 
 def _color(name: str, values: Values) -> bool:

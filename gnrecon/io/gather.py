@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.io.contents import Contents, Float, joined
+from gnrecon.geometry.arrays import Float, Int
+from gnrecon.io.contents import Contents, joined
 from gnrecon.region import Region
 
 _REACH = 1 << 20
@@ -83,7 +83,7 @@ class Gatherer:
         _, rows = np.unique(keys, return_index=True)
         return kept if len(rows) == len(keys) else _selected(kept, np.sort(rows))
 
-    def _keys(self, points: Float) -> npt.NDArray[np.int64]:
+    def _keys(self, points: Float) -> Int:
         """The number of each point's cube, of shape (N,); doubles the side where the numbers are too large."""
         assert self.side is not None
         assert self._first is not None
@@ -93,11 +93,11 @@ class Gatherer:
         self.side = max(self.side, float(least))
         corner = np.floor(points / self.side - self._first / self.side)
         x, y, z = corner.astype(np.int64).T + _REACH
-        keys: npt.NDArray[np.int64] = (x << 42) | (y << 21) | z
+        keys: Int = (x << 42) | (y << 21) | z
         return keys
 
 
-def _selected(contents: Contents, rows: npt.NDArray[np.intp]) -> Contents:
+def _selected(contents: Contents, rows: Int) -> Contents:
     return replace(
         contents,
         points=contents.points[rows],

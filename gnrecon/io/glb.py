@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents
 from gnrecon.io.foreign import parsing
 from gnrecon.mesh import Mesh
@@ -43,7 +43,7 @@ _UNREAD = {
 """Words of the JSON that name what is left out."""
 
 
-def fits_glb(name: str, values: npt.NDArray[np.generic]) -> bool:
+def fits_glb(name: str, values: Values) -> bool:
     """Whether glTF can hold an attribute: finite numbers of up to four columns that float32 tells apart."""
     if name == "colors":
         return True
@@ -134,9 +134,9 @@ def _rename(names: dict[str, Any], old: str, new: str) -> None:
         names[new] = names.pop(old)
 
 
-def _attributes(parts: list[dict[str, Any]]) -> dict[str, npt.NDArray[np.generic]]:
+def _attributes(parts: list[dict[str, Any]]) -> dict[str, Values]:
     """Attributes that all parts have in the same shape."""
-    found: dict[str, npt.NDArray[np.generic]] = {}
+    found: dict[str, Values] = {}
     for name, first in parts[0].items():
         values = [np.asarray(part[name]) for part in parts if name in part]
         if len(values) < len(parts) or any(one.shape[1:] != first.shape[1:] for one in values):

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Mask, Values
 from gnrecon.io.contents import Columns, Contents, from_columns, joined
 from gnrecon.io.foreign import parsing
 
@@ -103,7 +103,7 @@ def settled(contents: Contents) -> Contents:
 def _contents(chunk: Any) -> Contents:
     names = [name for name in chunk.point_format.dimension_names if name not in _SKIPPED]
     used = np.asarray(chunk.withheld) == 0
-    columns: dict[str, npt.NDArray[np.generic]] = {axis: np.asarray(getattr(chunk, axis))[used] for axis in "xyz"}
+    columns: dict[str, Values] = {axis: np.asarray(getattr(chunk, axis))[used] for axis in "xyz"}
     columns |= {name: np.asarray(chunk[name])[used] for name in names}
     found = from_columns(columns)
     dropped = len(used) - int(used.sum())
@@ -116,7 +116,7 @@ def _contents(chunk: Any) -> Contents:
     )
 
 
-def _colors(chunk: Any, used: npt.NDArray[np.bool_]) -> Columns:
+def _colors(chunk: Any, used: Mask) -> Columns:
     if "red" not in chunk.point_format.dimension_names:
         return {}
     return {"colors": np.column_stack([np.asarray(chunk[name])[used] for name in ("red", "green", "blue")])}

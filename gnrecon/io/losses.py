@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.errors import OutputError
+from gnrecon.geometry.arrays import Float, Values
 from gnrecon.mesh import Mesh
-
-Values = npt.NDArray[np.generic]
 
 _DIGITS = 4 * np.finfo(np.float64).eps
 """Rounding that the same numbers in another frame have anyway, as a share of the largest coordinate."""

@@ -9,17 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan, not_triangles
 from gnrecon.io.text import format_rows, read_text, rows_of
 from gnrecon.mesh import Mesh
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 
 _UNREAD = {
     "vt": "texture coordinates",

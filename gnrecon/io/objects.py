@@ -13,6 +13,7 @@ import numpy.typing as npt
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.io.contents import from_columns
 from gnrecon.mesh import Mesh
 
@@ -173,7 +174,7 @@ def _column(values: Any) -> npt.NDArray[Any]:
     return column
 
 
-def _array(obj: Any, expected: str = _POINTS) -> npt.NDArray[np.float64]:
+def _array(obj: Any, expected: str = _POINTS) -> Float:
     if hasattr(obj, "detach"):  # a torch tensor, on whatever device
         obj = obj.detach().cpu().numpy()
     try:
@@ -182,7 +183,7 @@ def _array(obj: Any, expected: str = _POINTS) -> npt.NDArray[np.float64]:
         raise InputError(f"Expected {expected}, but got {type(obj).__name__}.") from None
 
 
-def _from_array(rows: npt.NDArray[np.float64]) -> PointCloud:
+def _from_array(rows: Float) -> PointCloud:
     if rows.ndim != 2 or rows.shape[1] not in (3, 6):
         raise InputError(f"Expected points of shape (N, 3) or (N, 6), but got {rows.shape}.")
     return PointCloud(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)

@@ -11,11 +11,9 @@ from __future__ import annotations
 import re
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
-
-Float = npt.NDArray[np.float64]
 
 HEADER = 80
 """Bytes of an STL's header."""

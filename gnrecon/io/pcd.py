@@ -11,9 +11,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.text import numbers
 
@@ -41,7 +41,7 @@ def read_pcd(path: Path) -> Contents:
     _require_all(header, body, declared)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, format="pcd")
-    arrays: dict[str, npt.NDArray[np.generic]] = {name: cloud.point[name].numpy() for name in cloud.point}
+    arrays: dict[str, Values] = {name: cloud.point[name].numpy() for name in cloud.point}
     points = arrays.pop("positions", np.empty((0, 3)))
     if len(points) != declared:
         raise InputError(f"the header declares {declared} points, but {len(points)} could be read.")

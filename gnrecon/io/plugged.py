@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.errors import InputError, OutputError
+from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, WRITERS
 from gnrecon.io.objects import as_shape
@@ -23,8 +24,6 @@ from gnrecon.mesh import Mesh
 from gnrecon.plugins import READERS as READER_GROUP
 from gnrecon.plugins import WRITERS as WRITER_GROUP
 from gnrecon.plugins import Plugin, find, installed
-
-Values = npt.NDArray[np.generic]
 
 
 def is_readable(extension: str) -> bool:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Int, Values
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.ply_columns import vertex_columns
 from gnrecon.io.ply_header import ORDERS, PLY_TYPES, Element, Property, parse_header, too_short
@@ -22,14 +22,12 @@ from gnrecon.io.polygons import fan, not_triangles
 from gnrecon.io.text import numbers
 from gnrecon.mesh import Mesh
 
-Int = npt.NDArray[np.int64]
-
 
 @dataclass
 class _Rows:
     """Values of one element: scalar columns of shape (count,), lists as (lengths, values in a row)."""
 
-    scalars: dict[str, npt.NDArray[np.generic]]
+    scalars: dict[str, Values]
     lists: dict[str, tuple[Int, Int]]
 
 
@@ -88,15 +86,17 @@ def _walk(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Ro
             raise too_short(element, (len(buffer) - offset) // layout.itemsize)
         table = np.frombuffer(buffer[offset:end], layout)
     scalars = {p.name: _native(table[p.name], p, order) for p in element.properties if not p.count_type}
-    found = {p.name: (table[f"#{p.name}"].astype(np.int64), _indices(table[p.name]).ravel()) for p in lists}
+    found: dict[str, tuple[Int, Int]] = {
+        p.name: (table[f"#{p.name}"].astype(np.int64), _indices(table[p.name]).ravel()) for p in lists
+    }
     return _Rows(scalars, found), end
 
 
 def _walk_slowly(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
     """Walk row by row, for lists of differing lengths."""
-    scalars: dict[str, list[npt.NDArray[np.generic]]] = {p.name: [] for p in element.properties if not p.count_type}
+    scalars: dict[str, list[Values]] = {p.name: [] for p in element.properties if not p.count_type}
     counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
-    items: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in counts}
+    items: dict[str, list[Values]] = {name: [] for name in counts}
     for row in range(element.count):
         try:
             for prop in element.properties:
@@ -113,7 +113,9 @@ def _walk_slowly(buffer: bytes, offset: int, element: Element, order: str) -> tu
             raise too_short(element, row) from None
     by_name = {prop.name: prop for prop in element.properties}
     columns = {name: _native(np.array(values), by_name[name], order) for name, values in scalars.items()}
-    lists = {name: (np.array(counts[name], np.int64), _indices(np.concatenate(items[name]))) for name in counts}
+    lists: dict[str, tuple[Int, Int]] = {
+        name: (np.array(counts[name], np.int64), _indices(np.concatenate(items[name]))) for name in counts
+    }
     return _Rows(columns, lists), offset
 
 
@@ -159,7 +161,7 @@ def _layout(element: Element, order: str, lengths: dict[str, int]) -> np.dtype[n
     return np.dtype(fields)
 
 
-def _native(values: npt.NDArray[np.generic], prop: Property, order: str) -> npt.NDArray[np.generic]:
+def _native(values: Values, prop: Property, order: str) -> Values:
     """Return a column in this machine's byte order; text keeps all digits even where the header says float."""
     if not order and prop.type.startswith("f"):
         return values.astype(np.float64)
@@ -167,7 +169,7 @@ def _native(values: npt.NDArray[np.generic], prop: Property, order: str) -> npt.
         return values.astype(prop.type)
 
 
-def _indices(values: npt.NDArray[np.generic]) -> Int:
+def _indices(values: Values) -> Int:
     with np.errstate(invalid="ignore"):  # an index that is no number becomes one out of range, refused by Mesh
         return values.astype(np.int64)
 

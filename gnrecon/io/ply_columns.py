@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.colors import as_bytes
+from gnrecon.geometry.arrays import Values
 from gnrecon.mesh import Mesh
 
-Values = npt.NDArray[np.generic]
 Column = tuple[str, str, Values]
 """Name, PLY's name of the type, and values of shape (V,)."""
 

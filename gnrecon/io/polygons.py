@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Int = npt.NDArray[np.int64]
+from gnrecon.geometry.arrays import Int
 
 
 def fan(counts: Int, corners: Int) -> Int:

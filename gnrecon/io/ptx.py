@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.io.contents import Contents, joined, no_faces
 from gnrecon.io.text import numbers
-
-Float = npt.NDArray[np.float64]
 
 _POSE_LINES = 8
 _COLORS = slice(4, 7)
@@ -99,10 +97,10 @@ def _table(file: IO[str], count: int, number: int) -> Float:
     return table
 
 
-def _contents(table: Float, places: npt.NDArray[np.int64], height: int, matrix: Float) -> Contents:
+def _contents(table: Float, places: Int, height: int, matrix: Float) -> Contents:
     seen = (table[:, :3] != 0).any(axis=1)
     table, places = table[seen], places[seen]
-    attributes: dict[str, npt.NDArray[np.generic]] = {"intensity": table[:, 3]}
+    attributes: dict[str, Values] = {"intensity": table[:, 3]}
     if table.shape[1] == 7:
         attributes["colors"] = np.clip(np.nan_to_num(table[:, _COLORS]), 0, 255).astype(np.uint8)
     attributes |= {"row": (places % height).astype(np.int32), "column": (places // height).astype(np.int32)}

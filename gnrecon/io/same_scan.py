@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gnrecon.io.contents import Float
+from gnrecon.geometry.arrays import Float
 
 _LEAST = 25
 """Points below which moments may agree by chance."""

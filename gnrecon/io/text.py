@@ -7,11 +7,10 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float, Values
 
-Float = npt.NDArray[np.float64]
 _ROWS_AT_A_TIME = 100_000
 
 
@@ -70,7 +69,7 @@ def _first_bad(words: Sequence[str]) -> str:
     raise AssertionError("called for words of which one is no number")
 
 
-def format_rows(template: str, rows: npt.NDArray[np.generic]) -> list[str]:
+def format_rows(template: str, rows: Values) -> list[str]:
     """Return text blocks in which `template`, such as ``"v %r %r %r\\n"``, is filled in once for each row.
 
     ``%r`` writes the shortest digits that read back as the same float64. One format operation covers a block of rows,

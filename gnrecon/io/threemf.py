@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.colors import as_bytes, with_alpha
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.io.text import format_rows
 from gnrecon.mesh import Mesh
 
@@ -86,12 +87,12 @@ def _model(mesh: Mesh) -> Iterator[str]:
     yield f'<build>\n<item objectid="{_OBJECT}"{item}/>\n</build>\n</model>\n'
 
 
-def _palette(colors: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.intp]]:
+def _palette(colors: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint32], Int]:
     """Different colours as RGBA numbers, and for each row of `colors`, of shape (V, 4), which of them it is."""
     return np.unique(np.ascontiguousarray(colors).view(">u4")[:, 0].astype(np.uint32), return_inverse=True)
 
 
-def _shift(mesh: Mesh) -> npt.NDArray[np.float64]:
+def _shift(mesh: Mesh) -> Float:
     """What is taken from the coordinates, of shape (3,): nothing, unless float32 would spoil them."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     rounding = float(np.abs(mesh.vertices).max()) * float(np.finfo(np.float32).eps)

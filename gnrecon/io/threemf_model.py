@@ -16,15 +16,14 @@ from typing import IO
 from xml.parsers import expat
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.io.contents import Contents
 from gnrecon.io.text import numbers
 from gnrecon.io.threemf import MODEL_TYPE
 from gnrecon.mesh import Mesh
 
-Float = npt.NDArray[np.float64]
 Key = tuple[str, str]
 """A resource: the part of the archive that holds it, and its number there."""
 

@@ -14,9 +14,10 @@ from urllib.parse import unquote
 import numpy as np
 
 from gnrecon.errors import InputError
-from gnrecon.io.contents import Contents, Float, Int, no_faces
+from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.text import numbers
-from gnrecon.io.vtk_data import Values, assemble, split_counts, triangles
+from gnrecon.io.vtk_data import assemble, split_counts, triangles
 
 _TYPES = {
     **{"unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4"},
@@ -155,7 +156,7 @@ def _cells(source: _Source, words: list[str], data: _Data) -> None:
         following = source.words()
         if following[:1] != ["CONNECTIVITY"]:
             raise InputError("expected the line CONNECTIVITY behind the offsets.")
-        corners = source.numbers(size, _word(following, 1)).astype(np.int64)
+        corners: Int = source.numbers(size, _word(following, 1)).astype(np.int64)
         counts = split_counts(offsets, corners)
     else:
         source.place = start

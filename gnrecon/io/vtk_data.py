@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
-from gnrecon.io.contents import Contents, Float, Int, no_faces
+from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan
-
-Values = npt.NDArray[np.generic]
 
 
 def assemble(

@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.atomic import atomic_write
 from gnrecon.cloud import PointCloud
 from gnrecon.errors import MeshError, UsageError
+from gnrecon.geometry.arrays import Float, Values
 from gnrecon.io.contents import no_faces
 from gnrecon.io.formats import CLOUD_WRITERS, HOLDS
 from gnrecon.io.origin import far_origin, rounding, told
@@ -94,7 +94,7 @@ def write_cloud(
         CLOUD_WRITERS[extension](Mesh(cloud.points, no_faces(), cloud.normals, cloud.attributes), temporary)
 
 
-def holds(path: str | Path, name: str, values: npt.NDArray[np.generic]) -> bool:
+def holds(path: str | Path, name: str, values: Values) -> bool:
     """Whether the format that the path's extension names can hold such an attribute of vertices.
 
     Raises
@@ -105,7 +105,7 @@ def holds(path: str | Path, name: str, values: npt.NDArray[np.generic]) -> bool:
     return _holds(check_writable(path), name, values)
 
 
-def written_origin(mesh: Mesh, path: str | Path) -> npt.NDArray[np.float64] | None:
+def written_origin(mesh: Mesh, path: str | Path) -> Float | None:
     """Return the origin, of shape (3,), that coordinates are relative to in a mesh's file; None for the mesh's own."""
     return far_origin(mesh) if Path(path).suffix.lower() == ".stl" else None
 
@@ -141,12 +141,12 @@ def _writer(path: str | Path) -> tuple[str, Callable[[Mesh, Path], None]]:
     return extension, write
 
 
-def _holds(extension: str, name: str, values: npt.NDArray[np.generic]) -> bool:
+def _holds(extension: str, name: str, values: Values) -> bool:
     """Whether a format can hold an attribute; what other packages' formats hold is their own affair."""
     return extension not in HOLDS or HOLDS[extension](name, values)
 
 
-def _lost(mesh: Mesh, held: Mapping[str, npt.NDArray[np.generic]], extension: str) -> list[str]:
+def _lost(mesh: Mesh, held: Mapping[str, Values], extension: str) -> list[str]:
     """Return a sentence about attributes that the format has no place for."""
     lost = [name for name in mesh.attributes if name not in held]
     if not lost:

@@ -12,15 +12,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.ply_columns import vertex_columns
 from gnrecon.io.text import read_text
 from gnrecon.mesh import Mesh
-
-Float = npt.NDArray[np.float64]
 
 _COMMENTS = ("#", "//", ";", "%")
 _SEPARATORS = re.compile(r"[\s,;]+")

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.levelset.critical import refined
 from gnrecon.levelset.level_set import LevelSet
-from gnrecon.levelset.persistence import Int, Separate, separate_components
-from gnrecon.sampling import Box, Mask
+from gnrecon.levelset.persistence import Separate, separate_components
+from gnrecon.sampling import Box
 
 CELLS = 64
 

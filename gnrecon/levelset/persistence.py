@@ -19,11 +19,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.cloud import Float
-
-Int = npt.NDArray[np.int64]
+from gnrecon.geometry.arrays import Float, Int
 
 
 class Separate(NamedTuple):

@@ -17,18 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.levelset.crossings import Crossings, find_crossings
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.newton import project
 from gnrecon.levelset.spread import repel, walk
 from gnrecon.sampling import Box, halved
-
-Places = npt.NDArray[np.int64]
 
 NODES = 100_000
 _SWEEPS = 3
@@ -79,16 +76,16 @@ def sample_surface(
     return _arrived(level_set, points, crossings.spacing, area)
 
 
-def systematic(crossings: Crossings, box: Box, count: int, rng: np.random.Generator) -> Places:
+def systematic(crossings: Crossings, box: Box, count: int, rng: np.random.Generator) -> Int:
     """Return `count` row numbers of crossings, drawn by their areas at equal steps along a space-filling curve."""
     order = np.argsort(_curve(crossings.points.cpu().numpy(), box), kind="stable")
     reached = np.cumsum(crossings.areas.cpu().numpy()[order])
     marks = (np.arange(count) + rng.uniform()) * (reached[-1] / count)
-    chosen: Places = order[np.minimum(np.searchsorted(reached, marks), len(order) - 1)]
+    chosen: Int = order[np.minimum(np.searchsorted(reached, marks), len(order) - 1)]
     return chosen
 
 
-def _curve(points: Float, box: Box) -> Places:
+def _curve(points: Float, box: Box) -> Int:
     """Return the place of each point, of shape (N, 3), along Morton's curve of 1,024 cells a side, of shape (N,)."""
     cells = ((points - box.lower) / (box.upper - box.lower) * 1023).astype(np.int64)
     place = np.zeros(len(points), np.int64)

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.newton import newton_step
 from gnrecon.sampling import Box

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.histogram import Histogram
 from gnrecon.mesh import Mesh
 from gnrecon.page.numbers import figure

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.export import lighten, vertex_sky
+from gnrecon.geometry.arrays import Float, Values
 from gnrecon.mesh import Mesh
 from gnrecon.page.layers import Layer
 from gnrecon.page.ramps import ramp
@@ -86,13 +87,13 @@ def model(mesh: Mesh, cloud: PointCloud | None, shown: Sequence[Layer], solid: b
     return Model(buffers, scene)
 
 
-def pack(values: npt.NDArray[np.generic]) -> str:
+def pack(values: Values) -> str:
     """Return an array's bytes, compressed by zlib, in base64."""
     return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 6)).decode("ascii")
 
 
-def _attributes(mesh: Mesh, shown: Sequence[Layer]) -> dict[str, npt.NDArray[np.generic]]:
-    kept: dict[str, npt.NDArray[np.generic]] = {layer.name: layer.values for layer in shown}
+def _attributes(mesh: Mesh, shown: Sequence[Layer]) -> dict[str, Values]:
+    kept: dict[str, Values] = {layer.name: layer.values for layer in shown}
     if "colors" in mesh.attributes:
         kept["colors"] = mesh.attributes["colors"]
     return kept
@@ -105,7 +106,7 @@ def _shape(mesh: Mesh) -> npt.NDArray[np.int16]:
     return numbers
 
 
-def _values(values: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
+def _values(values: Values) -> npt.NDArray[np.float32]:
     numbers = values.astype(np.float64)
     single: npt.NDArray[np.float32] = np.where(np.isfinite(numbers), np.clip(numbers, -1e38, 1e38), NO_VALUE).astype(
         "<f4"
@@ -113,7 +114,7 @@ def _values(values: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
     return single
 
 
-def _rgba(colors: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
+def _rgba(colors: Values) -> npt.NDArray[np.uint8]:
     """8-bit colours of shape (N, 4), because graphics cards want rows of four bytes."""
     rgba = np.full((len(colors), 4), 255, dtype=np.uint8)
     rgba[:, :3] = as_bytes(colors)[:, :3]

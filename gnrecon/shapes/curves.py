@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import Float
 from gnrecon.errors import UsageError
+from gnrecon.geometry.arrays import Float
 from gnrecon.residuals import SecondOrder, eikonal, interface
 from gnrecon.sampling import Box
 from gnrecon.shapes.problem import ShapeProblem, Start, plane_through

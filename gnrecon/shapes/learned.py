@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float, Frame
+from gnrecon.cloud import Frame
 from gnrecon.errors import MeshError
 from gnrecon.export import extract, project
 from gnrecon.export.clip import clip
 from gnrecon.field import Network
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 from gnrecon.sampling import Box
 

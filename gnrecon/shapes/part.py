@@ -30,10 +30,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gnrecon.cloud import Float
 from gnrecon.design import Design, InterfaceSample
 from gnrecon.field import Network
 from gnrecon.field.activation import WAVELET
+from gnrecon.geometry.arrays import Float
 from gnrecon.levelset import Beside, Joints, LevelSet, Region, joints
 from gnrecon.linalg import Averaged, identity
 from gnrecon.optim import GainRatioDamping

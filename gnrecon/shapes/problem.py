@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Float
 from gnrecon.field import TANH, Network
+from gnrecon.geometry.arrays import Float
 from gnrecon.levelset import KnownSurface, LevelSet
 from gnrecon.linalg import Iterative, LinearSolver, Neighbours, identity
 from gnrecon.optim import GainRatioDamping, Search

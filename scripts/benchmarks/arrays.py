@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.problem import Problem
-from gnrecon.cloud import Float, Frame, PointCloud
+from gnrecon.cloud import Frame, PointCloud
 from gnrecon.errors import InputError
+from gnrecon.geometry.arrays import Float
 from gnrecon.io import read_mesh
 from gnrecon.mesh import Mesh
 

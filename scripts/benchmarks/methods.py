@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.peers import load_apss, load_ball_pivoting, load_meshlab_poisson, load_poisson, load_rimls
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 Method = Callable[..., tuple[Mesh, dict[str, Any]]]

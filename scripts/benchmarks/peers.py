@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 Answer = tuple[Mesh, dict[str, Any]]

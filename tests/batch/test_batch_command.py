@@ -30,7 +30,7 @@ from gnrecon.cli import main
 from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.export import verify_file
 from gnrecon.schema import report_schema
-from gnrecon.settings import Settings, read_settings, read_settings
+from gnrecon.settings import Settings, read_settings
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
 WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")

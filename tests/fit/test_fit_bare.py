@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from made_shapes import bored_plate, cube
 
-from gnrecon.cloud import Float
 from gnrecon.fit.bare import laid_bare
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.normals import oriented_normals
 
 NOISE = 0.002

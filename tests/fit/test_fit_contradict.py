@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.cloud import Frame, Samples
 from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.options import FitOptions
+from gnrecon.geometry.arrays import Float
 
 OPTIONS = FitOptions(quality="draft")
 

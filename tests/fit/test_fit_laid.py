@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from made_shapes import bored_plate
 
-from gnrecon.cloud import Float
 from gnrecon.fit.laid import Laid, laid
 from gnrecon.fit.sharp import AVERAGING
+from gnrecon.geometry.arrays import Float
 
 SIDE, HEIGHT, BORE, NOISE = 0.7, 0.2, 0.12, 0.006
 

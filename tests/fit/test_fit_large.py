@@ -19,7 +19,6 @@ from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Frame, Samples
 from gnrecon.errors import Cancelled, FitError, MemoryLimitError, UsageError
 from gnrecon.field.detail import Detail
-from gnrecon.field.partition import Int
 from gnrecon.field.siren import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
 from gnrecon.fit.averaged import Told
@@ -28,6 +27,7 @@ from gnrecon.fit.detail import CHOSEN, fit_detail
 from gnrecon.fit.options import QUALITIES
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.work import Work
+from gnrecon.geometry.arrays import Int
 from gnrecon.options import Options
 from gnrecon.sampling import Box
 

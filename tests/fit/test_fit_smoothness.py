@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.cloud import Frame, Samples
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.smoothness import LENGTHS, REACHES, Smoothness, global_smoothness
+from gnrecon.geometry.arrays import Float
 
 FRAME = Frame(np.zeros(3), 1.0)
 

@@ -8,9 +8,10 @@ import pytest
 from made_shapes import bored_plate
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Float, Frame, Samples
+from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.spread import MOST, spread
+from gnrecon.geometry.arrays import Float
 from gnrecon.sampling import Density
 
 SIDE, HEIGHT, BORE = 0.7, 0.2, 0.25

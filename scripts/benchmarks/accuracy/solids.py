@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from sample_shapes import Distance, gradient, project, smooth_cut
 
-from gnrecon.cloud import Float, Frame
+from gnrecon.cloud import Frame
 from gnrecon.export import extract
 from gnrecon.export.metrics import sample_surface
+from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 
 FINE = 0.02

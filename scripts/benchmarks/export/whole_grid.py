@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Float
 from gnrecon.export import SignedDistance, extract
 from gnrecon.export.band import narrow_band
-from gnrecon.export.lattice import Int, Lattice
+from gnrecon.export.lattice import Lattice
 from gnrecon.fit import NeuralSDF
+from gnrecon.geometry.arrays import Float, Int
 from gnrecon.mesh import Mesh
 
 TOLERANCE = 1e-4

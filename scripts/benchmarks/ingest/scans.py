@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Float
+from gnrecon.geometry.arrays import Float
 from gnrecon.io.text import format_rows
 
 BLOCK = 1_000_000

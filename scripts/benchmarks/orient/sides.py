@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.peers import oriented
 from benchmarks.problem import Problem
-from gnrecon.cloud import Float
 from gnrecon.export.nearest import Surface
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest import oriented_normals
 from gnrecon.mesh import Mesh
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gnrecon.cloud import Float, Frame
+from gnrecon.cloud import Frame
+from gnrecon.geometry.arrays import Float
 
 STEP = 1e-6
 

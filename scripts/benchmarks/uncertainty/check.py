@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from benchmarks.uncertainty.scans import Case, draw, errors
-from gnrecon.cloud import Float, PointCloud
+from gnrecon.cloud import PointCloud
+from gnrecon.geometry.arrays import Float
 from gnrecon.pipeline import Reconstruction, reconstruct
 
 FAR = 2.0

@@ -11,8 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.uncertainty.check import Check
 from gnrecon.atomic import atomic_write
-from gnrecon.cloud import Float
 from gnrecon.export import render
+from gnrecon.geometry.arrays import Float
 
 PANEL = (420, 400)
 """Width and height of a panel, in pixels."""
