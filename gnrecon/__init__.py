@@ -14,8 +14,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gnrecon.cloud import Frame, PointCloud, Samples
-from gnrecon.errors import Cancelled, FitError, GnreconError, InputError, MeshError, OutputError, UsageError
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import Cancelled, FitError, GnreconError, InputError, MeshError, OutputError, UsageError
 from gnrecon.version import __version__
 
 if TYPE_CHECKING:

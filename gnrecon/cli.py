@@ -1,7 +1,7 @@
 """The command line: ``gnrecon scan.ply -o mesh.obj``, and the other commands by their names.
 
 A first word that names no command is a scan. Results go to files, figures that were asked for to stdout, everything
-else to stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon.errors`.
+else to stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon.runtime.errors`.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ from gnrecon.arguments import (
     Widths,
     WorkDir,
 )
-from gnrecon.errors import ExitCode, failure
+from gnrecon.runtime.errors import ExitCode, failure
 from gnrecon.version import __version__
 
 # Newer versions of typer carry their own click, older ones import it: this is the base of whichever is in use.

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Int, Mask, Values
+from gnrecon.runtime.errors import InputError
 
 
 def _as_rows(name: str, values: npt.ArrayLike) -> Float:

@@ -141,11 +141,11 @@ def check_package(distribution: str, module: str) -> Check:
 
 def check_plugins() -> list[Check]:
     """Return, for each reader, writer and residual that other packages bring, whether it can be loaded."""
-    from gnrecon.plugins import KINDS, installed
+    from gnrecon.runtime.plugins import KINDS, installed
 
     checks = []
     for plugin in (plugin for group in KINDS for plugin in installed(group)):
-        code = f"from gnrecon.plugins import find; find({plugin.group!r}, {plugin.entry.name!r}).load()"
+        code = f"from gnrecon.runtime.plugins import find; find({plugin.group!r}, {plugin.entry.name!r}).load()"
         ok, said = run_python(code)
         remedy = "" if ok else f"Mend or uninstall {plugin.package}."
         checks.append(Check(f"{KINDS[plugin.group]} {plugin.entry.name}", ok, plugin.package if ok else said, remedy))

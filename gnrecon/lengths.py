@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 
-from gnrecon.errors import UsageError
+from gnrecon.runtime.errors import UsageError
 
 METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 

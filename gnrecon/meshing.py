@@ -13,7 +13,6 @@ from typing import Protocol
 
 import numpy as np
 
-from gnrecon.advance import Advance, part, unheard
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.export.protocol import sdf_and_gradient
@@ -21,6 +20,7 @@ from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 from gnrecon.options import Options
+from gnrecon.runtime.progress import Advance, part, unheard
 
 _log = logging.getLogger(__name__)
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.errors import UsageError
 from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.large import LARGE
@@ -20,6 +19,7 @@ from gnrecon.ingest.spacing import neighbour_spacing
 from gnrecon.io import MOST_POINTS
 from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.region import Region
+from gnrecon.runtime.errors import UsageError
 
 RESOLUTION, FEWEST_CELLS, MOST_CELLS = 256, 128, 1024
 """Cells where nothing else is known; the fewest that a sparse scan and the most that a large one gets by itself."""

@@ -18,7 +18,6 @@ import torch
 
 from gnrecon.adorn import Sources, adorn, fitting, wanted
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.export import (
     Attribute,
     Invented,
@@ -50,15 +49,16 @@ from gnrecon.io import (
     to_trimesh,
     write_mesh,
 )
-from gnrecon.logs import TOLD
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
 from gnrecon.region import Region
 from gnrecon.report import Stages, plain, versions
+from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
+from gnrecon.runtime.logs import TOLD
+from gnrecon.runtime.parallel import having_threads
 from gnrecon.schema import SCHEMA_VERSION
-from gnrecon.threads import having_threads
 from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ def reconstruct(
     Raises
     ------
     UsageError, InputError, FitError, MeshError, MemoryLimitError
-        See `gnrecon.errors`; each says in one sentence what is wrong.
+        See `gnrecon.runtime.errors`; each says in one sentence what is wrong.
     """
     chosen = Options.of(**options)
     require_device(chosen.device)

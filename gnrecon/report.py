@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from gnrecon.memory import PeakMemory, process_peak_mb
+from gnrecon.runtime.memory import PeakMemory, process_peak_mb
 from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)

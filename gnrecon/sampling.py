@@ -20,8 +20,7 @@ import numpy as np
 import torch
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.slices import slices
-from gnrecon.threads import abreast
+from gnrecon.runtime.parallel import abreast, slices
 
 _SOURCES = 4000
 _NEIGHBOURS = 8

@@ -21,8 +21,8 @@ from typing import Any
 
 import tomli_w
 
-from gnrecon.errors import InputError, UsageError
 from gnrecon.options import Options
+from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.values import typed
 from gnrecon.version import __version__
 

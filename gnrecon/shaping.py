@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.advance import Advance, unheard
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.cut import crop, subtract
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.export.offset import OffsetField
@@ -20,6 +18,8 @@ from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
 from gnrecon.meshing import StageTimer, mesh_field, untimed
 from gnrecon.options import Options
+from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.progress import Advance, unheard
 
 MARGIN = 3
 """Cells beyond a crop that are meshed too, so that what closes the surface there is cut away."""

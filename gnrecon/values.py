@@ -7,8 +7,8 @@ import types
 from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from gnrecon.errors import UsageError
 from gnrecon.options import Options
+from gnrecon.runtime.errors import UsageError
 
 _WORDS = {
     bool: "true or false",

@@ -9,7 +9,7 @@ from mmap import MAP_ANONYMOUS, MAP_PRIVATE, PAGESIZE, mmap
 import numpy as np
 import psutil
 
-from gnrecon import memory
+from gnrecon.runtime import memory
 
 
 def use(mb: float) -> None:

@@ -12,9 +12,9 @@ from scan_files import TUBE, torus
 
 from gnrecon.adorn import wanted
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import FitError, UsageError
 from gnrecon.io import read_mesh
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.runtime.errors import FitError, UsageError
 
 FAST = {"widths": (300,), "steps": 0, "resolution": 32}
 

@@ -35,10 +35,10 @@ from benchmarks.samples_apart import between_samples
 from benchmarks.trial import Job, run_trial
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.export import require_sound, verify
 from gnrecon.export.nearest import Surface
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 NOWHERE = Path("nowhere")
 VOLUMES = {

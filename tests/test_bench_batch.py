@@ -16,8 +16,8 @@ from benchmarks.batch.witness import Witness
 
 from gnrecon.batch.find import Search, find_scans
 from gnrecon.batch.job import PROGRESS, running_folder
-from gnrecon.errors import ExitCode, InputError
 from gnrecon.io import read_cloud
+from gnrecon.runtime.errors import ExitCode, InputError
 from gnrecon.settings import read_settings
 
 GOOD = {"exit_code": 8, "meshes": 4, "causes": BROKEN, "twice": [], "same_bytes": True, "seconds": 60.0}

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 from benchmarks.blocks.main import main as blocks
 from benchmarks.blocks.scan import Ball
 
-from gnrecon.errors import ExitCode, OutputError, UsageError
+from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 
 
 def test_exact_points_lie_on_the_surface_with_its_normals() -> None:

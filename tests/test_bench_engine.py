@@ -34,9 +34,9 @@ from benchmarks.engine.step import Frozen, freeze, measure_step
 from benchmarks.engine.tables import tables
 from PIL import Image
 
-from gnrecon.errors import GnreconError
 from gnrecon.field import Siren
 from gnrecon.linalg import SOLVERS, Cholesky, identity
+from gnrecon.runtime.errors import GnreconError
 
 NET = (8, 8)
 GOAL = Goal("rockerarm-100", 1e-2, 1e-3)

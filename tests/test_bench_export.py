@@ -21,11 +21,11 @@ from benchmarks.export.main import sentences
 from benchmarks.export.whole_grid import compare, same_surface
 
 from gnrecon.cloud import Frame
-from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.export import extract
 from gnrecon.field import Siren
 from gnrecon.fit import NeuralSDF
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.sampling import Box
 
 

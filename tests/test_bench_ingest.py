@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 from benchmarks.ingest.main import main as ingest
 from benchmarks.ingest.scans import WRITERS
 
-from gnrecon.errors import ExitCode, OutputError, UsageError
 from gnrecon.io import read_cloud
+from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 
 
 def test_every_format_holds_the_same_points(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from benchmarks.orient.sides import sides, true_normals
 from benchmarks.problem import Problem
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import ExitCode, UsageError
+from gnrecon.runtime.errors import ExitCode, UsageError
 
 NOWHERE = Path("nowhere")
 

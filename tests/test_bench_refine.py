@@ -11,8 +11,8 @@ from benchmarks.__main__ import main as bench
 from benchmarks.refine import main as refine_bench
 from benchmarks.refine.shapes import SHAPES
 
-from gnrecon.errors import ExitCode
 from gnrecon.export import extract, verify
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from benchmarks.__main__ import main as bench
 
-from gnrecon.errors import ExitCode
 from gnrecon.field import TANH, Network
+from gnrecon.runtime.errors import ExitCode
 from gnrecon.shapes import PROBLEMS, catenoid, pretrain
 
 

@@ -18,9 +18,9 @@ from markupsafe import escape
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, sphere, start, torus, wait_for, write_scan
 
 from gnrecon.cli import main
-from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
 from gnrecon.io import read_mesh
+from gnrecon.runtime.errors import ExitCode
 from gnrecon.version import __version__
 
 Here = Callable[..., subprocess.CompletedProcess[str]]

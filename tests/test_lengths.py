@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.errors import UsageError
 from gnrecon.lengths import METRES, parse_box, parse_length
+from gnrecon.runtime.errors import UsageError
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ import pytest
 from scan_files import torus, write_scan
 
 from gnrecon.cli import main
-from gnrecon.errors import Cancelled, ExitCode
 from gnrecon.pipeline import Progress, reconstruct
+from gnrecon.runtime.errors import Cancelled, ExitCode
 
 FEW: dict[str, Any] = {"widths": (150,), "steps": 1, "resolution": 24}
 WORDS = ("--widths", "150", "--steps", "1", "--resolution", "24")
@@ -88,7 +88,7 @@ def test_a_log_is_appended_to_and_ends_with_the_failure(
     (tmp_path / "bad.xyz").write_text("1 2 3\n")
     assert run(tmp_path / "bad.xyz", "-o", tmp_path / "other.obj", "--log", log, *WORDS) == ExitCode.INPUT
     assert log.read_text().startswith(first)
-    assert "ERROR gnrecon.logs: InputError: Only 1 of 1 points" in log.read_text()
+    assert "ERROR gnrecon.runtime.logs: InputError: Only 1 of 1 points" in log.read_text()
     assert "Traceback" in log.read_text()
     # Nothing is left behind in this process.
     assert [type(handler) for handler in logging.getLogger("gnrecon").handlers] == [logging.NullHandler]

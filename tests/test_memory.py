@@ -8,8 +8,8 @@ from threading import Barrier, Thread
 import pytest
 from held_memory import resident, use
 
-from gnrecon import memory
-from gnrecon.memory import PeakMemory, process_peak_mb
+from gnrecon.runtime import memory
+from gnrecon.runtime.memory import PeakMemory, process_peak_mb
 
 SLACK = 12.0  # MB that the interpreter, the allocator and other threads may take meanwhile
 

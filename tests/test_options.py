@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from gnrecon.cli import batch_command, parse_widths, reconstruct_command
-from gnrecon.errors import UsageError
 from gnrecon.export import RefineOptions
 from gnrecon.fit import FitOptions
 from gnrecon.ingest import prepare
 from gnrecon.options import Options
+from gnrecon.runtime.errors import UsageError
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,11 @@ from scan_files import FAST, TORUS_VOLUME, TUBE, box, gnrecon, sphere, torus, wr
 from scipy.spatial.transform import Rotation
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, MemoryLimitError, MeshError, UsageError
 from gnrecon.export import measure
 from gnrecon.mesh import Mesh
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.runtime.errors import InputError, MemoryLimitError, MeshError, UsageError
 from gnrecon.schema import SCHEMA_VERSION
 
 RADIUS = 1 + TUBE

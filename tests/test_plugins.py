@@ -14,12 +14,12 @@ from other_packages import ACME, install, packages
 from scan_files import torus
 
 from gnrecon.cloud import Frame, Samples
-from gnrecon.errors import FitError, GnreconError, InputError, OutputError, UsageError
 from gnrecon.fit import FitOptions, fit
 from gnrecon.io import read_cloud, read_mesh, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.pipeline import reconstruct
 from gnrecon.residuals import SecondOrder, eikonal, interface, mean_curvature, named
+from gnrecon.runtime.errors import FitError, GnreconError, InputError, OutputError, UsageError
 
 TETRA = Mesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 

@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 from scan_files import torus, write_scan
 
-from gnrecon.advance import part
 from gnrecon.cli import main
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import Cancelled, ExitCode
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.run import STAGES, Shown
+from gnrecon.runtime.errors import Cancelled, ExitCode
+from gnrecon.runtime.progress import part
 from gnrecon.schema import report_schema
 
 SMALL: dict[str, Any] = {"widths": (100,), "steps": 2, "resolution": 32}

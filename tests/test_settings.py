@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.errors import InputError, UsageError
 from gnrecon.options import Options
+from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.settings import Settings, read_settings, settings_text
 from gnrecon.values import typed
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scan_files import sphere
 
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import require_sound
 from gnrecon.fit import NeuralSDF
 from gnrecon.options import Options
 from gnrecon.pipeline import reconstruct
+from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.shaping import Shape, shaped
 
 OPTIONS = Options(resolution=32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 
 @pytest.mark.parametrize(("count", "size"), [(0, 5), (1, 5), (5, 5), (6, 5), (23, 7)])

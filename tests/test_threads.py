@@ -20,7 +20,7 @@ from scan_files import box, torus
 
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, limited, reconstruct
-from gnrecon.threads import abreast
+from gnrecon.runtime.parallel import abreast
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}

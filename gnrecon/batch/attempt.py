@@ -20,7 +20,7 @@ import psutil
 from gnrecon.batch.children import WORK, Child, ForkerError, start_child
 from gnrecon.batch.job import Limits, Stop
 from gnrecon.batch.outcome import Cause, cause_of, describe_signal
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
 
 LOOK = 0.1
 """Seconds between two looks at a child."""

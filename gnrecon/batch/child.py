@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from gnrecon.batch.job import FAILURE, PROGRESS
-from gnrecon.errors import ExitCode, failure
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress
+from gnrecon.runtime.errors import ExitCode, failure
 
 _SELDOM = 0.5
 
@@ -24,7 +24,7 @@ _SELDOM = 0.5
 def prepare() -> None:
     """Import what a run needs, before any child is forked."""
     import gnrecon.run  # noqa: F401 - what is imported here, no child has to import
-    from gnrecon.export.preload import preload
+    from gnrecon.runtime.preload import preload
 
     preload()
 

@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Any
 
 import gnrecon
-from gnrecon.errors import ExitCode, GnreconError
+from gnrecon.runtime.errors import ExitCode, GnreconError
 
 WORK = "gnrecon.batch.child"
 """Module whose function ``work`` a child runs."""

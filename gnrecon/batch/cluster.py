@@ -21,8 +21,8 @@ from gnrecon.batch.children import WORK
 from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import Job, running_folder
 from gnrecon.batch.outcome import Cause, Outcome, Status
-from gnrecon.errors import ExitCode
-from gnrecon.scheduler import connected, require_distributed
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.parallel import connected, require_distributed
 
 RETRIES = 2
 """How often Dask begins a task again that raised an error, as a worker without the libraries would."""

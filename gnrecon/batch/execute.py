@@ -17,14 +17,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gnrecon.atomic import sync
 from gnrecon.batch.attempt import End, attempt
 from gnrecon.batch.children import WORK
 from gnrecon.batch.identity import file_hash, hash_if_there, identity_of
 from gnrecon.batch.job import FAILURE, Job, Stop, running_folder
 from gnrecon.batch.outcome import PASSING, Cause, Outcome, Status, cause_of, figures_of
 from gnrecon.batch.record import Record, read_record
-from gnrecon.errors import ExitCode, GnreconError, OutputError
+from gnrecon.runtime.errors import ExitCode, GnreconError, OutputError
+from gnrecon.runtime.files import sync
 
 REPORT, THUMBNAIL = "report.json", "thumbnail.png"
 

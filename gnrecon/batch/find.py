@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 from gnrecon.batch.job import STATE
 from gnrecon.batch.naming import Found
 from gnrecon.batch.record import all_records
-from gnrecon.errors import InputError
 from gnrecon.io import extension_of, readable
+from gnrecon.runtime.errors import InputError
 
 
 @dataclass(frozen=True)

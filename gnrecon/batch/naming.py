@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from gnrecon.errors import UsageError
 from gnrecon.io import extension_of
+from gnrecon.runtime.errors import UsageError
 
 FIELDS = ("stem", "name", "folder", "parent", "index")
 """What a template may name: the file's name without and with its extension, its folder below the one that was given,

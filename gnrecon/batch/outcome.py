@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
 
 
 class Status(enum.StrEnum):

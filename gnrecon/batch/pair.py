@@ -6,8 +6,8 @@ from pathlib import Path
 
 from gnrecon.batch.naming import Found, filled
 from gnrecon.batch.request import Request
-from gnrecon.errors import InputError
 from gnrecon.io import readable
+from gnrecon.runtime.errors import InputError
 
 _TEMPLATES = ("{folder}/{stem}", "{stem}")
 

@@ -11,9 +11,9 @@ from gnrecon.batch.naming import Found, named
 from gnrecon.batch.pair import reference_of
 from gnrecon.batch.quantity import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
-from gnrecon.errors import UsageError
 from gnrecon.io import all_members
 from gnrecon.options import Options
+from gnrecon.runtime.errors import UsageError
 from gnrecon.settings import settings_text
 
 THREADS = 1

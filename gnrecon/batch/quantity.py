@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from gnrecon.errors import UsageError
+from gnrecon.runtime.errors import UsageError
 
 SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 MEGABYTES = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6, "kib": 2**10 / 1e6, "mib": 2**20 / 1e6, "gib": 2**30 / 1e6}

@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gnrecon.atomic import write_text
 from gnrecon.batch.identity import hash_if_there
+from gnrecon.runtime.files import write_text
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gnrecon.errors import UsageError
 from gnrecon.io import writable
+from gnrecon.runtime.errors import UsageError
 from gnrecon.settings import Settings
 
 

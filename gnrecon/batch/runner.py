@@ -18,7 +18,7 @@ from gnrecon.batch.plan import plan
 from gnrecon.batch.request import Request
 from gnrecon.batch.summary import NAME, Account, write_summary
 from gnrecon.batch.workplace import workplace
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
 
 
 def run_batch(request: Request) -> int:

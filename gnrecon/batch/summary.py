@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gnrecon.atomic import write_text
 from gnrecon.batch.outcome import FILES, Outcome, Status
 from gnrecon.batch.overview import overview_text
+from gnrecon.runtime.files import write_text
 from gnrecon.version import __version__
 
 NAME = "summary"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gnrecon.batch.job import STATE, running_folder
 from gnrecon.batch.record import all_records
-from gnrecon.errors import OutputError, UsageError
+from gnrecon.runtime.errors import OutputError, UsageError
 
 
 @contextmanager

@@ -6,9 +6,9 @@ import json
 import math
 from pathlib import Path
 
-from gnrecon.errors import ExitCode, MeshError
 from gnrecon.export import examine
 from gnrecon.io import read_mesh
+from gnrecon.runtime.errors import ExitCode, MeshError
 
 
 def check(path: Path, *, as_json: bool = False) -> int:

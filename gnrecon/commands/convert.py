@@ -7,8 +7,6 @@ from pathlib import Path
 from rich.console import Console
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import ExitCode, UsageError
-from gnrecon.files import require_files
 from gnrecon.io import (
     CLOUD_WRITERS,
     all_members,
@@ -23,6 +21,8 @@ from gnrecon.io import (
 from gnrecon.io.losses import losses
 from gnrecon.io.origin import told
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import ExitCode, UsageError
+from gnrecon.runtime.files import require_files
 
 
 def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool = False) -> int:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode
 from gnrecon.export import measure
-from gnrecon.files import require_files
 from gnrecon.io import all_members, read_mesh, read_reference
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import require_files, write_text
 
 
 def evaluate(

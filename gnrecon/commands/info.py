@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import ExitCode, InputError
 from gnrecon.estimate import estimate
 from gnrecon.fit import bounds_of
 from gnrecon.ingest import Layers, layers_of, prepare, survey
 from gnrecon.io import Reading
 from gnrecon.options import Options
 from gnrecon.pipeline import described, read_source
+from gnrecon.runtime.errors import ExitCode, InputError
 
 _NORMALS = {
     "missing": "missing; they will be estimated",

@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gnrecon.atomic import atomic_write
 from gnrecon.cloud import Frame
 from gnrecon.commands.part import NAME, DesignFiles, part_mesh
 from gnrecon.commands.scanned import FILES, ScanFiles, is_scan, placed
 from gnrecon.design import Design, DesignFacts, judge
-from gnrecon.errors import ExitCode, UsageError
 from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
-from gnrecon.files import require_files
 from gnrecon.io import all_members, check_writable, write_mesh
 from gnrecon.mesh import Mesh
 from gnrecon.pipeline import limited
 from gnrecon.report import plain, versions
+from gnrecon.runtime.errors import ExitCode, UsageError
+from gnrecon.runtime.files import atomic_write, require_files
 from gnrecon.shapes import (
     OPTIMISERS,
     PROBLEMS,

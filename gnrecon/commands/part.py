@@ -13,9 +13,9 @@ import numpy as np
 
 from gnrecon.cloud import Frame
 from gnrecon.design import Design, read_design
-from gnrecon.errors import InputError, UsageError
 from gnrecon.export import curvatures, extract, project, remove_stray, repair
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.shapes import LearnedField
 
 NAME = "bracket"

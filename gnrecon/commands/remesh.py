@@ -10,9 +10,7 @@ from rich.console import Console
 
 from gnrecon.adorn import curvature_of, wanted
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import ExitCode
 from gnrecon.export import Neighbourhood, require_sound, verify_file
-from gnrecon.files import require_files
 from gnrecon.fit import NeuralSDF
 from gnrecon.io import check_writable, holds, write_mesh
 from gnrecon.mesh import Mesh
@@ -20,6 +18,8 @@ from gnrecon.options import Options
 from gnrecon.pipeline import limited, require_device
 from gnrecon.report import Stages
 from gnrecon.run import shown, summarise
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import require_files
 from gnrecon.shaping import Shape, shaped
 
 

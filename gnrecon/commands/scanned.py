@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.cloud import Frame, PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.ingest import prepare
 from gnrecon.io import read_reference
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.shapes import ShapeProblem, scanned
 
 FILES = {"bunny": "bun_zipper.ply", "rockerarm": "rocker-arm.off"}

@@ -15,11 +15,11 @@ import numpy as np
 from gnrecon.cloud import Frame
 from gnrecon.design.interfaces import Interfaces
 from gnrecon.design.region import DesignRegion
-from gnrecon.errors import InputError
 from gnrecon.export.solid import from_solid, to_solid
 from gnrecon.export.verify import failures, verify
 from gnrecon.io import read_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 MARGIN = 0.1
 """How far the problem's box reaches beyond the design region, in half its longest side."""

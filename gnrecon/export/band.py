@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.advance import Advance, part, unheard
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.export.search import Coarse, search
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.progress import Advance, part, unheard
 
 NUDGE = 1e-4
 """Least magnitude of a node's value, in cells over the slope: no vertex falls on a node and makes faces degenerate."""

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from gnrecon.errors import UsageError
 from gnrecon.geometry.arrays import Float
+from gnrecon.runtime.errors import UsageError
 
 View = str | tuple[float, float]
 """A name of `VIEWS`, or the azimuth and elevation in degrees from which the shape is seen."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.errors import MeshError
 from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 
 SNAP = 1e-9
 """Vertices within this share of the mesh's size from a cut are put onto it exactly."""

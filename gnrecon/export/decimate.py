@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.between import between
 from gnrecon.export.meshlab import from_meshlab, to_meshlab
 from gnrecon.export.nearest import nearest_on_surface
@@ -23,6 +22,7 @@ from gnrecon.export.remesh import creased, settled
 from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
 from gnrecon.export.surface import unit
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
 
 FEWEST = 4
 """Faces of a tetrahedron."""

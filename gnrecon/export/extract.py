@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.advance import Advance, part, unheard
-from gnrecon.errors import MeshError
 from gnrecon.export.band import Band, narrow_band
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import CHUNK, Values
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
+from gnrecon.runtime.progress import Advance, part, unheard
 
 EVALUATED = 0.9
 """About which share of the time has passed when the field is known; marching cubes takes the rest."""

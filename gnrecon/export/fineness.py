@@ -15,12 +15,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gnrecon.errors import UsageError
 from gnrecon.export.between import between
 from gnrecon.export.project import project, side_lengths
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 MEAN_EDGE = 0.97
 """Mean length of marching cubes' edges, in cells."""

@@ -26,12 +26,12 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from gnrecon.angles import widest_gap
-from gnrecon.errors import MeshError
 from gnrecon.export.loops import Loop, short_loops
 from gnrecon.export.topology import Edges, corner_fans
 from gnrecon.export.verify import require_sound
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 
 RIM = 2 * np.pi
 """Length of a disk's rim, in radii of it."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.advance import Advance, unheard
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.protocol import SignedDistance, knows_blocks, sdf_around
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.slices import slices
+from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.progress import Advance, unheard
 
 PER_BLOCK = 8
 """Points that a block counts as for a field that knows blocks: the more at once, the more they share."""

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.export.definitions import Metrics
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.progress import Advance, unheard
 
 F_SCORE_SHARE = 0.005
 """Threshold of the F-score as a share of the reference's radius."""

@@ -14,7 +14,7 @@ import numpy as np
 from gnrecon.export.solid import centre_and_size
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.mesh import Mesh
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 RAYS = 5
 """Rays that vote on whether a point lies inside: one alone may graze an edge and count it twice, or not at all."""

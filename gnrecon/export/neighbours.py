@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 COUNT = 8
 """Points that are averaged: about the first ring around a point of an even scan."""

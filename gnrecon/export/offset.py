@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from gnrecon.cloud import Frame
-from gnrecon.errors import UsageError
 from gnrecon.export.nearest import Surface
 from gnrecon.export.solid import centre_and_size
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 LEAST_LEVEL = 1e-5
 """Of half the mesh's longest side: nearer to the surface, its two sides are not told apart reliably."""

@@ -15,13 +15,13 @@ from scipy.spatial import cKDTree
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
 from gnrecon.colors import to_linear as to_light
-from gnrecon.errors import UsageError
 from gnrecon.export.camera import Camera, View
 from gnrecon.export.nearest import ray_scene
 from gnrecon.export.shading import shade, sky_share, to_bytes, to_linear
 from gnrecon.export.splats import draw_points
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 CLAY, SLATE = (230, 208, 180), (86, 120, 164)
 """Colours of meshes and of points."""
@@ -163,7 +163,7 @@ def write_image(image: Image, path: Path) -> None:
     """
     from PIL import Image as Pillow
 
-    from gnrecon.atomic import atomic_write
+    from gnrecon.runtime.files import atomic_write
 
     with atomic_write(path, overwrite=True) as temporary:
         Pillow.fromarray(image).save(temporary, format="PNG")

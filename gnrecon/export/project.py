@@ -11,12 +11,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.advance import Advance, unheard
-from gnrecon.errors import UsageError
 from gnrecon.export.protocol import SignedDistance, sdf_and_gradient
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.mesh import Mesh, area_vectors
-from gnrecon.slices import slices
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.progress import Advance, unheard
 
 TURN, COLLAPSE = 0.3, 1e-3
 """Least cosine between a face's old and new normal, and least new area as a share of the old."""

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.advance import Advance, unheard
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export.decimate import FEWEST, decimate, simplify
 from gnrecon.export.project import project
 from gnrecon.export.protocol import SignedDistance
@@ -22,6 +20,8 @@ from gnrecon.export.repair import repair
 from gnrecon.export.sharpen import sharpen
 from gnrecon.export.verify import verify
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.progress import Advance, unheard
 
 GENTLER = (1.0, 0.5, 0.25)
 """Factors by which a step's strength is lowered before it is given up."""

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.errors import UsageError
 from gnrecon.export.collapse import collapse_short
 from gnrecon.export.crease import crease_edges
 from gnrecon.export.flip import flip_for_angles, flip_for_valence
@@ -24,6 +23,7 @@ from gnrecon.export.split import split_long
 from gnrecon.export.surface import EdgeTable, Surface, unit
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 ROUNDS = 8
 

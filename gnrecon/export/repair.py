@@ -15,13 +15,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.errors import MeshError
 from gnrecon.export.meshlab import from_meshlab, to_meshlab
 from gnrecon.export.solid import from_solid, refusal, to_solid
 from gnrecon.export.topology import Edges, corner_fans, split_vertices, submesh
 from gnrecon.export.verify import require_sound, verify
 from gnrecon.geometry.arrays import Mask
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 
 APART = 1e-3
 """How far vertices at one place are moved apart, as a share of the way to the middle of their faces."""

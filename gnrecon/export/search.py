@@ -21,7 +21,7 @@ import numpy as np
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import LEAF, Leaves
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 MOST_BLOCKS = 96
 """Most coarse blocks along the longest side."""

@@ -21,10 +21,10 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gnrecon.errors import UsageError
 from gnrecon.export.diffuse import diffused, vertex_areas
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 CLEAR = 0.1
 """How far a crossing stays from the ends of its edge, as a share of the edge."""

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import MeshError
 from gnrecon.export.solid import refusal, to_solid
 from gnrecon.export.topology import Edges, face_components, split_vertices
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 
 
 @dataclass(frozen=True)

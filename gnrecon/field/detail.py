@@ -18,8 +18,7 @@ from torch import Tensor
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.slices import slices
-from gnrecon.threads import abreast
+from gnrecon.runtime.parallel import abreast, slices
 
 ROWS = 512
 """Pairs of a point and a cube whose features are made at once: they stay in the processor's cache."""

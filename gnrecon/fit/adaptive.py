@@ -15,9 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
-from gnrecon.errors import UsageError
 from gnrecon.fit.averaged import Told, told
 from gnrecon.fit.ball import Ball
 from gnrecon.fit.contradict import reconciled
@@ -32,6 +30,8 @@ from gnrecon.fit.shaped import Free, Shaping, bend_global
 from gnrecon.fit.sharp import Sharp
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.optim import Solution
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.progress import Advance, part, unheard
 from gnrecon.sampling import Density
 
 COARSE_POINTS = 5000

@@ -23,8 +23,8 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.robust import deviation
+from gnrecon.runtime.parallel import slices
 from gnrecon.sampling import Density
-from gnrecon.slices import slices
 
 Part = tuple[slice, Int, Float]
 

@@ -30,8 +30,8 @@ from gnrecon.fit.evidence import POINTS, Evidence
 from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.runtime.parallel import abreast
 from gnrecon.sampling import Density
-from gnrecon.threads import abreast
 
 LENGTHS = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)
 POSITIONS = (0.02, 0.1, 0.3, 0.8)

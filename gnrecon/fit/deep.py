@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.advance import Advance, unheard
 from gnrecon.field.siren import Siren
 from gnrecon.fit.loss import data_terms, start_terms, step_terms
 from gnrecon.fit.method import optimiser_for
@@ -29,6 +28,7 @@ from gnrecon.fit.start import spectral_start
 from gnrecon.linalg import layer_scaled
 from gnrecon.optim import Callback, GainRatioDamping, Solution, StopRule
 from gnrecon.optim.problem import loss_of
+from gnrecon.runtime.progress import Advance, unheard
 
 
 @dataclass(frozen=True)

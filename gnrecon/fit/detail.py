@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.advance import Advance, part, unheard
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
@@ -26,8 +25,9 @@ from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.progress import Advance, part, unheard
 from gnrecon.sampling import CoarseDistance
-from gnrecon.threads import abreast
 
 _log = logging.getLogger(__name__)
 

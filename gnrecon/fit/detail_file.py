@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gnrecon.errors import InputError
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
+from gnrecon.runtime.errors import InputError
 
 LATTICE, NOISE, KEYS, LENGTHS = "detail.lattice", "detail.noise", "detail.keys", "detail.lengths"
 FREQUENCIES, PHASES, AMPLITUDES = "detail.frequencies", "detail.phases", "detail.amplitudes"

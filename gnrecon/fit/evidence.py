@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gnrecon.field.features import Features
 from gnrecon.fit.patch import Patch, data_kernel
-from gnrecon.threads import abreast
+from gnrecon.runtime.parallel import abreast
 
 POSITIONS = (0.005, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 """Noise of the positions to choose from, over the radius of a point's disk."""

@@ -27,10 +27,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gnrecon.errors import FitError
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.linalg import LayeredJacobian
 from gnrecon.linalg.cholesky import damped_factor, solve_factored
+from gnrecon.runtime.errors import FitError
 
 PRIOR = 10.0
 PASSES, SETTLED = 6, 0.02

@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
@@ -35,7 +34,8 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.work import Work
 from gnrecon.fit.workers import solve_blocks
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.progress import Advance, part, unheard
 
 LARGE = 200_000
 """Points from which a scan is fitted by blocks."""

@@ -20,7 +20,7 @@ from torch import Tensor
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import Laplace
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 PATCHES = {1: 200, 8: 40, 40: 12}
 """Number of patches of each number of points."""

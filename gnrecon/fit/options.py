@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gnrecon.errors import UsageError
 from gnrecon.fit.regulariser import Regulariser, regularisers
 from gnrecon.linalg import SOLVERS
-from gnrecon.plugins import RESIDUALS, find, installed
 from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
 from gnrecon.residuals.named import named
 from gnrecon.residuals.second_order import SecondOrder
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.plugins import RESIDUALS, find, installed
 
 NORMAL_RESIDUALS: dict[str, Residual] = {
     "vector": normal_vector,

@@ -20,7 +20,7 @@ from torch import Tensor
 from gnrecon.field.features import Features
 from gnrecon.linalg.cholesky import damped_factor, solve_factored
 from gnrecon.linalg.gram import gram
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""

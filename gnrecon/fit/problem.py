@@ -19,7 +19,7 @@ from gnrecon.fit.terms import Term, groups
 from gnrecon.linalg.jacobian import Block, LayeredJacobian
 from gnrecon.linalg.rows import LayerRows
 from gnrecon.residuals.first_order import Linearised
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000
 """Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""

@@ -18,8 +18,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gnrecon.errors import UsageError
 from gnrecon.residuals import SecondOrder, gauss_curvature, mean_curvature, surface_strain
+from gnrecon.runtime.errors import UsageError
 
 FILL, DEVELOPABLE = 1e-2, 1e-3
 """Weights of `minimal` and of `developable` without one of their own."""

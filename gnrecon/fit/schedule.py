@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.advance import Advance, part, unheard
 from gnrecon.cloud import Samples
-from gnrecon.errors import FitError, UsageError
 from gnrecon.field.siren import Siren
 from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.deep import fit_deep
@@ -19,6 +17,8 @@ from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.wide import fit_wide
 from gnrecon.optim import Callback, Record, Solution
+from gnrecon.runtime.errors import FitError, UsageError
+from gnrecon.runtime.progress import Advance, part, unheard
 
 WIDE_STARTED, DEEP_STARTED = 0.4, 0.05
 """About which share of the time has passed when the start is made, where steps follow."""

@@ -9,12 +9,11 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 
-from gnrecon.advance import Advance
-from gnrecon.errors import FitError
 from gnrecon.fit.block import solve_block
 from gnrecon.fit.work import Work
-from gnrecon.scheduler import connected, require_distributed
-from gnrecon.threads import having_threads
+from gnrecon.runtime.errors import FitError
+from gnrecon.runtime.parallel import connected, having_threads, require_distributed
+from gnrecon.runtime.progress import Advance
 
 RETRIES = 2
 """How often a block is begun again that raised an error, as where a network file system shows files late."""

@@ -17,9 +17,8 @@ from gnrecon.cloud import Frame
 from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren
 from gnrecon.geometry.arrays import Float
+from gnrecon.runtime.parallel import abreast, slices
 from gnrecon.sampling import Box
-from gnrecon.slices import slices
-from gnrecon.threads import abreast
 
 _BATCH_BYTES = 4_000_000
 # What stays in the processor's cache is twice as fast as what does not.

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.errors import FitError
 from gnrecon.field.features import Features
 from gnrecon.fit.bend import Jet, Sines, Wish, bent
 from gnrecon.fit.loss import data_terms, distance_term
@@ -35,6 +34,7 @@ from gnrecon.fit.terms import Term
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.linalg.cholesky import damped_factor
 from gnrecon.residuals import SecondOrder, free_space
+from gnrecon.runtime.errors import FitError
 from gnrecon.sampling import Density, least_values
 
 GLOBAL_STEPS, CUBE_STEPS = 8, 3

@@ -23,8 +23,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.advance import Advance, unheard
-from gnrecon.errors import FitError
 from gnrecon.field.siren import Siren
 from gnrecon.fit.ghosts import GhostSearch
 from gnrecon.fit.problem import FieldProblem
@@ -33,6 +31,8 @@ from gnrecon.fit.terms import Term
 from gnrecon.geometry.arrays import Float
 from gnrecon.linalg.cholesky import Cholesky
 from gnrecon.linalg.metric import identity
+from gnrecon.runtime.errors import FitError
+from gnrecon.runtime.progress import Advance, unheard
 
 RIDGE = 1e-8
 ROUNDS, TRIALS = 3, 3

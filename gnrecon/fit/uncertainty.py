@@ -33,8 +33,8 @@ from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float
+from gnrecon.runtime.parallel import slices
 from gnrecon.sampling import Density
-from gnrecon.slices import slices
 
 MOST_POINTS = 20_000
 """Data points that count; more of them are thinned at random, so that sigma is rather too large."""

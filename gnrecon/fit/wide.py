@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.advance import Advance, unheard
 from gnrecon.field.siren import Siren
 from gnrecon.fit.loss import start_terms, step_terms
 from gnrecon.fit.method import optimiser_for
@@ -19,6 +18,7 @@ from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.start import COARSE, Spectrum, wide_start
 from gnrecon.optim import Callback, GainRatioDamping, Solution, StopRule
+from gnrecon.runtime.progress import Advance, unheard
 
 SUBSPACE_UNITS = 400
 MAX_STEP_POINTS = 4000

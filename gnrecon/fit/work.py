@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.atomic import atomic_write
-from gnrecon.errors import InputError, OutputError, UsageError
+from gnrecon.runtime.errors import InputError, OutputError, UsageError
+from gnrecon.runtime.files import atomic_write
 from gnrecon.version import __version__
 
 Arrays = Mapping[str, npt.NDArray[Any]]

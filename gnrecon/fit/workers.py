@@ -15,12 +15,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from gnrecon.advance import Advance
-from gnrecon.errors import FitError, MemoryLimitError
 from gnrecon.fit.block import solve_block
 from gnrecon.fit.work import Work
 from gnrecon.fit.worker import DONE
-from gnrecon.threads import having_threads
+from gnrecon.runtime.errors import FitError, MemoryLimitError
+from gnrecon.runtime.parallel import having_threads
+from gnrecon.runtime.progress import Advance
 
 NEED = 1.2e9
 """Bytes that a process needs at most, with Python and torch; no more processes are started than have room."""

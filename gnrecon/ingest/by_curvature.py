@@ -12,7 +12,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.ingest.outliers import thickness
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 _NEIGHBOURS = 16
 _EVENLY = 0.5

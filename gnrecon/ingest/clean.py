@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.ingest.clusters import isolated_clusters
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.outlier_rules import MODES, outliers_by_rule, parse_outliers
 from gnrecon.ingest.outliers import find_outliers
 from gnrecon.ingest.repeats import repeated_points
+from gnrecon.runtime.errors import InputError, UsageError
 
 LEAST_POINTS = 10
 _FLAT = 1e-4  # ratio of extents below which a cloud counts as a plane or a line

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 _NEIGHBOURS = (12, 24, 48)
 _FIRST, _MORE = 8, 16

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.consistent import consistent_normals
 from gnrecon.ingest.directions import directions, tangent_planes
@@ -26,6 +25,7 @@ from gnrecon.ingest.gauss import gauss_normals
 from gnrecon.ingest.propagate import propagated
 from gnrecon.ingest.sight import towards_scanner
 from gnrecon.ingest.winding import agreement, disorder, outwardness
+from gnrecon.runtime.errors import InputError
 
 _OFF_PLANE_PENALTY = 2.0
 _LOCAL, _SMOOTH = 12, 24

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.ingest.normals import Orientation, flip_if_inward, oriented_normals
+from gnrecon.runtime.errors import UsageError
 
 MODES = {
     "auto": "estimated where there are none; all turned around where they look into a closed surface",

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.errors import UsageError
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.lengths import parse_reach
+from gnrecon.runtime.errors import UsageError
 
 MODES = ("auto", "on", "off")
 _NEIGHBOURS = 16

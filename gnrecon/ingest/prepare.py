@@ -7,9 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Frame, PointCloud, Samples
-from gnrecon.errors import UsageError
 from gnrecon.ingest.clean import LEAST_POINTS, clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.orient import require_orientation, with_outward_normals
@@ -17,6 +15,8 @@ from gnrecon.ingest.smooth import smoothed
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample as thin
 from gnrecon.lengths import parse_reach
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.progress import Advance, unheard
 
 _log = logging.getLogger(__name__)
 

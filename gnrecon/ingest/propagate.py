@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.winding import outwardness
+from gnrecon.runtime.errors import InputError
 
 _NEIGHBOURS = 8
 _JITTER = 1e-6  # of the extent

@@ -14,7 +14,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.spacing import neighbour_spacing
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 _LEAST = 9
 """Neighbours, the point itself included, that a quadric needs; points with fewer stay where they are."""

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.ingest.by_curvature import by_curvature
 from gnrecon.ingest.farthest import farthest_points
 from gnrecon.ingest.poisson_disk import poisson_disk, poisson_disk_apart
 from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.voxel import voxel_representatives, voxel_representatives_of_side
+from gnrecon.runtime.errors import UsageError
 
 
 def _random(points: Float, count: int, rng: np.random.Generator) -> Int:

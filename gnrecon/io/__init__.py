@@ -1,6 +1,5 @@
 """Reading clouds and meshes, writing both, and converting other libraries' objects."""
 
-from gnrecon.atomic import atomic_write, write_text
 from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
 from gnrecon.io.handed import to_open3d, to_pymeshlab, to_trimesh
 from gnrecon.io.members import all_members
@@ -10,6 +9,7 @@ from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
 from gnrecon.io.scans import MOST_POINTS, Reading, cropped, read_scans
 from gnrecon.io.unpack import extension_of
 from gnrecon.io.write import check_writable, holds, unverified, write_cloud, write_mesh, written_origin
+from gnrecon.runtime.files import atomic_write, write_text
 
 __all__ = [
     "CLOUD_WRITERS",

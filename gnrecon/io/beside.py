@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gnrecon.errors import InputError
+from gnrecon.runtime.errors import InputError
 
 
 def beside(folder: Path, name: str, what: str) -> Path:

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.io.beside import beside
 from gnrecon.io.contents import Contents, joined
 from gnrecon.io.ply import read_ply
 from gnrecon.io.text import numbers, read_text
+from gnrecon.runtime.errors import InputError
 
 _DISTANCE = 100.0
 """Of the scanner, in extents of the scan."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.runtime.errors import InputError
 
 Columns = Mapping[str, Values]
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Values
 from gnrecon.io.contents import Columns, Contents, joined, no_faces
 from gnrecon.io.foreign import parsing
+from gnrecon.runtime.errors import InputError
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")

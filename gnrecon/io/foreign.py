@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from gnrecon.errors import InputError
-from gnrecon.foreign import guarded, told
+from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.plugins import guarded, told
 
 
 def parsing(kind: str) -> AbstractContextManager[None]:
@@ -14,6 +14,6 @@ def parsing(kind: str) -> AbstractContextManager[None]:
     Raises
     ------
     InputError
-        When the library in the block fails in whichever way; see `gnrecon.foreign.guarded`.
+        When the library in the block fails in whichever way; see `gnrecon.runtime.plugins.guarded`.
     """
     return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({told(error)}).")

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from gnrecon.colors import as_bytes, to_linear, to_srgb, with_alpha
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents
 from gnrecon.io.foreign import parsing
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 _COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"
 """The name of colours in glTF, and the one under which trimesh takes them for any attribute."""

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from gnrecon.errors import InputError
 from gnrecon.io.beside import beside
 from gnrecon.io.contents import Contents
 from gnrecon.io.foreign import parsing
 from gnrecon.io.glb import packed, read_glb_bytes
+from gnrecon.runtime.errors import InputError
 
 
 def read_gltf(path: Path) -> Contents:

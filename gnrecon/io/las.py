@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Mask, Values
 from gnrecon.io.contents import Columns, Contents, from_columns, joined
 from gnrecon.io.foreign import parsing
+from gnrecon.runtime.errors import InputError
 
 _LEAST_HEADER, _VLR, _EVLR = 227, 54, 60  # bytes, from the specification
 _COMPRESSED = 0xC0

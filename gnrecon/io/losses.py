@@ -6,9 +6,9 @@ import numpy as np
 
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
-from gnrecon.errors import OutputError
 from gnrecon.geometry.arrays import Float, Values
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import OutputError
 
 _DIGITS = 4 * np.finfo(np.float64).eps
 """Rounding that the same numbers in another frame have anyway, as a share of the largest coordinate."""

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from urllib.parse import unquote
 
-from gnrecon.errors import InputError
 from gnrecon.io.beside import beside
 from gnrecon.io.conf import parse_conf
 from gnrecon.io.text import read_text
 from gnrecon.io.unpack import extension_of
+from gnrecon.runtime.errors import InputError
 
 
 def members(path: Path, format: str | None = None) -> list[Path]:

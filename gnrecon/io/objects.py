@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.io.contents import from_columns
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 _POINTS = (
     "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, or a cloud of open3d, trimesh or "

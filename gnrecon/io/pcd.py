@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.text import numbers
+from gnrecon.runtime.errors import InputError
 
 Header = dict[str, list[str]]
 

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.errors import InputError, OutputError
 from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, WRITERS
 from gnrecon.io.objects import as_shape
 from gnrecon.mesh import Mesh
-from gnrecon.plugins import READERS as READER_GROUP
-from gnrecon.plugins import WRITERS as WRITER_GROUP
-from gnrecon.plugins import Plugin, find, installed
+from gnrecon.runtime.errors import InputError, OutputError
+from gnrecon.runtime.plugins import READERS as READER_GROUP
+from gnrecon.runtime.plugins import WRITERS as WRITER_GROUP
+from gnrecon.runtime.plugins import Plugin, find, installed
 
 
 def is_readable(extension: str) -> bool:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Int, Values
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.ply_columns import vertex_columns
@@ -21,6 +20,7 @@ from gnrecon.io.ply_header import ORDERS, PLY_TYPES, Element, Property, parse_he
 from gnrecon.io.polygons import fan, not_triangles
 from gnrecon.io.text import numbers
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 
 @dataclass

@@ -15,10 +15,10 @@ from typing import IO
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.io.contents import Contents, joined, no_faces
 from gnrecon.io.text import numbers
+from gnrecon.runtime.errors import InputError
 
 _POSE_LINES = 8
 _COLORS = slice(4, 7)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
-from gnrecon.errors import InputError, MemoryLimitError, UsageError
-from gnrecon.files import STANDARD_INPUT
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED
 from gnrecon.io.plugged import is_readable, readable, reader_of
 from gnrecon.io.unpack import extension_of, plain_file
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
+from gnrecon.runtime.files import STANDARD_INPUT
 
 _log = logging.getLogger(__name__)
 

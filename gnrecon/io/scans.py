@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.io.chunks import SETTLED, chunks
 from gnrecon.io.contents import Contents
 from gnrecon.io.gather import Gatherer
@@ -18,6 +17,7 @@ from gnrecon.io.same_scan import Moments, same_scans
 from gnrecon.io.unpack import plain_file
 from gnrecon.mesh import Mesh
 from gnrecon.region import Region
+from gnrecon.runtime.errors import InputError, UsageError
 
 _log = logging.getLogger(__name__)
 

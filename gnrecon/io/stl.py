@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents
 from gnrecon.io.origin import HEADER, far_origin, header, origin_in
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 
 def read_stl(path: Path) -> Contents:

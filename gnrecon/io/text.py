@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Values
+from gnrecon.runtime.errors import InputError
 
 _ROWS_AT_A_TIME = 100_000
 

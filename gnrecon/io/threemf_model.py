@@ -17,12 +17,12 @@ from xml.parsers import expat
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.io.contents import Contents
 from gnrecon.io.text import numbers
 from gnrecon.io.threemf import MODEL_TYPE
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 Key = tuple[str, str]
 """A resource: the part of the archive that holds it, and its number there."""

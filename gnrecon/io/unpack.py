@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gnrecon.errors import InputError, UsageError
-from gnrecon.files import STANDARD_INPUT
+from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.files import STANDARD_INPUT
 
 _GZIP = b"\x1f\x8b"
 _SUFFIX = ".gz"

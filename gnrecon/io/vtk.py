@@ -13,11 +13,11 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.text import numbers
 from gnrecon.io.vtk_data import assemble, split_counts, triangles
+from gnrecon.runtime.errors import InputError
 
 _TYPES = {
     **{"unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4"},

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.polygons import fan
+from gnrecon.runtime.errors import InputError
 
 
 def assemble(

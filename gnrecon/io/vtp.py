@@ -18,11 +18,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Int, Values
 from gnrecon.io.contents import Contents, joined, no_faces
 from gnrecon.io.text import numbers
 from gnrecon.io.vtk_data import assemble, split_counts, triangles
+from gnrecon.runtime.errors import InputError
 
 _KINDS = {"Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Float32", "Float64"}
 _UNPACK: dict[str, Callable[[bytes], bytes]] = {

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.atomic import atomic_write
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.geometry.arrays import Float, Values
 from gnrecon.io.contents import no_faces
 from gnrecon.io.formats import CLOUD_WRITERS, HOLDS
 from gnrecon.io.origin import far_origin, rounding, told
 from gnrecon.io.plugged import is_readable, writable, writer_of
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.files import atomic_write
 
 _NOTABLE_ROUNDING = 1e-6  # of the mesh's diagonal
 _INT32_LIMIT = 2**31

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.ply_columns import vertex_columns
 from gnrecon.io.text import read_text
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 _COMMENTS = ("#", "//", ";", "%")
 _SEPARATORS = re.compile(r"[\s,;]+")

@@ -7,9 +7,9 @@ from itertools import islice
 from pathlib import Path
 from typing import IO
 
-from gnrecon.errors import InputError
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.xyz import named, split, table
+from gnrecon.runtime.errors import InputError
 
 
 def xyz_chunks(path: Path, rows: int) -> Iterator[Contents]:

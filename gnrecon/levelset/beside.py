@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 
 import torch
 
-from gnrecon.threads import set_threads
+from gnrecon.runtime.parallel import set_threads
 
 Input = TypeVar("Input")
 Answer = TypeVar("Answer")

@@ -9,9 +9,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from gnrecon.atomic import write_text
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import MeshError
 from gnrecon.histogram import Histogram
 from gnrecon.mesh import Mesh
 from gnrecon.page import facts
@@ -22,6 +20,8 @@ from gnrecon.page.model import model
 from gnrecon.page.numbers import count, figure
 from gnrecon.page.quality import quality
 from gnrecon.page.ramps import css, ramp
+from gnrecon.runtime.errors import MeshError
+from gnrecon.runtime.files import write_text
 
 FOLDER = Path(__file__).parent
 

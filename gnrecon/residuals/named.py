@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from gnrecon.errors import FitError, UsageError
-from gnrecon.plugins import RESIDUALS as GROUP
-from gnrecon.plugins import Plugin, find, installed
 from gnrecon.residuals.first_order import (
     Linearised,
     Residual,
@@ -24,6 +21,9 @@ from gnrecon.residuals.first_order import (
     signed_distance,
 )
 from gnrecon.residuals.second_order import SecondOrder, gauss_curvature, mean_curvature, surface_strain
+from gnrecon.runtime.errors import FitError, UsageError
+from gnrecon.runtime.plugins import RESIDUALS as GROUP
+from gnrecon.runtime.plugins import Plugin, find, installed
 
 RESIDUALS: dict[str, Residual | SecondOrder] = {
     "interface": interface,

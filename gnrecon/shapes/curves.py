@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.errors import UsageError
 from gnrecon.geometry.arrays import Float
 from gnrecon.residuals import SecondOrder, eikonal, interface
+from gnrecon.runtime.errors import UsageError
 from gnrecon.sampling import Box
 from gnrecon.shapes.problem import ShapeProblem, Start, plane_through
 from gnrecon.shapes.term import Term, Weight, at_points, fading, in_box, on_surface

@@ -24,7 +24,7 @@ from gnrecon.field import CurvedJet, Network
 from gnrecon.levelset import transported
 from gnrecon.linalg import Block, LayeredJacobian
 from gnrecon.residuals import Linearised, Residual, SecondOrder, tangents
-from gnrecon.slices import slices
+from gnrecon.runtime.parallel import slices
 
 CHUNK = 8192
 FOLLOWED, LONGEST = 2, 0.1

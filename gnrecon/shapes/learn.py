@@ -25,9 +25,9 @@ from time import perf_counter
 import numpy as np
 from torch import Tensor
 
-from gnrecon.errors import FitError, UsageError
 from gnrecon.field import Network
 from gnrecon.optim import LBFGS, Adam, GaussNewton, Optimiser, Problem, Record, Solution, StopRule
+from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.shapes.learned import LearnedField
 from gnrecon.shapes.measure import Measurement, measure
 from gnrecon.shapes.pretrain import pretrained

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from gnrecon.cloud import Frame
-from gnrecon.errors import MeshError
 from gnrecon.export import extract, project
 from gnrecon.export.clip import clip
 from gnrecon.field import Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 from gnrecon.sampling import Box
 
 MARGIN = 2

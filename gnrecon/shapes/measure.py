@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gnrecon.errors import FitError
 from gnrecon.levelset import chamfer_divergence
+from gnrecon.runtime.errors import FitError
 from gnrecon.shapes.problem import ShapeProblem
 from gnrecon.shapes.term import LAST
 

@@ -16,9 +16,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.errors import FitError
 from gnrecon.levelset import LevelSet, sample_surface
 from gnrecon.residuals import Residual, SecondOrder
+from gnrecon.runtime.errors import FitError
 from gnrecon.sampling import Box, halved
 
 LAST = 10**9

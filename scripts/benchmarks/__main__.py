@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
-from gnrecon.errors import ExitCode, GnreconError
+from gnrecon.runtime.errors import ExitCode, GnreconError
 
 
 @dataclass(frozen=True)

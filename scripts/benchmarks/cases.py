@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmarks.problem import Problem
 from gnrecon.cloud import Frame, PointCloud
-from gnrecon.errors import InputError
 from gnrecon.geometry.arrays import Float
 from gnrecon.io import read_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from benchmarks.problem import Case
-from gnrecon.errors import UsageError
+from gnrecon.runtime.errors import UsageError
 
 Groups = Mapping[str, Mapping[str, Case]]
 """Names that stand for several cases, each with its name."""

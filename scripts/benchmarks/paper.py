@@ -18,9 +18,9 @@ from benchmarks.comparison import Protocol, problems_of, run_case, summarise
 from benchmarks.provenance import REPOSITORY, provenance
 from benchmarks.sheet import Part, Row, draw_row, write_sheet
 from benchmarks.table import comparison_table, failures
-from gnrecon.atomic import write_text
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import ExitCode, OutputError
+from gnrecon.runtime.errors import ExitCode, OutputError
+from gnrecon.runtime.files import write_text
 
 METHODS = ("gnrecon", "Poisson")
 DATA = REPOSITORY.parent / "shared/data/paper"

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gnrecon.atomic import atomic_write
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import GnreconError
 from gnrecon.export import render
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import GnreconError
+from gnrecon.runtime.files import atomic_write
 
 PANEL = (460, 400)
 """Width and height of a panel, in pixels."""

@@ -23,12 +23,12 @@ from rich.table import Table
 from torch import Tensor
 
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, UsageError
 from gnrecon.levelset import derivative_along, sample_surface, transported
 from gnrecon.linalg import LayeredJacobian
 from gnrecon.optim import Problem, StopRule
 from gnrecon.residuals import Linearised, SecondOrder, mean_curvature
+from gnrecon.runtime.errors import ExitCode, UsageError
+from gnrecon.runtime.files import write_text
 from gnrecon.shapes import OPTIMISERS, PROBLEMS, Drawn, Moment, ShapeProblem, Term
 from gnrecon.shapes.measure import measure
 from gnrecon.shapes.pretrain import pretrained

@@ -21,10 +21,10 @@ from benchmarks.arrays import load_scan, load_truth, save_mesh
 from benchmarks.methods import METHODS
 from benchmarks.samples_apart import between_samples
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import GnreconError, MeshError
 from gnrecon.export import measure, verify
-from gnrecon.memory import process_peak_mb
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import GnreconError, MeshError
+from gnrecon.runtime.memory import process_peak_mb
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from benchmarks.engine.plot import require_matplotlib
 
-from gnrecon.atomic import write_text
 from gnrecon.commands.learn import LearnOptions
-from gnrecon.errors import ExitCode, GnreconError
+from gnrecon.runtime.errors import ExitCode, GnreconError
+from gnrecon.runtime.files import write_text
 from reproduction.experiments import PROBLEMS, Experiment, experiments, interrupted
 from reproduction.figures import draw_convergence, draw_surfaces
 from reproduction.table import as_csv, as_markdown

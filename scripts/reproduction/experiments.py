@@ -10,7 +10,7 @@ from typing import Any
 from gnrecon.commands.learn import LearnOptions, run_learn
 from gnrecon.commands.part import DesignFiles
 from gnrecon.commands.scanned import ScanFiles, is_scan
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
 from gnrecon.shapes import OPTIMISERS
 
 PROBLEMS: dict[str, tuple[str, float | None]] = {

@@ -16,7 +16,7 @@ from errands import job, notes
 from gnrecon.batch.cluster import Abandoned, run_on_cluster
 from gnrecon.batch.job import running_folder
 from gnrecon.batch.outcome import Outcome, Status
-from gnrecon.errors import UsageError
+from gnrecon.runtime.errors import UsageError
 
 # Dask's own threads and sockets go when they please.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -71,7 +71,7 @@ def _is_child(process: psutil.Process, folder: Path) -> bool:
 
 
 def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gnrecon.scheduler.PATIENCE", "1s")
+    monkeypatch.setattr("gnrecon.runtime.parallel.PATIENCE", "1s")
     outcomes: list[Outcome] = []
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         with pytest.raises(UsageError, match=f"No scheduler answers at {re.escape(address)}"):

@@ -27,8 +27,8 @@ from gnrecon.batch.outcome import Outcome
 from gnrecon.batch.request import Request
 from gnrecon.batch.runner import run_batch
 from gnrecon.cli import main
-from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.export import verify_file
+from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.schema import report_schema
 from gnrecon.settings import Settings, read_settings
 

@@ -21,7 +21,7 @@ from gnrecon.batch.job import Job, Limits, running_folder
 from gnrecon.batch.outcome import Cause, Outcome, Status
 from gnrecon.batch.record import read_record
 from gnrecon.batch.workplace import workplace
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture(scope="module", autouse=True)

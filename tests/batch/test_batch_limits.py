@@ -13,8 +13,8 @@ from gnrecon.batch.job import Job, Limits
 from gnrecon.batch.quantity import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
 from gnrecon.batch.workplace import workplace
-from gnrecon.errors import OutputError, UsageError
 from gnrecon.options import Options
+from gnrecon.runtime.errors import OutputError, UsageError
 
 
 def test_times() -> None:

@@ -10,7 +10,7 @@ import pytest
 from gnrecon.batch.job import Limits
 from gnrecon.batch.plan import plan
 from gnrecon.batch.request import Request
-from gnrecon.errors import InputError, UsageError
+from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.settings import Settings, read_settings
 
 

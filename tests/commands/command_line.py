@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from gnrecon.cli import main
-from gnrecon.errors import ExitCode
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import ExitCode
 
 
 class CommandLine:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from command_line import CommandLine, ball, cube
 
-from gnrecon.errors import ExitCode
 from gnrecon.io import write_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from command_line import CommandLine, ball, cube
 
-from gnrecon.errors import ExitCode
 from gnrecon.export import measure
 from gnrecon.io import read_mesh, write_mesh
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from command_line import CommandLine
 
-from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
 from gnrecon.io import read_cloud, read_mesh
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from command_line import CommandLine
 
-from gnrecon.errors import ExitCode
 from gnrecon.export import verify_file
 from gnrecon.field import Network
 from gnrecon.field.activation import WAVELET
 from gnrecon.io import read_mesh
+from gnrecon.runtime.errors import ExitCode
 from gnrecon.shapes import pretrain
 
 

@@ -8,8 +8,8 @@ import pytest
 from command_line import CommandLine, ball
 from other_packages import install, packages
 
-from gnrecon.errors import ExitCode
 from gnrecon.io import write_mesh
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture

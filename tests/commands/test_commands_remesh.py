@@ -13,10 +13,10 @@ from command_line import CommandLine
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, torus, write_scan
 from scipy.spatial import cKDTree
 
-from gnrecon.errors import ExitCode
 from gnrecon.export import quality, verify_file
 from gnrecon.fit import NeuralSDF
 from gnrecon.io import read_mesh
+from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture

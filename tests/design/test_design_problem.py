@@ -11,9 +11,9 @@ import trimesh
 from gnrecon.cloud import Frame
 from gnrecon.design import Design, DesignRegion, judge, read_design
 from gnrecon.design.measure import solid_pieces
-from gnrecon.errors import InputError
 from gnrecon.io import read_mesh, write_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 
 def box(*sides: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from analytic_fields import Field, torus
 
-from gnrecon.errors import Cancelled
 from gnrecon.export import extract, measure, project
+from gnrecon.runtime.errors import Cancelled
 
 BATCH = 1000
 

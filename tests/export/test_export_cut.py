@@ -9,10 +9,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gnrecon.cloud import Frame
-from gnrecon.errors import MeshError
 from gnrecon.export import extract, project, require_sound
 from gnrecon.export.cut import crop, subtract
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 
 RADIUS = 0.8
 

@@ -8,10 +8,10 @@ from analytic_fields import UTM, Field, Function, sphere, torus
 from scipy.spatial import KDTree
 from sharp_fields import HALF, between, box, cylinder, extracted, notched_box
 
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import decimate, project, require_sound, sharpen, simplify
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
 
 
 def sharp(field: Field, resolution: int = 32) -> Mesh:

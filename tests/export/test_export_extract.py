@@ -8,11 +8,11 @@ from analytic_fields import UNIT, UTM, Field, plate, shells, sines, sphere, toru
 from skimage.measure import marching_cubes
 
 from gnrecon.cloud import Frame
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import extract, project, require_sound, verify
 from gnrecon.export.band import NUDGE, narrow_band
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import Growing, Leaves
+from gnrecon.runtime.errors import MeshError, UsageError
 
 SHAPES = {
     "sphere": sphere(),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
-from gnrecon.errors import UsageError
 from gnrecon.export import extract, project
 from gnrecon.export.fineness import (
     cells_for_edges,
@@ -15,6 +14,7 @@ from gnrecon.export.fineness import (
     finer,
     measure_fineness,
 )
+from gnrecon.runtime.errors import UsageError
 
 RADIUS = 0.8
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, torus, union
 
-from gnrecon.errors import MeshError
 from gnrecon.export import extract, project, remove_handles, require_sound
 from gnrecon.export.loops import short_loops
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError
 
 Float = np.ndarray
 APART = 0.07

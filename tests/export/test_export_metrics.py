@@ -9,11 +9,11 @@ import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.export import extract, measure, project
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError, UsageError
 
 
 def ball(radius: float, frame: object = None, resolution: int = 96) -> Mesh:

@@ -7,11 +7,11 @@ import pytest
 from analytic_fields import UNIT, UTM, Field, shells, sphere, torus
 
 from gnrecon.cloud import Frame
-from gnrecon.errors import UsageError
 from gnrecon.export import extract, project, require_sound
 from gnrecon.export.nearest import Surface, nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 RESOLUTION = 32
 

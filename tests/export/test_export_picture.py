@@ -9,10 +9,10 @@ import pytest
 from analytic_fields import UTM, Field, Function, sphere, union
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import OutputError, UsageError
 from gnrecon.export import extract, project, render, render_sheet
 from gnrecon.export.camera import VIEWS, Camera
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import OutputError, UsageError
 
 SIZE = (120, 90)
 

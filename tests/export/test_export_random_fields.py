@@ -12,9 +12,9 @@ import trimesh
 from analytic_fields import UNIT
 from random_fields import random_field
 
-from gnrecon.errors import ExitCode, MeshError
 from gnrecon.export import SignedDistance, extract, project, repair, require_sound, verify_file
 from gnrecon.io import write_mesh
+from gnrecon.runtime.errors import ExitCode, MeshError
 
 FORMATS = ("obj", "ply", "stl", "glb")
 CASES = 200

@@ -10,9 +10,9 @@ import pytest
 from analytic_fields import Field, sphere, torus, union
 from sharp_fields import box, cylinder, extracted
 
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import RefineOptions, quality, refine, require_sound
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
 
 
 def test_nothing_asked_for_is_nothing_done() -> None:

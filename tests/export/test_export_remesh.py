@@ -7,11 +7,11 @@ import pytest
 from analytic_fields import UTM, Field, Function, sines, sphere, torus
 from sharp_fields import between, box, cylinder, extracted, lens, to_box_edges, to_cylinder_edges, to_lens_edge
 
-from gnrecon.errors import UsageError
 from gnrecon.export import project, quality, remesh, require_sound, sharpen, verify
 from gnrecon.export.remesh import creased
 from gnrecon.export.surface import CORNER, CREASE
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 
 
 def off(mesh: Mesh, field: Field) -> np.ndarray:

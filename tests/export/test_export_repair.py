@@ -9,10 +9,10 @@ import pytest
 from analytic_fields import UTM, Field, plate, shells, sines, sphere, union
 from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
 
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import drop_stray, extract, project, remove_stray, repair, require_bordered, require_sound, verify
 from gnrecon.export.topology import submesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
 
 
 @pytest.fixture(scope="module")

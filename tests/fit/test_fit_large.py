@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.advance import Advance, unheard
 from gnrecon.cloud import Frame, Samples
-from gnrecon.errors import Cancelled, FitError, MemoryLimitError, UsageError
 from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
@@ -29,6 +27,8 @@ from gnrecon.fit.patch import Belief
 from gnrecon.fit.work import Work
 from gnrecon.geometry.arrays import Int
 from gnrecon.options import Options
+from gnrecon.runtime.errors import Cancelled, FitError, MemoryLimitError, UsageError
+from gnrecon.runtime.progress import Advance, unheard
 from gnrecon.sampling import Box
 
 COUNT = 1500
@@ -141,7 +141,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
     with pytest.raises(UsageError, match="need a work folder"):
         Options(block_scheduler="tcp://127.0.0.1:9")
     assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
-    monkeypatch.setattr("gnrecon.scheduler.PATIENCE", "1s")
+    monkeypatch.setattr("gnrecon.runtime.parallel.PATIENCE", "1s")
     with pytest.raises(UsageError, match=r"No scheduler answers at tcp://127\.0\.0\.1:9"):
         scheduled.solve_scheduled(Work(tmp_path), [0], "tcp://127.0.0.1:9", unheard)
 

@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 
 from gnrecon.cloud import Frame, Samples
-from gnrecon.errors import FitError, UsageError
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit.deep import hold_out
 from gnrecon.fit.options import NORMAL_RESIDUALS, OPTIMISERS, SEARCHES
@@ -16,6 +15,7 @@ from gnrecon.fit.scene import Scene
 from gnrecon.fit.wide import MAX_STEP_POINTS
 from gnrecon.linalg import SOLVERS
 from gnrecon.optim import Record
+from gnrecon.runtime.errors import FitError, UsageError
 
 Float = NDArray[np.float64]
 

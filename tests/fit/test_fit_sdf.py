@@ -14,9 +14,9 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from gnrecon.cloud import Frame, Samples
-from gnrecon.errors import InputError, OutputError
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, fit
+from gnrecon.runtime.errors import InputError, OutputError
 from gnrecon.sampling import Box
 
 UNIT = Frame(np.zeros(3), 1.0)

@@ -8,13 +8,13 @@ import torch
 from scipy.special import kv
 from torch import Tensor
 
-from gnrecon.errors import FitError
 from gnrecon.field import Siren
 from gnrecon.field.features import DEGREES_OF_FREEDOM
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.start import COARSE, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.terms import Term
 from gnrecon.residuals import interface, normal_vector, signed_distance
+from gnrecon.runtime.errors import FitError
 
 each_field = pytest.mark.parametrize("widths", [(20,), (12, 15)], ids=str)
 

@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.cloud import Frame, Samples
-from gnrecon.errors import FitError
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
 from gnrecon.fit.data_rows import MOST_PARAMETERS, DataRows, free_units
@@ -22,6 +21,7 @@ from gnrecon.fit.left_out import PATCHES, calibration, left_out_scores
 from gnrecon.fit.start import random_features
 from gnrecon.residuals import normal_projection, normal_vector
 from gnrecon.residuals.first_order import Residual
+from gnrecon.runtime.errors import FitError
 from gnrecon.sampling import Box
 
 UNIT = Frame(np.zeros(3), 1.0)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.ingest import IngestCounts, clean, find_outliers
+from gnrecon.runtime.errors import InputError, UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
-from gnrecon.errors import InputError
 from gnrecon.ingest import flip_if_inward, oriented_normals
 from gnrecon.ingest.consistent import consistent_normals
 from gnrecon.ingest.gauss import gauss_normals
 from gnrecon.ingest.winding import agreement as confirmed
 from gnrecon.ingest.winding import disorder, outwardness, winding_on_surface
+from gnrecon.runtime.errors import InputError
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])

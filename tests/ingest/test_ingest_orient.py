@@ -9,11 +9,11 @@ import pytest
 from analytic_clouds import Float, sphere, torus
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.ingest import prepare
 from gnrecon.ingest.normals import oriented_normals
 from gnrecon.ingest.sight import towards_scanner
 from gnrecon.io import read_scans
+from gnrecon.runtime.errors import UsageError
 
 SCANNERS = np.array([[9.0, 0, 0], [-5, 8, 0], [-5, -8, 3], [0, 0, -9]])
 

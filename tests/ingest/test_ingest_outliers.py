@@ -8,10 +8,10 @@ from analytic_clouds import sphere, torus
 from scipy.spatial import cKDTree
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.ingest import clean, isolated_clusters
 from gnrecon.ingest.outlier_rules import OutlierRule, outliers_by_rule, parse_outliers
 from gnrecon.ingest.repeats import repeated_points
+from gnrecon.runtime.errors import UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])
 

@@ -11,9 +11,9 @@ from analytic_clouds import sphere, torus
 from scipy.spatial import cKDTree
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import InputError, UsageError
 from gnrecon.ingest import clean, oriented_normals, prepare
 from gnrecon.io import read_cloud, read_mesh
+from gnrecon.runtime.errors import InputError, UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])
 DATA = Path(os.environ.get("GNRECON_TEST_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))

@@ -7,9 +7,9 @@ import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.ingest import prepare
 from gnrecon.ingest.smooth import smoothed
+from gnrecon.runtime.errors import UsageError
 
 UTM = np.array([431234.125, 5412345.5, 312.0])
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.ingest import mean_spacing, subsample
 from gnrecon.ingest.subsample import METHODS
+from gnrecon.runtime.errors import UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import UsageError
 from gnrecon.ingest import mean_spacing, prepare, subsample
 from gnrecon.ingest.by_curvature import surface_variation
 from gnrecon.ingest.farthest import farthest_points
 from gnrecon.ingest.subsample import METHODS
+from gnrecon.runtime.errors import UsageError
 
 
 def sphere(count: int, rng: np.random.Generator) -> PointCloud:

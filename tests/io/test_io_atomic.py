@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from gnrecon.atomic import atomic_write, write_text
-from gnrecon.errors import MeshError, OutputError
+from gnrecon.runtime.errors import MeshError, OutputError
+from gnrecon.runtime.files import atomic_write, write_text
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -110,7 +110,7 @@ def test_a_killed_process_leaves_the_target_as_it_was(tmp_path: Path, existing: 
     if existing is not None:
         target.write_text(existing)
     script = (
-        "import sys, time\nfrom gnrecon.atomic import atomic_write\n"
+        "import sys, time\nfrom gnrecon.runtime.files import atomic_write\n"
         "with atomic_write(sys.argv[1], overwrite=True) as temporary:\n"
         "    temporary.write_text('half')\n    print('written', flush=True)\n    time.sleep(60)\n"
     )

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnrecon.errors import InputError
 from gnrecon.io import as_cloud, holds, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 COLOURED = [".ply", ".obj", ".off", ".glb", ".3mf"]
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])

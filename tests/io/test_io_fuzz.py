@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 from scan_writers import FORMS, file_of, random_cloud
 
-from gnrecon.errors import ExitCode, InputError, UsageError
 from gnrecon.io import read_scans, write_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import ExitCode, InputError, UsageError
 
 MUTATIONS = 76
 """Of each of the forms, so that there are more than 2,000 in all."""

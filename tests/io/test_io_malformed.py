@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnrecon.errors import GnreconError, InputError, UsageError
 from gnrecon.io import READERS, WRITERS, read_cloud, read_mesh, write_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import GnreconError, InputError, UsageError
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
 PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n{}end_header\n{}"

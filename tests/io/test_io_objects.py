@@ -13,9 +13,9 @@ import pytest
 
 from gnrecon.cloud import PointCloud
 from gnrecon.colors import as_bytes
-from gnrecon.errors import InputError
 from gnrecon.io import as_cloud, as_mesh, to_open3d, to_pymeshlab, to_trimesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(20, 3)) + np.array([431234.123456789, 5412345.987654321, 312.1])

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from scan_writers import file_of, random_cloud
 
-from gnrecon.errors import InputError, UsageError
 from gnrecon.io import read_any, read_cloud, read_mesh
+from gnrecon.runtime.errors import InputError, UsageError
 
 UTM = np.array([[431234.123, 5412345.987, 312.1], [431235.001, 5412346.5, 313.25], [431233.5, 5412340.25, 300.0]])
 

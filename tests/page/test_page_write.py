@@ -12,10 +12,10 @@ import pytest
 from pages import CENTRE, Elements, adorned, buffer, report, scan, scene, torus
 
 from gnrecon.cloud import PointCloud
-from gnrecon.errors import MeshError, OutputError
 from gnrecon.export import verify
 from gnrecon.mesh import Mesh
 from gnrecon.page import page_text, write_page
+from gnrecon.runtime.errors import MeshError, OutputError
 
 ALL_MODES = ["plain", "colors", "error", "sigma", "distance", "mean_curvature", "gauss_curvature", "intensity"]
 

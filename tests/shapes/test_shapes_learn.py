@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.errors import MeshError, UsageError
 from gnrecon.export import require_bordered, require_sound
 from gnrecon.field import Network
 from gnrecon.residuals import eikonal, interface, mean_curvature
+from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.sampling import Box
 from gnrecon.shapes import (
     Measurement,

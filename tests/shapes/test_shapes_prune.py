@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.errors import UsageError
 from gnrecon.field import Network
 from gnrecon.field.activation import SINE, TANH, WAVELET
 from gnrecon.residuals import signed_distance
+from gnrecon.runtime.errors import UsageError
 from gnrecon.shapes import catenoid, learn
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
 from gnrecon.shapes.prune import narrower, widened, without_unit

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.errors import FitError, UsageError
 from gnrecon.levelset import LevelSet
 from gnrecon.residuals import interface
+from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.sampling import Box
 from gnrecon.shapes import (
     PROBLEMS,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from benchmarks.problem import Problem
 from gnrecon.cloud import Frame, PointCloud
-from gnrecon.errors import InputError
 from gnrecon.io import read_cloud, read_mesh
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import InputError
 
 SAMPLES_APART = 1_000_000
 """Samples on each surface in the protocol of DiGS (Ben-Shabat et al. 2022)."""

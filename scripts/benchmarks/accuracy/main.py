@@ -23,8 +23,8 @@ from benchmarks.paper import lasting, positive, require_folders
 from benchmarks.problem import Case
 from benchmarks.provenance import REPOSITORY, provenance
 from benchmarks.sheet import Pixels, draw_row, write_sheet
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import write_text
 
 DATA = REPOSITORY.parent / "shared/data"
 LIMIT = 3600.0

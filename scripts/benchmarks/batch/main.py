@@ -20,8 +20,8 @@ from benchmarks.batch.command import Cost, run
 from benchmarks.batch.scans import BROKEN, CONFIG, make_scans
 from benchmarks.batch.witness import Witness, running
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, UsageError
+from gnrecon.runtime.errors import ExitCode, UsageError
+from gnrecon.runtime.files import write_text
 
 
 def main(arguments: Sequence[str]) -> int:

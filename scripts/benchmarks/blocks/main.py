@@ -19,9 +19,9 @@ from benchmarks.alone import run_program
 from benchmarks.blocks.plot import draw
 from benchmarks.engine.plot import require_matplotlib
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, OutputError, UsageError
 from gnrecon.fit.large import LARGE
+from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
+from gnrecon.runtime.files import write_text
 
 COUNTS = (100_000, 300_000, 1_000_000, 2_000_000)
 THREADS = 2

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gnrecon.atomic import atomic_write
+from gnrecon.runtime.files import atomic_write
 
 SIZE = (10.4, 4.2)
 """In inches."""

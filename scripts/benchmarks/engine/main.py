@@ -19,8 +19,8 @@ from benchmarks.engine.plot import draw, require_matplotlib
 from benchmarks.engine.tables import tables
 from benchmarks.paper import DATA
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, InputError, OutputError, UsageError
+from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
+from gnrecon.runtime.files import write_text
 
 FILE_WIDTH = 120
 

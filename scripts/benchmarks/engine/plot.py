@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gnrecon.atomic import atomic_write
-from gnrecon.errors import UsageError
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from benchmarks.alone import run_program
-from gnrecon.memory import process_peak_mb
+from gnrecon.runtime.memory import process_peak_mb
 
 
 def run_alone(module: str, function: str, folder: Path, **arguments: Any) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from rich.table import Table
 from benchmarks.engine.cost import exponent
 from benchmarks.engine.process import run_alone
 from benchmarks.provenance import REPOSITORY, provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, FitError, InputError, OutputError, UsageError
+from gnrecon.runtime.errors import ExitCode, FitError, InputError, OutputError, UsageError
+from gnrecon.runtime.files import write_text
 
 SCAN = REPOSITORY / "sample_data/bracket_sparse.ply"
 RESOLUTIONS, WHOLE = (256, 512, 1024), 256

@@ -15,9 +15,9 @@ from rich.table import Table
 from benchmarks.engine.process import run_alone
 from benchmarks.ingest.scans import WRITERS
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode, OutputError, UsageError
 from gnrecon.io import MOST_POINTS
+from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
+from gnrecon.runtime.files import write_text
 
 POINTS = 20_000_000
 _ROWS = (

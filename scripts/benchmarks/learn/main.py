@@ -17,9 +17,9 @@ from rich.table import Table
 
 from benchmarks.learn.step import step_figures
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode
 from gnrecon.report import plain
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import write_text
 from gnrecon.shapes import OPTIMISERS, PROBLEMS, learn
 
 RATES = {"cone": 1e-4}

@@ -22,8 +22,8 @@ from benchmarks.orient.sides import sides
 from benchmarks.paper import lasting, require_folders
 from benchmarks.problem import Problem
 from benchmarks.provenance import provenance
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import write_text
 
 WIDTH = 160
 

@@ -15,8 +15,6 @@ from rich.table import Table
 
 from benchmarks.provenance import provenance
 from benchmarks.refine.shapes import SHAPES
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode
 from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
 from gnrecon.export.between import between
 from gnrecon.export.decimate import collapsed
@@ -24,6 +22,8 @@ from gnrecon.export.meshlab import from_meshlab, to_meshlab
 from gnrecon.export.solid import centre_and_size
 from gnrecon.fit import NeuralSDF
 from gnrecon.mesh import Mesh
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import write_text
 
 CELLS, MODEL_CELLS = 48, 128
 FEWER = 10

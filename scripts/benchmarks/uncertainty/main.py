@@ -18,8 +18,8 @@ from benchmarks.provenance import provenance
 from benchmarks.uncertainty.check import figures, run
 from benchmarks.uncertainty.picture import draw_picture
 from benchmarks.uncertainty.scans import CASES, Case
-from gnrecon.atomic import write_text
-from gnrecon.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import write_text
 
 OPTIONS = {"resolution": 96}
 PICTURED = "bracket, holed"

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.uncertainty.check import Check
-from gnrecon.atomic import atomic_write
 from gnrecon.export import render
 from gnrecon.geometry.arrays import Float
+from gnrecon.runtime.files import atomic_write
 
 PANEL = (420, 400)
 """Width and height of a panel, in pixels."""

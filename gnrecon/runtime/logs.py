@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gnrecon.errors import OutputError, UsageError
+from gnrecon.runtime.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console

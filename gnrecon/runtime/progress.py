@@ -1,7 +1,7 @@
 """How far a piece of work is: a function that the work calls now and then, which may also end it.
 
 The one who asks for the work gives the function; the work calls it between its larger pieces, so that it costs nothing
-to speak of. Whatever it raises, such as `gnrecon.errors.Cancelled`, ends the work there and then.
+to speak of. Whatever it raises, such as `gnrecon.runtime.errors.Cancelled`, ends the work there and then.
 """
 
 from __future__ import annotations

@@ -11,13 +11,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
-from gnrecon.advance import Advance, unheard
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.progress import Advance, unheard
 
 Item = TypeVar("Item")
+
 Answer = TypeVar("Answer")
 
 _SETTING = Lock()
@@ -78,3 +80,50 @@ def abreast(
 def _told(answer: Answer, number: int, count: int, advance: Advance) -> Answer:
     advance(number / count)
     return answer
+
+
+# Rows by stretches: what is computed of millions at a time takes little memory beside them.
+
+
+def slices(count: int, size: int = 1 << 18) -> list[slice]:
+    """Return slices that cover `count` rows, at most `size` at a time."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+PATIENCE = "20s"
+
+
+# A Dask scheduler that is there already, for whoever hands tasks in: batches of scans and blocks of a large one.
+
+
+def require_distributed() -> Any:
+    """Return the package `distributed`.
+
+    Raises
+    ------
+    UsageError
+        When it is not installed.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise UsageError("Dask is not installed; add it by: pip install 'gnrecon[cluster]'.") from None
+    return distributed
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Any]:
+    """Give a `distributed.Client` of the scheduler at an address such as ``tcp://host:8786``.
+
+    Raises
+    ------
+    UsageError
+        When Dask is not installed, or the scheduler does not answer.
+    """
+    distributed = require_distributed()
+    try:
+        client = distributed.Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"No scheduler answers at {address} ({error}).") from error
+    with client:
+        yield client

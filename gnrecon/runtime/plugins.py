@@ -8,15 +8,16 @@ installed at that moment: nothing is registered, and nothing is kept.
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from gnrecon.errors import GnreconError, UsageError
-from gnrecon.foreign import guarded, told
+from gnrecon.runtime.errors import GnreconError, UsageError
 
 READERS, WRITERS, RESIDUALS = "gnrecon.readers", "gnrecon.writers", "gnrecon.residuals"
+
 KINDS = {READERS: "reader", WRITERS: "writer", RESIDUALS: "residual"}
 """Groups of entry points, and what each holds."""
 
@@ -67,7 +68,7 @@ class Plugin:
         Raises
         ------
         GnreconError
-            Of the given kind, when the block fails by its own fault; see `gnrecon.foreign.guarded`.
+            Of the given kind, when the block fails by its own fault; see `gnrecon.runtime.plugins.guarded`.
         """
         return guarded(kind, lambda error: f"{self.subject} failed ({told(error)}).")
 
@@ -102,3 +103,52 @@ def find(group: str, name: str) -> Plugin | None:
 
 def _capital(plugin: Plugin) -> str:
     return str(plugin).replace("the", "The", 1)
+
+
+_LONGEST = 200
+
+
+# Code of other people that runs on files: whatever it raises on damaged ones becomes one sentence.
+
+
+@contextmanager
+def guarded(kind: type[GnreconError], sentence: Callable[[BaseException], str]) -> Iterator[None]:
+    """Run a block of other people's code.
+
+    Failures of gnrecon's own kinds, want of memory, what the system says of a file, and interrupts come through as they
+    are.
+
+    Parameters
+    ----------
+    kind : of the failure that the block's own ones become
+    sentence : says what failed, given what was raised; see `told`
+
+    Raises
+    ------
+    GnreconError
+        Of the given kind, when the block fails in any other way.
+    """
+    try:
+        yield
+    except (GnreconError, MemoryError):
+        raise
+    except BaseException as error:
+        if not _fails(error):
+            raise
+        said = sentence(error)
+        _log.info("%s", said, exc_info=True)
+        raise kind(said) from error
+
+
+def told(error: BaseException) -> str:
+    """Return what was raised in one line: its type, and the beginning of what it says."""
+    said = " ".join(str(error).split())[:_LONGEST]
+    return f"{type(error).__name__}{': ' if said else ''}{said}"
+
+
+def _fails(error: BaseException) -> bool:
+    """Whether this is the code's own failure."""
+    if isinstance(error, OSError):
+        return error.errno is None
+    # What goes wrong inside of a library written in Rust is a `PanicException`, which is no `Exception`.
+    return isinstance(error, Exception | SystemExit) or type(error).__name__ == "PanicException"
