@@ -13,8 +13,8 @@ import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from gnrecon.cloud import Frame, PointCloud, Samples
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.runtime.errors import Cancelled, FitError, GnreconError, InputError, MeshError, OutputError, UsageError
 from gnrecon.version import __version__
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from gnrecon.cloud import PointCloud, Samples
 from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
 from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud, Samples
 from gnrecon.io import holds
-from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.runtime.progress import Advance, unheard

@@ -463,7 +463,7 @@ def mesh_command(
     import numpy as np
 
     from gnrecon.commands.remesh import remesh as mesh_again
-    from gnrecon.lengths import parse_box, parse_length
+    from gnrecon.geometry.units import parse_box, parse_length
     from gnrecon.shaping import Shape
 
     del debug

@@ -18,7 +18,7 @@ from gnrecon.export.fineness import MOST_REFINED, Fineness, error_once_projected
 from gnrecon.export.protocol import sdf_and_gradient
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.options import Options
 from gnrecon.runtime.progress import Advance, part, unheard
 

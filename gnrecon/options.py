@@ -13,12 +13,12 @@ from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.large import LARGE
 from gnrecon.fit.options import FitOptions
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Region
+from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.orient import require_orientation
 from gnrecon.ingest.spacing import neighbour_spacing
 from gnrecon.io import MOST_POINTS
-from gnrecon.lengths import METRES, parse_box, parse_plane, parse_reach
-from gnrecon.region import Region
 from gnrecon.runtime.errors import UsageError
 
 RESOLUTION, FEWEST_CELLS, MOST_CELLS = 256, 128, 1024
@@ -43,7 +43,7 @@ class Options:
     clip_plane : sequence of str
         Planes ``"a,b,c,d"``; points with a x + b y + c z + d < 0 for any of them are not read.
     units : str, optional
-        The scan's own unit, a name of `gnrecon.lengths.METRES`; with it, lengths may have other units, as in ``"2mm"``.
+        The scan's own unit, one of `gnrecon.geometry.units.METRES`; lengths may then have other units: ``"2mm"``.
     fraction : float in (0, 1], optional
         Share of the points to keep.
     max_points : int, optional

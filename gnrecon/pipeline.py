@@ -17,7 +17,6 @@ import numpy.typing as npt
 import torch
 
 from gnrecon.adorn import Sources, adorn, fitting, wanted
-from gnrecon.cloud import PointCloud
 from gnrecon.export import (
     Attribute,
     Invented,
@@ -36,6 +35,8 @@ from gnrecon.export import (
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.work import require_work_folder
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units, layers_of, prepare, survey
 from gnrecon.io import (
     Reading,
@@ -49,11 +50,9 @@ from gnrecon.io import (
     to_trimesh,
     write_mesh,
 )
-from gnrecon.mesh import Mesh
 from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
-from gnrecon.region import Region
 from gnrecon.report import Stages, plain, versions
 from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.runtime.logs import TOLD

@@ -15,7 +15,7 @@ from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.meshing import StageTimer, mesh_field, untimed
 from gnrecon.options import Options
 from gnrecon.runtime.errors import MeshError, UsageError

@@ -18,9 +18,9 @@ from sample_shapes import SHAPES, Shape, project
 from skimage.measure import marching_cubes
 from virtual_scanner import Scanner, scan
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import write_mesh
-from gnrecon.mesh import Mesh
 
 SPACING = 0.6  # mm between the grid's points
 TOLERANCE = 0.08  # mm

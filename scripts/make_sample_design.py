@@ -17,8 +17,8 @@ import manifold3d
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
-from gnrecon.mesh import Mesh
 
 SEGMENTS, ROWS = 64, 5
 BOLTS, BOLT_RADIUS, FOOT, HEAD_RADIUS = (-40.0, 40.0), 6.0, 14.0, 11.0

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import open3d
 
-from gnrecon.cloud import PointCloud
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 
 Float = npt.NDArray[np.float64]
 

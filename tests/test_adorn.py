@@ -11,7 +11,7 @@ import pytest
 from scan_files import TUBE, torus
 
 from gnrecon.adorn import wanted
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import read_mesh
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.errors import FitError, UsageError

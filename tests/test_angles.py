@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.angles import widest_gap
+from gnrecon.geometry.statistics import widest_gap
 
 
 def test_the_widest_gap_about_an_axis() -> None:

@@ -23,8 +23,8 @@ from benchmarks.paper import main as paper
 from benchmarks.table import FIGURES, comparison_table, failures
 from benchmarks.trial import Job, run_trial
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
-from gnrecon.mesh import Mesh
 
 MAJOR, MINOR = 3.0, 1.2
 CENTER = np.array([10.0, -4.0, 7.0])

@@ -34,10 +34,10 @@ from benchmarks.problem import Problem
 from benchmarks.samples_apart import between_samples
 from benchmarks.trial import Job, run_trial
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import require_sound, verify
 from gnrecon.export.nearest import Surface
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import UsageError
 
 NOWHERE = Path("nowhere")

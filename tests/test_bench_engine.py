@@ -35,7 +35,7 @@ from benchmarks.engine.tables import tables
 from PIL import Image
 
 from gnrecon.field import Siren
-from gnrecon.linalg import SOLVERS, Cholesky, identity
+from gnrecon.least_squares import SOLVERS, Cholesky, identity
 from gnrecon.runtime.errors import GnreconError
 
 NET = (8, 8)

@@ -20,13 +20,13 @@ from benchmarks.export.main import main as export
 from benchmarks.export.main import sentences
 from benchmarks.export.whole_grid import compare, same_surface
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract
 from gnrecon.field import Siren
 from gnrecon.fit import NeuralSDF
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
-from gnrecon.sampling import Box
 
 
 @pytest.fixture

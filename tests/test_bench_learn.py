@@ -15,7 +15,7 @@ from benchmarks.learn.nested import nested_step, papers_step
 from benchmarks.learn.step import closed_step
 
 from gnrecon.field import Network
-from gnrecon.linalg import Cholesky
+from gnrecon.least_squares import Cholesky
 from gnrecon.residuals import eikonal, interface, mean_curvature
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm

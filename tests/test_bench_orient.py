@@ -18,7 +18,7 @@ from benchmarks.orient.main import main, meshes_table
 from benchmarks.orient.sides import sides, true_normals
 from benchmarks.problem import Problem
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import ExitCode, UsageError
 
 NOWHERE = Path("nowhere")

@@ -18,7 +18,7 @@ from benchmarks.uncertainty.main import COLUMNS, main
 from benchmarks.uncertainty.picture import HIGHEST, LOWEST, colors
 from benchmarks.uncertainty.scans import CASES, Case, draw, errors
 
-from gnrecon.cloud import Frame
+from gnrecon.geometry.point_cloud import Frame
 
 SMALL = Case("knot", 250, 0.0, 2, 0.3)
 

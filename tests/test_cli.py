@@ -342,12 +342,12 @@ def test_a_kill_leaves_nothing_under_the_targets_name(out: Path, scan: Path, pla
 
 TORN_BY_REPAIR = """
 import gnrecon.meshing
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 gnrecon.meshing.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
 """
 TORN_BY_WRITING = """
 import gnrecon.io.formats
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 write = gnrecon.io.formats.WRITERS[".obj"]
 gnrecon.io.formats.WRITERS[".obj"] = lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path)
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.colors import as_bytes, to_linear, to_srgb
+from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb
 
 ALL = np.arange(256, dtype=np.uint8)
 COLORS = np.column_stack([ALL, ALL[::-1], np.roll(ALL, 77)])

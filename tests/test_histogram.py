@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.histogram import Histogram
+from gnrecon.geometry.statistics import Histogram
 
 
 @given(st.lists(st.floats(-10, 10), min_size=1), st.floats(-9, 0), st.floats(1, 9), st.integers(1, 20))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.lengths import METRES, parse_box, parse_length
+from gnrecon.geometry.units import METRES, parse_box, parse_length
 from gnrecon.runtime.errors import UsageError
 
 

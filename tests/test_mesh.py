@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from gnrecon.mesh import Mesh, area_vectors
+from gnrecon.geometry.mesh import Mesh, area_vectors
 from gnrecon.runtime.errors import InputError
 
 TRIANGLE = Mesh(np.eye(3), np.array([[0, 1, 2]]))

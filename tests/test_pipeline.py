@@ -14,9 +14,9 @@ import torch
 from scan_files import FAST, TORUS_VOLUME, TUBE, box, gnrecon, sphere, torus, write_scan
 from scipy.spatial.transform import Rotation
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import measure
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.errors import InputError, MemoryLimitError, MeshError, UsageError

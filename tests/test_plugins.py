@@ -13,10 +13,10 @@ import torch
 from other_packages import ACME, install, packages
 from scan_files import torus
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.io import read_cloud, read_mesh, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.pipeline import reconstruct
 from gnrecon.residuals import SecondOrder, eikonal, interface, mean_curvature, named
 from gnrecon.runtime.errors import FitError, GnreconError, InputError, OutputError, UsageError

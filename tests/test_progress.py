@@ -14,7 +14,7 @@ from rich.progress import Progress as Bar
 from scan_files import torus, write_scan
 
 from gnrecon.cli import main
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.run import STAGES, Shown

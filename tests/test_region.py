@@ -14,13 +14,12 @@ from scan_files import gnrecon, sphere, write_scan
 
 from gnrecon.batch.request import Request
 from gnrecon.cli import main
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud, Region
+from gnrecon.geometry.units import parse_plane
 from gnrecon.io import cropped, read_scans
 from gnrecon.io.contents import Contents
 from gnrecon.io.gather import Gatherer
-from gnrecon.lengths import parse_plane
 from gnrecon.options import Options
-from gnrecon.region import Region
 from gnrecon.runtime.errors import UsageError
 
 BOX = ((-1.0, -1.0, 0.0), (1.0, 1.0, 1.0))

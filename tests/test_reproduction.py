@@ -10,7 +10,7 @@ import pytest
 from reproduction.__main__ import main
 from reproduction.figures import HIGH, LOW, MIDDLE, coloured
 
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 def test_an_experiment_is_run_once_and_drawn(

@@ -11,8 +11,8 @@ from make_sample_data import SAMPLES
 from sample_shapes import SHAPES, extrude, gradient, project, smooth_cut, smooth_union
 from virtual_scanner import Scanner, scan
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_cloud, read_mesh
-from gnrecon.mesh import Mesh
 
 Float = npt.NDArray[np.float64]
 

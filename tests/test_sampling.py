@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnrecon.sampling import Box, CoarseDistance, halved, near_surface, winding_number
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, halved, near_surface, winding_number
 
 Float = NDArray[np.float64]
 Shape = Callable[[int], tuple[Float, Float]]

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import (
     CLOUD_WRITERS,
     all_members,
@@ -20,7 +21,6 @@ from gnrecon.io import (
 )
 from gnrecon.io.losses import losses
 from gnrecon.io.origin import told
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import require_files
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gnrecon.cloud import PointCloud
 from gnrecon.estimate import estimate
 from gnrecon.fit import bounds_of
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare, survey
 from gnrecon.io import Reading
 from gnrecon.options import Options

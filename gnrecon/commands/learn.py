@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gnrecon.cloud import Frame
 from gnrecon.commands.part import NAME, DesignFiles, part_mesh
 from gnrecon.commands.scanned import FILES, ScanFiles, is_scan, placed
 from gnrecon.design import Design, DesignFacts, judge
 from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import all_members, check_writable, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.pipeline import limited
 from gnrecon.report import plain, versions
 from gnrecon.runtime.errors import ExitCode, UsageError

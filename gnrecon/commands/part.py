@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Frame
 from gnrecon.design import Design, read_design
 from gnrecon.export import curvatures, extract, project, remove_stray, repair
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.shapes import LearnedField
 

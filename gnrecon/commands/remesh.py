@@ -9,11 +9,11 @@ import numpy as np
 from rich.console import Console
 
 from gnrecon.adorn import curvature_of, wanted
-from gnrecon.cloud import PointCloud
 from gnrecon.export import Neighbourhood, require_sound, verify_file
 from gnrecon.fit import NeuralSDF
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import check_writable, holds, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.options import Options
 from gnrecon.pipeline import limited, require_device
 from gnrecon.report import Stages

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Frame, PointCloud
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame, PointCloud
 from gnrecon.ingest import prepare
 from gnrecon.io import read_reference
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.shapes import ShapeProblem, scanned
 

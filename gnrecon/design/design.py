@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Frame
 from gnrecon.design.interfaces import Interfaces
 from gnrecon.design.region import DesignRegion
 from gnrecon.export.solid import from_solid, to_solid
 from gnrecon.export.verify import failures, verify
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import read_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 MARGIN = 0.1

@@ -14,7 +14,7 @@ import numpy as np
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.topology import face_components, submesh
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 class InterfaceSample(NamedTuple):

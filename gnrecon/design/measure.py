@@ -14,7 +14,7 @@ from gnrecon.design.design import Design
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.export.topology import face_components, submesh
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 TOLERANCE = 1e-3
 _SAMPLES = 50_000

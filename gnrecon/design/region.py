@@ -9,8 +9,8 @@ import numpy as np
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.nearest import Surface
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.mesh import Mesh
-from gnrecon.sampling import Box
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.signed_distance import Box
 
 _NEAR_SHARE, _NEAR_SPREAD = 0.5, 0.03
 

@@ -10,7 +10,7 @@ from gnrecon.export.nearest import ray_scene
 from gnrecon.export.shading import open_sky, sphere_directions
 from gnrecon.export.solid import centre_and_size
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 REACH = 0.7
 """How near something must be to cover the sky, in halves of the mesh's longest side."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes, to_linear, to_srgb
 from gnrecon.export.attribute import Attribute
 from gnrecon.export.neighbours import COUNT, Neighbourhood
 from gnrecon.geometry.arrays import Float, Values
+from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb
+from gnrecon.geometry.point_cloud import PointCloud
 
 MEASURED = ("amplitude", "confidence", "intensity", "quality", "reflectance")
 """Names of measured values, which are averaged even where a file holds whole numbers."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from gnrecon.export.trim import cut_along, used
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 ON = 1e-9
 """Distance, as a share of the box's diagonal, at which a vertex is on a side."""

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
 SNAP = 1e-9

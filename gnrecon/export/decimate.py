@@ -21,7 +21,7 @@ from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.remesh import creased, settled
 from gnrecon.export.solid import centre_and_size, from_solid, refusal, to_solid
 from gnrecon.export.surface import unit
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
 FEWEST = 4

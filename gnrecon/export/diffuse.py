@@ -16,7 +16,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 TOLERANCE, MOST_STEPS = 1e-6, 500
 """Of conjugate gradients: relative residual, and most steps."""

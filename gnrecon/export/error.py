@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export.nearest import Surface
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 
 
 def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:

@@ -14,7 +14,7 @@ import numpy as np
 from gnrecon.export.meshlab import to_meshlab
 from gnrecon.export.solid import refusal, to_solid
 from gnrecon.export.verify import MeshFacts, failures, verify
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 ROUNDING = 4 * np.finfo(np.float64).eps
 """A face is flat when its height is not more than this share of the largest coordinate."""

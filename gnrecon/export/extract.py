@@ -20,7 +20,7 @@ from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import CHUNK, Values
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 from gnrecon.runtime.progress import Advance, part, unheard
 

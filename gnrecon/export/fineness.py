@@ -19,7 +19,7 @@ from gnrecon.export.between import between
 from gnrecon.export.project import project, side_lengths
 from gnrecon.export.protocol import SignedDistance
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
 MEAN_EDGE = 0.97

@@ -25,12 +25,12 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from gnrecon.angles import widest_gap
 from gnrecon.export.loops import Loop, short_loops
 from gnrecon.export.topology import Edges, corner_fans
 from gnrecon.export.verify import require_sound
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.statistics import widest_gap
 from gnrecon.runtime.errors import MeshError
 
 RIM = 2 * np.pi
@@ -140,7 +140,7 @@ class _Support:
 
     def __init__(self, points: Float) -> None:
         # It brings torch, which a check of a mesh does without.
-        from gnrecon.sampling import Density
+        from gnrecon.geometry.signed_distance import Density
 
         self._density = Density(points)
 

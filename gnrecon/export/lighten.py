@@ -15,7 +15,7 @@ import numpy as np
 from gnrecon.export.nearest import Surface
 from gnrecon.export.solid import centre_and_size
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 DENSITY = 2.3
 """Faces that clustering leaves for each square of the surface that is as wide as a cube, about."""

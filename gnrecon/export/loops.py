@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.export.topology import Edges, face_components
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.parallel import slices
 
 Words = npt.NDArray[np.uint64]

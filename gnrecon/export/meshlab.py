@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.export.solid import centre_and_size
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 def to_meshlab(mesh: Mesh) -> Any:

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export.definitions import Metrics
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.progress import Advance, unheard
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from gnrecon.export.solid import centre_and_size
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.parallel import slices
 
 RAYS = 5

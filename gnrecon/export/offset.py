@@ -12,11 +12,11 @@ from functools import cached_property
 
 import numpy as np
 
-from gnrecon.cloud import Frame
 from gnrecon.export.nearest import Surface
 from gnrecon.export.solid import centre_and_size
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import UsageError
 
 LEAST_LEVEL = 1e-5

@@ -12,15 +12,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
-from gnrecon.colors import to_linear as to_light
 from gnrecon.export.camera import Camera, View
 from gnrecon.export.nearest import ray_scene
 from gnrecon.export.shading import shade, sky_share, to_bytes, to_linear
 from gnrecon.export.splats import draw_points
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.colors import to_linear as to_light
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import UsageError
 
 CLAY, SLATE = (230, 208, 180), (86, 120, 164)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gnrecon.export.protocol import SignedDistance, sdf_and_gradient
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh, area_vectors
+from gnrecon.geometry.mesh import Mesh, area_vectors
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import Advance, unheard

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from gnrecon.cloud import Frame
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame
 
 
 class SignedDistance(Protocol):

@@ -19,7 +19,7 @@ from gnrecon.export.remesh import remesh
 from gnrecon.export.repair import repair
 from gnrecon.export.sharpen import sharpen
 from gnrecon.export.verify import verify
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.progress import Advance, unheard
 

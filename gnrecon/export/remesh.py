@@ -22,7 +22,7 @@ from gnrecon.export.sizing import bent_lengths, even_lengths
 from gnrecon.export.split import split_long
 from gnrecon.export.surface import EdgeTable, Surface, unit
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
 ROUNDS = 8

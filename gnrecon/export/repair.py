@@ -20,7 +20,7 @@ from gnrecon.export.solid import from_solid, refusal, to_solid
 from gnrecon.export.topology import Edges, corner_fans, split_vertices, submesh
 from gnrecon.export.verify import require_sound, verify
 from gnrecon.geometry.arrays import Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
 APART = 1e-3

@@ -16,7 +16,7 @@ from gnrecon.export.protocol import SignedDistance
 from gnrecon.export.split import split
 from gnrecon.export.surface import EdgeTable, Surface, area_vectors, unit
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 REACH = 1.5
 """How far from a chamfer's middle its crease may lie, in lengths of the chamfer."""

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export.camera import View
 from gnrecon.export.picture import Image, render, write_image
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 
 SIDES: tuple[View, ...] = ("front", "right", "top")
 """The smaller pictures, from the left."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 def centre_and_size(mesh: Mesh) -> tuple[Float, float]:

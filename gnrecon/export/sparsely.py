@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 MOST = 20_000
 """Vertices at which the quantity is computed."""

@@ -14,7 +14,7 @@ import numpy as np
 from gnrecon.export.nearest import nearest_on_surface
 from gnrecon.export.topology import face_components, submesh
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
 LEAST_VOTES, LEAST_SHARE = 3, 0.005

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 SMOOTH, CREASE, CORNER = 0, 1, 2
 """Kinds of vertices: without a crease, on one that passes through, and where creases end, meet or branch."""

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gnrecon.geometry.arrays import Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gnrecon.export.diffuse import diffused, vertex_areas
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
 CLEAR = 0.1

@@ -13,7 +13,7 @@ import numpy as np
 
 from gnrecon.export.solid import refusal, to_solid
 from gnrecon.export.topology import Edges, face_components, split_vertices
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
 

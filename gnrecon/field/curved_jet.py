@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.activation import Activation, Index, parted
-from gnrecon.linalg.rows import LayerRows
+from gnrecon.least_squares.layer_products import LayerRows
 
 Layers = list[tuple[Tensor, Tensor]]
 Derivatives = dict[Index, Tensor]

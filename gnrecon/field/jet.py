@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.rows import LayerRows
+from gnrecon.least_squares.layer_products import LayerRows
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import Samples
 from gnrecon.fit.averaged import Told, told
 from gnrecon.fit.ball import Ball
 from gnrecon.fit.contradict import reconciled
@@ -29,10 +28,11 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Free, Shaping, bend_global
 from gnrecon.fit.sharp import Sharp
 from gnrecon.geometry.arrays import Int, Mask
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density
 from gnrecon.optim import Solution
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import Advance, part, unheard
-from gnrecon.sampling import Density
 
 COARSE_POINTS = 5000
 """Most points that the global field sees."""

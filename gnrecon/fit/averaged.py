@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.cloud import Samples
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.choose import Choice, Leftover, Trials
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.sharp import Sharp, has_edges
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.point_cloud import Samples
 
 _log = logging.getLogger(__name__)
 

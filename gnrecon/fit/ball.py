@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Samples
 from gnrecon.fit.primitives import Sphere, feet
 from gnrecon.fit.white import is_white
 from gnrecon.geometry.arrays import Float
-from gnrecon.robust import deviation
-from gnrecon.sampling import Density
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density
+from gnrecon.geometry.statistics import deviation
 
 LEAST = 30
 """Fewest points that could tell a sphere from a quadric by what is noise."""

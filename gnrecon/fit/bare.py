@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from gnrecon.fit.laid import MADE, NEAR, OFF, Face, Laid, Search
 from gnrecon.fit.primitives import LEAST, agreed
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 NOISE, MOST = 0.1, 0.2
 """Noise with which surfaces are looked for at least, and beyond which few points cannot tell a shape from them, in

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.features import Features
-from gnrecon.linalg import identity
-from gnrecon.linalg.jacobian import DenseJacobian
+from gnrecon.least_squares import identity
+from gnrecon.least_squares.jacobian import DenseJacobian
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 from gnrecon.optim.problem import loss_of
 from gnrecon.residuals import Linearised, SecondOrder

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.robust import deviation
+from gnrecon.geometry.signed_distance import Density
+from gnrecon.geometry.statistics import deviation
 from gnrecon.runtime.parallel import slices
-from gnrecon.sampling import Density
 
 Part = tuple[slice, Int, Float]
 

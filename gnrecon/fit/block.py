@@ -25,7 +25,7 @@ from gnrecon.fit.octree import Codes, morton
 from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.work import Arrays, Work
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.sampling import Box, is_certain, side_of
+from gnrecon.geometry.signed_distance import Box, is_certain, side_of
 
 CHANCE = 3
 """Tells the cubes' chance from that of the rest of the fit, which has the same seed."""

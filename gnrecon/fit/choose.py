@@ -22,7 +22,6 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.cloud import Samples
 from gnrecon.field.features import Features
 from gnrecon.fit.clean import clean_noise
 from gnrecon.fit.evidence import PATCHES as EVIDENT_PATCHES
@@ -30,8 +29,9 @@ from gnrecon.fit.evidence import POINTS, Evidence
 from gnrecon.fit.patch import Belief, Patch, patch_system
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density
 from gnrecon.runtime.parallel import abreast
-from gnrecon.sampling import Density
 
 LENGTHS = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)
 POSITIONS = (0.02, 0.1, 0.3, 0.8)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gnrecon.fit.creases import over_planes
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 Noise = tuple[float, float]
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gnrecon.cloud import Samples
 from gnrecon.field.siren import Siren
 from gnrecon.fit.loss import distance_term
 from gnrecon.fit.options import FitOptions
@@ -24,6 +23,7 @@ from gnrecon.fit.smoothness import LENGTHS, smooth_spectrum
 from gnrecon.fit.start import wide_start
 from gnrecon.fit.terms import Term
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.point_cloud import Samples
 from gnrecon.residuals.first_order import interface
 
 CLEARLY = -0.5

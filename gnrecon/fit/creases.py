@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.fit.primitives import cosine_of
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 NEAREST, REACH = 40, 3.0
 """Most neighbours of a point, and how far they are at most, in radii of its disk."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from gnrecon.field.siren import Siren
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.terms import Term
-from gnrecon.linalg import LayeredJacobian
+from gnrecon.least_squares import LayeredJacobian
 from gnrecon.residuals.first_order import Residual, interface
 
 MOST_PARAMETERS = 3000

@@ -25,7 +25,7 @@ from gnrecon.fit.options import FitOptions
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.start import spectral_start
-from gnrecon.linalg import layer_scaled
+from gnrecon.least_squares import layer_scaled
 from gnrecon.optim import Callback, GainRatioDamping, Solution, StopRule
 from gnrecon.optim.problem import loss_of
 from gnrecon.runtime.progress import Advance, unheard

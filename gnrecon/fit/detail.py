@@ -25,9 +25,9 @@ from gnrecon.fit.patch import Belief, PatchSystem
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.shaped import Shaping
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.runtime.parallel import abreast
 from gnrecon.runtime.progress import Advance, part, unheard
-from gnrecon.sampling import CoarseDistance
 
 _log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from gnrecon.fit.octree import BITS, Codes, morton
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.sampling import winding_number
+from gnrecon.geometry.signed_distance import winding_number
 
 SIDE = 4.0
 """Of the smallest cubes, in radii of the disk that a point stands for in the median."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import CoarseDistance
+from gnrecon.geometry.signed_distance import CoarseDistance
 
 
 @dataclass

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.cloud import Samples
 from gnrecon.field.siren import Siren
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import REACH, Scene
@@ -19,9 +18,10 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.smoothness import global_smoothness, smooth_spectrum
 from gnrecon.fit.wide import fit_wide
 from gnrecon.geometry.arrays import Int, Mask
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import is_certain
 from gnrecon.optim import Solution
 from gnrecon.runtime.progress import Advance, part
-from gnrecon.sampling import is_certain
 
 _log = logging.getLogger(__name__)
 

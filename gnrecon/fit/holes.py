@@ -22,7 +22,7 @@ from gnrecon.fit.min_cut import minimal_inside, shifted
 from gnrecon.fit.mouths import mouths
 from gnrecon.fit.primitives import Seen, Surface, Wanted, agreed, feet, planar_share, surfaces
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.sampling import Box, CoarseDistance, Density
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, Density
 
 MOST_POINTS, CLOSER = 6000, 15_000
 """Points that are looked at for holes, and for surfaces; holes that so many do not show are small."""

@@ -20,8 +20,8 @@ from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, feet, surfaces
 from gnrecon.fit.white import is_white
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.robust import deviation
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
+from gnrecon.geometry.statistics import deviation
 
 MADE = 0.5
 """Least share of the points that lie on such surfaces, where a shape is a made one: 0.8 and more on machine parts, 0.2

@@ -28,8 +28,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.fit.data_rows import DataRows
-from gnrecon.linalg import LayeredJacobian
-from gnrecon.linalg.cholesky import damped_factor, solve_factored
+from gnrecon.least_squares import LayeredJacobian
+from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.runtime.errors import FitError
 
 PRIOR = 10.0

@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from gnrecon.cloud import Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.features import Features
 from gnrecon.field.partition import Partition
@@ -34,6 +33,7 @@ from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.work import Work
 from gnrecon.fit.workers import solve_blocks
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import Advance, part, unheard
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gnrecon.fit.options import FitOptions
-from gnrecon.linalg import SOLVERS, layer_scaled
+from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import LBFGS, Adam, GainRatioDamping, GaussNewton, LogLineSearch, Optimiser, Search
 
 ENERGY = 0.3

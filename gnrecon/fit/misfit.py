@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Samples
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float
-from gnrecon.histogram import Histogram
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.statistics import Histogram
 
 MOST = 20_000
 """Points that are asked; more would cost time and change no figure."""

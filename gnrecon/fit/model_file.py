@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gnrecon.cloud import Frame
 from gnrecon.field.siren import Siren
 from gnrecon.fit.detail_file import detail_of, detail_tensors
 from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.geometry.point_cloud import Frame
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.files import atomic_write
-from gnrecon.sampling import Box
 from gnrecon.version import __version__
 
 FORMAT = "gnrecon-sdf-1"

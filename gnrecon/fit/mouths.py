@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.angles import widest_gap
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.statistics import widest_gap
 
 WITHIN = 1.5
 """How far points are looked for around a sample, in distances of the nearest one."""

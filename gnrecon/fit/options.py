@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gnrecon.fit.regulariser import Regulariser, regularisers
-from gnrecon.linalg import SOLVERS
+from gnrecon.least_squares import SOLVERS
 from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
 from gnrecon.residuals.named import named
 from gnrecon.residuals.second_order import SecondOrder
@@ -49,7 +49,7 @@ class FitOptions:
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
         Gauss-Newton, or one of the methods that the paper compares with.
     solver : str
-        Linear solver of Gauss-Newton's steps, a name of `gnrecon.linalg.SOLVERS`; ``"auto"`` picks by rows,
+        Linear solver of Gauss-Newton's steps, a name of `gnrecon.least_squares.SOLVERS`; ``"auto"`` picks by rows,
         parameters, memory and device.
     search : ``"auto"``, ``"damping"``, ``"geodesic"`` or ``"line"``
         Step control of Gauss-Newton: gain-ratio damping, the same with geodesic acceleration, or the paper's log-spaced

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 NEIGHBOURS = 8
 USUAL, TIMES = 0.95, 4.0

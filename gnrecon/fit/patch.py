@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.features import Features
-from gnrecon.linalg.cholesky import damped_factor, solve_factored
-from gnrecon.linalg.gram import gram
+from gnrecon.least_squares.direct import damped_factor, solve_factored
+from gnrecon.least_squares.layer_products import gram
 from gnrecon.runtime.parallel import slices
 
 SIZE = 3.0

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 ANGLE = 10.0
 """Degrees between a point's normal and the surface's that it lies on, at most."""

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gnrecon.field.siren import Siren
 from gnrecon.fit.terms import Term, groups
-from gnrecon.linalg.jacobian import Block, LayeredJacobian
-from gnrecon.linalg.rows import LayerRows
+from gnrecon.least_squares.jacobian import Block, LayeredJacobian
+from gnrecon.least_squares.layer_products import LayerRows
 from gnrecon.residuals.first_order import Linearised
 from gnrecon.runtime.parallel import slices
 

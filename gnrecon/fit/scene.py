@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Samples
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import Box, CoarseDistance, near_surface
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
 
 MARGIN = 0.1
 """How far the box reaches beyond the data, in radii."""

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import Samples
 from gnrecon.field.siren import Siren
 from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.deep import fit_deep
@@ -16,6 +15,7 @@ from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.fit.wide import fit_wide
+from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.runtime.progress import Advance, part, unheard

@@ -13,12 +13,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Frame
 from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.parallel import abreast, slices
-from gnrecon.sampling import Box
 
 _BATCH_BYTES = 4_000_000
 # What stays in the processor's cache is twice as fast as what does not.

@@ -32,10 +32,10 @@ from gnrecon.fit.sheet import Sheet
 from gnrecon.fit.start import FINAL_POINTS, RIDGE
 from gnrecon.fit.terms import Term
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.linalg.cholesky import damped_factor
+from gnrecon.geometry.signed_distance import Density, least_values
+from gnrecon.least_squares.direct import damped_factor
 from gnrecon.residuals import SecondOrder, free_space
 from gnrecon.runtime.errors import FitError
-from gnrecon.sampling import Density, least_values
 
 GLOBAL_STEPS, CUBE_STEPS = 8, 3
 """Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""

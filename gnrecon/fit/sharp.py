@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.cloud import Samples
 from gnrecon.fit.bare import laid_bare
 from gnrecon.fit.bilateral import Averaging
 from gnrecon.fit.creases import Faces
@@ -22,7 +21,8 @@ from gnrecon.fit.laid import Laid, laid
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.spread import spread
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import Density
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density
 
 SHARP, FLAT, OPPOSED = 0.8, 0.4, 1.8
 """Lengths of the difference of two neighbours' normals: above the first there is an edge between them, up to the last,

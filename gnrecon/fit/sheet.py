@@ -18,8 +18,8 @@ from torch import Tensor
 
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.signed_distance import Density
 from gnrecon.levelset import LevelSet, sample_surface
-from gnrecon.sampling import Density
 
 NEAR, FAR = 2.0, 3.5
 """Where far begins to count, and where it counts fully."""

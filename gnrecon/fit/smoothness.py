@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gnrecon.cloud import Samples
 from gnrecon.field.features import DEGREES_OF_FREEDOM, Features
 from gnrecon.fit.choose import SPARSE
 from gnrecon.fit.patch import Patch, PatchSystem
 from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.start import Spectrum
 from gnrecon.geometry.arrays import Mask
+from gnrecon.geometry.point_cloud import Samples
 
 LENGTHS = (0.25, 0.5, 1.0)
 """Lengths to choose from, in radii."""

@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 from gnrecon.fit.laid import OFF, Face, Search
 from gnrecon.fit.primitives import LEAST, Cylinder, Plane, agreed, cosine_of
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.signed_distance import Density, winding_number
 from gnrecon.runtime.parallel import slices
-from gnrecon.sampling import Density, winding_number
 
 NOISE, ANGLE = 0.005, 10.0
 """Noise with which surfaces are looked for, in radii of a point's disk, and degrees between their normals and a

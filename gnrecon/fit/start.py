@@ -29,8 +29,8 @@ from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.terms import Term
 from gnrecon.geometry.arrays import Float
-from gnrecon.linalg.cholesky import Cholesky
-from gnrecon.linalg.metric import identity
+from gnrecon.least_squares.direct import Cholesky
+from gnrecon.least_squares.system import identity
 from gnrecon.runtime.errors import FitError
 from gnrecon.runtime.progress import Advance, unheard
 

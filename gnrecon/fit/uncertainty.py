@@ -24,7 +24,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Samples
 from gnrecon.fit.data_rows import DataRows
 from gnrecon.fit.laplace import laplace
 from gnrecon.fit.left_out import calibration
@@ -33,8 +32,9 @@ from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.schedule import fit
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density
 from gnrecon.runtime.parallel import slices
-from gnrecon.sampling import Density
 
 MOST_POINTS = 20_000
 """Data points that count; more of them are thinned at random, so that sigma is rather too large."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 ALIKE, BESIDE = 2.5, 6
 """Most correlation of a height with its neighbours' mean, times the root of their number; and how many neighbours."""

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.clusters import isolated_clusters
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.outlier_rules import MODES, outliers_by_rule, parse_outliers

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Samples
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.point_cloud import Samples
 from gnrecon.ingest.spacing import neighbour_spacing
 
 _TESTED = 500

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.normals import Orientation, flip_if_inward, oriented_normals
 from gnrecon.runtime.errors import UsageError
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.spacing import mean_spacing
-from gnrecon.lengths import parse_reach
 from gnrecon.runtime.errors import UsageError
 
 MODES = ("auto", "on", "off")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.robust import deviation
+from gnrecon.geometry.statistics import deviation
 
 _NEIGHBOURS = 16
 _DEVIATIONS = 6.0

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.by_curvature import by_curvature
 from gnrecon.ingest.farthest import farthest_points
 from gnrecon.ingest.poisson_disk import poisson_disk, poisson_disk_apart

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise, local_frames
 from gnrecon.ingest.normals import flip_if_inward

@@ -22,7 +22,7 @@ _SMALLEST, _MIDDLE, _LARGEST = 0.005, 5.0, 5000.0
 
 @dataclass(frozen=True)
 class UnitsGuess:
-    """A unit, a name of `gnrecon.lengths.METRES` or None where there is nothing to go by, and why it is that."""
+    """A unit, a name of `gnrecon.geometry.units.METRES` or None where there is nothing to go by, and why it is that."""
 
     unit: str | None
     reason: str

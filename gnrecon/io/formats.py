@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gnrecon.geometry.arrays import Values
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.conf import read_conf
 from gnrecon.io.contents import Contents
 from gnrecon.io.e57 import read_e57
@@ -23,7 +24,6 @@ from gnrecon.io.threemf_model import read_3mf
 from gnrecon.io.vtk import read_vtk
 from gnrecon.io.vtp import read_vtp
 from gnrecon.io.xyz import read_xyz, write_xyz
-from gnrecon.mesh import Mesh
 
 READERS: dict[str, Callable[[Path], Contents]] = {
     ".ply": read_ply,

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.point_cloud import Region
 from gnrecon.io.contents import Contents, joined
-from gnrecon.region import Region
 
 _REACH = 1 << 20
 """Cubes from the first point in each direction: three such numbers fit into one key of 64 bits."""

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.geometry.arrays import Values
+from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb, with_alpha
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.foreign import parsing
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 _COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"

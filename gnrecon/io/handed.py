@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import no_faces
-from gnrecon.mesh import Mesh
 
 Values = npt.NDArray[Any]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
 from gnrecon.geometry.arrays import Float, Values
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import OutputError
 
 _DIGITS = 4 * np.finfo(np.float64).eps

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import from_columns
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 _POINTS = (

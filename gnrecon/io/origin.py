@@ -13,7 +13,7 @@ import re
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 HEADER = 80
 """Bytes of an STL's header."""

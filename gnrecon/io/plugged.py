@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Values
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, WRITERS
 from gnrecon.io.objects import as_shape
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError, OutputError
 from gnrecon.runtime.plugins import READERS as READER_GROUP
 from gnrecon.runtime.plugins import WRITERS as WRITER_GROUP

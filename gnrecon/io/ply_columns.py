@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 
-from gnrecon.colors import as_bytes
 from gnrecon.geometry.arrays import Values
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
 
 Column = tuple[str, str, Values]
 """Name, PLY's name of the type, and values of shape (V,)."""

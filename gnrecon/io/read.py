@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED
 from gnrecon.io.plugged import is_readable, readable, reader_of
 from gnrecon.io.unpack import extension_of, plain_file
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import STANDARD_INPUT
 

@@ -8,15 +8,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.io.chunks import SETTLED, chunks
 from gnrecon.io.contents import Contents
 from gnrecon.io.gather import Gatherer
 from gnrecon.io.read import check_file, extension_for, reading
 from gnrecon.io.same_scan import Moments, same_scans
 from gnrecon.io.unpack import plain_file
-from gnrecon.mesh import Mesh
-from gnrecon.region import Region
 from gnrecon.runtime.errors import InputError, UsageError
 
 _log = logging.getLogger(__name__)

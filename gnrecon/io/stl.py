@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.origin import HEADER, far_origin, header, origin_in
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 

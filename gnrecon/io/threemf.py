@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.colors import as_bytes, with_alpha
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.colors import as_bytes, with_alpha
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.text import format_rows
-from gnrecon.mesh import Mesh
 
 CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 MATERIAL = "http://schemas.microsoft.com/3dmanufacturing/material/2015/02"

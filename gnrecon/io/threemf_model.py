@@ -18,10 +18,10 @@ from xml.parsers import expat
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.text import numbers
 from gnrecon.io.threemf import MODEL_TYPE
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 Key = tuple[str, str]

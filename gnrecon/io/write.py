@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float, Values
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import no_faces
 from gnrecon.io.formats import CLOUD_WRITERS, HOLDS
 from gnrecon.io.origin import far_origin, rounding, told
 from gnrecon.io.plugged import is_readable, writable, writer_of
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.files import atomic_write
 

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.levelset.critical import refined
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.persistence import Separate, separate_components
-from gnrecon.sampling import Box
 
 CELLS = 64
 

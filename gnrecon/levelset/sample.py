@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.signed_distance import Box, halved
 from gnrecon.levelset.crossings import Crossings, find_crossings
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.newton import project
 from gnrecon.levelset.spread import repel, walk
-from gnrecon.sampling import Box, halved
 
 NODES = 100_000
 _SWEEPS = 3
@@ -37,7 +37,7 @@ class SurfaceSample:
 
     Parameters
     ----------
-    points : of shape (N, 3), on the level set and in the box, in the order of `gnrecon.sampling.halved`
+    points : of shape (N, 3), on the level set and in the box, in the order of `gnrecon.geometry.signed_distance.halved`
     normals : grad f / |grad f| there, of shape (N, 3)
     area : an unbiased estimate of the surface's area in the box, in squared units of the coordinates
     """

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.levelset.level_set import LevelSet
 from gnrecon.levelset.newton import newton_step
-from gnrecon.sampling import Box
 
 _RANGE, _PUSH = 1.8, 0.6
 _NEIGHBOURS = 8

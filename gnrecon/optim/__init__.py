@@ -2,16 +2,11 @@
 
 from collections.abc import Callable
 
-from gnrecon.optim.adam import Adam
-from gnrecon.optim.damping import GainRatioDamping
+from gnrecon.optim.first_order import LBFGS, Adam
 from gnrecon.optim.gauss_newton import GaussNewton
-from gnrecon.optim.lbfgs import LBFGS
-from gnrecon.optim.line import FixedStep, LogLineSearch
-from gnrecon.optim.optimiser import Optimiser
+from gnrecon.optim.loop import Callback, HeldOut, Optimiser, Record, Solution, StopRule, Watch
 from gnrecon.optim.problem import Problem, ProblemAt
-from gnrecon.optim.search import Move, Search
-from gnrecon.optim.solution import Callback, Record, Solution
-from gnrecon.optim.stop import HeldOut, StopRule, Watch
+from gnrecon.optim.step_control import FixedStep, GainRatioDamping, LogLineSearch, Move, Search
 
 OPTIMISERS: dict[str, Callable[[], Optimiser]] = {
     "gn": lambda: GaussNewton(GainRatioDamping()),

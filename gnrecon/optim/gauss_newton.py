@@ -11,13 +11,11 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from gnrecon.linalg.cholesky import Cholesky
-from gnrecon.linalg.system import LinearSolver
-from gnrecon.optim.optimiser import Outcome, iterate
+from gnrecon.least_squares.direct import Cholesky
+from gnrecon.least_squares.system import LinearSolver
+from gnrecon.optim.loop import Callback, HeldOut, Outcome, Record, Solution, StopRule, Watch, iterate
 from gnrecon.optim.problem import Problem, ProblemAt
-from gnrecon.optim.search import Search
-from gnrecon.optim.solution import Callback, Record, Solution
-from gnrecon.optim.stop import HeldOut, StopRule, Watch
+from gnrecon.optim.step_control import Search
 
 
 @dataclass(frozen=True)

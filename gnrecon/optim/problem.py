@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.jacobian import Jacobian
+from gnrecon.least_squares.jacobian import Jacobian
 
 
 class Problem(Protocol):

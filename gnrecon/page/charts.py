@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from gnrecon.histogram import Histogram
+from gnrecon.geometry.statistics import Histogram
 from gnrecon.page import ticks
 from gnrecon.page.numbers import MINUS, figure, share
 

@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.histogram import Histogram
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.statistics import Histogram
 from gnrecon.page.numbers import figure
 
 BINS = 56

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
 from gnrecon.export import lighten, vertex_sky
 from gnrecon.geometry.arrays import Float, Values
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.page.layers import Layer
 from gnrecon.page.ramps import ramp
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.export.quality import corner_angles, edge_lengths
-from gnrecon.histogram import Histogram
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.statistics import Histogram
 from gnrecon.page.facts import Fact
 from gnrecon.page.numbers import figure, share
 

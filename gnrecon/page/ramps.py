@@ -13,8 +13,8 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.colors import to_linear, to_srgb
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.colors import to_linear, to_srgb
 
 STOPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {

@@ -9,9 +9,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from gnrecon.cloud import PointCloud
-from gnrecon.histogram import Histogram
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.geometry.statistics import Histogram
 from gnrecon.page import facts
 from gnrecon.page.charts import bars
 from gnrecon.page.convergence import convergence

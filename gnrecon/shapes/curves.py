@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import SecondOrder, eikonal, interface
 from gnrecon.runtime.errors import UsageError
-from gnrecon.sampling import Box
 from gnrecon.shapes.problem import ShapeProblem, Start, plane_through
 from gnrecon.shapes.term import Term, Weight, at_points, fading, in_box, on_surface
 

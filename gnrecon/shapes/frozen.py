@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.field import CurvedJet, Network
+from gnrecon.least_squares import Block, LayeredJacobian
 from gnrecon.levelset import transported
-from gnrecon.linalg import Block, LayeredJacobian
 from gnrecon.residuals import Linearised, Residual, SecondOrder, tangents
 from gnrecon.runtime.parallel import slices
 

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract, project
 from gnrecon.export.clip import clip
 from gnrecon.field import Network
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.errors import MeshError
-from gnrecon.sampling import Box
 
 MARGIN = 2
 """Cells around the shown box that are meshed as well, so that the cap that closes the field there is cut off."""

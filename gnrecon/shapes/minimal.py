@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon import levelset
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import mean_curvature
-from gnrecon.sampling import Box
 from gnrecon.shapes.curves import through_curves
 from gnrecon.shapes.problem import ShapeProblem, Start, circle, cube, z_cylinder, z_plane
 from gnrecon.shapes.term import rising

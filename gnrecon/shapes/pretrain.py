@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.linalg import identity
+from gnrecon.least_squares import identity
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 from gnrecon.residuals import signed_distance
 from gnrecon.shapes.frozen import FrozenProblem

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gnrecon.field import TANH, Network
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.signed_distance import Box
+from gnrecon.least_squares import Iterative, LinearSolver, Neighbours, identity
 from gnrecon.levelset import KnownSurface, LevelSet
-from gnrecon.linalg import Iterative, LinearSolver, Neighbours, identity
 from gnrecon.optim import GainRatioDamping, Search
-from gnrecon.sampling import Box
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
 from gnrecon.shapes.term import Drawn, Moment, Term
 

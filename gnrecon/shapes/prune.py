@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field import Network
-from gnrecon.linalg.cholesky import damped_factor
+from gnrecon.least_squares.direct import damped_factor
 from gnrecon.optim.problem import loss_of
 from gnrecon.shapes.frozen import FrozenProblem
 

@@ -21,13 +21,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.cloud import Samples
 from gnrecon.field import Network
 from gnrecon.field.activation import SINE
-from gnrecon.linalg import Iterative, LinearSolver, Neighbours, Preconditioner, jacobian_layer_scaled
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, halved, least_values
+from gnrecon.least_squares import Iterative, LinearSolver, Neighbours, Preconditioner, jacobian_layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
-from gnrecon.sampling import Box, CoarseDistance, halved, least_values
 from gnrecon.shapes.problem import ShapeProblem, Start
 from gnrecon.shapes.term import (
     LAST,

@@ -16,10 +16,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from gnrecon.geometry.signed_distance import Box, halved
 from gnrecon.levelset import LevelSet, sample_surface
 from gnrecon.residuals import Residual, SecondOrder
 from gnrecon.runtime.errors import FitError
-from gnrecon.sampling import Box, halved
 
 LAST = 10**9
 """The number of a step that is never reached: weights have ended there."""

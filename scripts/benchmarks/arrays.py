@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 
 
 def save_mesh(mesh: Mesh, path: Path) -> None:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.problem import Problem
-from gnrecon.cloud import Frame, PointCloud
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame, PointCloud
 from gnrecon.io import read_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 

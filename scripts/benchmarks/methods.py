@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.peers import load_apss, load_ball_pivoting, load_meshlab_poisson, load_poisson, load_rimls
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 Method = Callable[..., tuple[Mesh, dict[str, Any]]]
 

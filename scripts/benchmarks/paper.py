@@ -18,7 +18,7 @@ from benchmarks.comparison import Protocol, problems_of, run_case, summarise
 from benchmarks.provenance import REPOSITORY, provenance
 from benchmarks.sheet import Part, Row, draw_row, write_sheet
 from benchmarks.table import comparison_table, failures
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import ExitCode, OutputError
 from gnrecon.runtime.files import write_text
 

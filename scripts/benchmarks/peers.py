@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 Answer = tuple[Mesh, dict[str, Any]]
 

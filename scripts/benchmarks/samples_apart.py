@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.export.metrics import sample_surface
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 def between_samples(mesh: Mesh, truth: Mesh, count: int, seed: int = 0) -> dict[str, float]:

@@ -23,8 +23,8 @@ from rich.table import Table
 from torch import Tensor
 
 from benchmarks.provenance import provenance
+from gnrecon.least_squares import LayeredJacobian
 from gnrecon.levelset import derivative_along, sample_surface, transported
-from gnrecon.linalg import LayeredJacobian
 from gnrecon.optim import Problem, StopRule
 from gnrecon.residuals import Linearised, SecondOrder, mean_curvature
 from gnrecon.runtime.errors import ExitCode, UsageError

@@ -20,9 +20,9 @@ from benchmarks.alone import run_program
 from benchmarks.arrays import load_scan, load_truth, save_mesh
 from benchmarks.methods import METHODS
 from benchmarks.samples_apart import between_samples
-from gnrecon.cloud import PointCloud
 from gnrecon.export import measure, verify
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import GnreconError, MeshError
 from gnrecon.runtime.memory import process_peak_mb
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from benchmarks.sheet import PANEL, Row, draw_row, write_sheet
 
 from gnrecon.export import render
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh
-from gnrecon.mesh import Mesh
 from reproduction.experiments import Experiment
 
 NAMES = {"gn": "Gauss-Newton", "lbfgs": "L-BFGS", "adam": "Adam"}

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from gnrecon.cli import main
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from command_line import CommandLine, ball, cube
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode
 
 

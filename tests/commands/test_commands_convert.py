@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from command_line import CommandLine, ball, cube
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import read_any, read_cloud, read_mesh, write_cloud, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode
 
 UTM = np.array([500_000.125, 4_500_000.25, 100.0])

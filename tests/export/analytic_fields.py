@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import Frame
+from gnrecon.geometry.point_cloud import Frame
 
 Float = npt.NDArray[np.float64]
 Function = Callable[[Float], Float]

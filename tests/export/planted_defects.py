@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 def touching_in_a_vertex(mesh: Mesh) -> Mesh:

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from analytic_fields import UNIT, UTM, Field, Function, plate, sines, sphere, union
 
-from gnrecon.cloud import Frame
 from gnrecon.export import SignedDistance
 from gnrecon.field import Siren
 from gnrecon.fit import NeuralSDF
-from gnrecon.sampling import Box
+from gnrecon.geometry.point_cloud import Frame
+from gnrecon.geometry.signed_distance import Box
 
 Rng = np.random.Generator
 FAR = Frame(np.array([-3e3, 2e4, 7.0]), 0.01)

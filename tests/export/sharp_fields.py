@@ -7,7 +7,7 @@ from analytic_fields import Field, Function
 from scipy.spatial.transform import Rotation
 
 from gnrecon.export import extract, project
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 Float = np.ndarray
 TURN = Rotation.from_rotvec([0.4, -0.7, 0.3]).as_matrix()

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import to_linear, to_srgb
 from gnrecon.export import Neighbourhood, carry
 from gnrecon.export.neighbours import COUNT
+from gnrecon.geometry.colors import to_linear, to_srgb
+from gnrecon.geometry.point_cloud import PointCloud
 
 UTM = np.array([431234.5, 5412345.25, 312.0])
 

@@ -8,7 +8,7 @@ import trimesh
 
 from gnrecon.export import require_bordered
 from gnrecon.export.clip import clip
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 def ball(subdivisions: int = 4) -> Mesh:

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
-from gnrecon.cloud import Frame
 from gnrecon.export import curvatures
 from gnrecon.field import Siren
 from gnrecon.fit import NeuralSDF
-from gnrecon.sampling import Box
+from gnrecon.geometry.point_cloud import Frame
+from gnrecon.geometry.signed_distance import Box
 
 RING, TUBE = 1.0, 0.3
 

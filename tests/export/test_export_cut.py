@@ -8,10 +8,10 @@ from analytic_fields import UNIT, UTM, Field, sphere
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract, project, require_sound
 from gnrecon.export.cut import crop, subtract
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import MeshError
 
 RADIUS = 0.8

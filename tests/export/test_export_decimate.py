@@ -10,7 +10,7 @@ from sharp_fields import HALF, between, box, cylinder, extracted, notched_box
 
 from gnrecon.export import decimate, project, require_sound, sharpen, simplify
 from gnrecon.export.nearest import nearest_on_surface
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
 

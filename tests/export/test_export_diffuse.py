@@ -8,7 +8,7 @@ from analytic_fields import Field, sphere
 
 from gnrecon.export import extract
 from gnrecon.export.diffuse import diffused, vertex_areas
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 RADIUS = 0.8
 

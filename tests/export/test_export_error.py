@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import extract, project, vertex_error
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 
 
 def ball(radius: float, resolution: int = 32) -> Mesh:

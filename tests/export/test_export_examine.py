@@ -8,7 +8,7 @@ from analytic_fields import UTM, Field, sphere
 from planted_defects import touching_in_a_vertex, with_a_fin
 
 from gnrecon.export import examine, extract
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import pytest
 from analytic_fields import UNIT, UTM, Field, plate, shells, sines, sphere, torus, union
 from skimage.measure import marching_cubes
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract, project, require_sound, verify
 from gnrecon.export.band import NUDGE, narrow_band
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaves import Growing, Leaves
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import MeshError, UsageError
 
 SHAPES = {

@@ -11,7 +11,7 @@ from analytic_fields import UTM, Field, Function, sphere, torus, union
 from gnrecon.export import extract, project, remove_handles, require_sound
 from gnrecon.export.loops import short_loops
 from gnrecon.export.nearest import nearest_on_surface
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
 Float = np.ndarray

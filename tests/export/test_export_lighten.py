@@ -8,7 +8,7 @@ from analytic_fields import UTM, Field, sphere, union
 
 from gnrecon.export import extract, lighten, project, vertex_sky
 from gnrecon.export.lighten import barycentric
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 
 @pytest.fixture(scope="module")

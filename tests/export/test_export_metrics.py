@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import extract, measure, project
 from gnrecon.export.metrics import sample_surface
 from gnrecon.export.nearest import nearest_on_surface
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import InputError, UsageError
 
 

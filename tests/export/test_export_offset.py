@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from analytic_fields import UNIT, UTM, Field, shells, sphere, torus
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract, project, require_sound
 from gnrecon.export.nearest import Surface, nearest_on_surface
 from gnrecon.export.offset import OffsetField
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import UsageError
 
 RESOLUTION = 32

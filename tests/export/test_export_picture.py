@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, union
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import extract, project, render, render_sheet
 from gnrecon.export.camera import VIEWS, Camera
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import OutputError, UsageError
 
 SIZE = (120, 90)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gnrecon.export.quality import corner_angles, edge_lengths, quality
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 TETRAHEDRON = Mesh(
     np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]]) + 1e6,

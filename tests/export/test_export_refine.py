@@ -11,7 +11,7 @@ from analytic_fields import Field, sphere, torus, union
 from sharp_fields import box, cylinder, extracted
 
 from gnrecon.export import RefineOptions, quality, refine, require_sound
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
 

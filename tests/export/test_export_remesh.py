@@ -10,7 +10,7 @@ from sharp_fields import between, box, cylinder, extracted, lens, to_box_edges, 
 from gnrecon.export import project, quality, remesh, require_sound, sharpen, verify
 from gnrecon.export.remesh import creased
 from gnrecon.export.surface import CORNER, CREASE
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
 

@@ -11,7 +11,7 @@ from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fi
 
 from gnrecon.export import drop_stray, extract, project, remove_stray, repair, require_bordered, require_sound, verify
 from gnrecon.export.topology import submesh
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
 

@@ -7,7 +7,7 @@ import pytest
 from scan_files import torus
 
 from gnrecon.export import sparsely
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 FACE = np.array([[0, 1, 2]])
 

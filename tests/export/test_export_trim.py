@@ -11,8 +11,8 @@ from analytic_fields import Field, sphere, torus, union
 from gnrecon.export import Neighbourhood, extract, invented, require_bordered, require_sound, trim, verify_file
 from gnrecon.export.topology import Edges, split_vertices
 from gnrecon.export.trim import CLEAR
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
 RADIUS = 0.8

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gnrecon.linalg import LayerRows
+from gnrecon.least_squares import LayerRows
 
 
 def dense(layers: list[LayerRows]) -> Tensor:

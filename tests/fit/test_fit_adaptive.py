@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, adaptive, fit
 from gnrecon.fit.choose import ANGLES, LENGTHS, POSITIONS, Leftover, _smoothest, choose
+from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.runtime.errors import InputError
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)

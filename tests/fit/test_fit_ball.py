@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.ball import Ball
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame, Samples
 
 FRAME = Frame(np.array([5e5, 4.5e6, 100.0]), 20.0)
 CENTER, RADIUS = np.array([0.1, -0.05, 0.02]), 0.8

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.choose import LENGTHS, Choice, Leftover, Trials
 from gnrecon.fit.clean import ANGLE, ESTIMATED, POSITION, clean_noise, heights
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import Density
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Density
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
 STEP = 1e-6

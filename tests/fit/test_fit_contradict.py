@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.contradict import reconciled
 from gnrecon.fit.options import FitOptions
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame, Samples
 
 OPTIONS = FitOptions(quality="draft")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gnrecon.fit.dipoles import FEW, Dipoles
-from gnrecon.sampling import Density, winding_number
+from gnrecon.geometry.signed_distance import Density, winding_number
 
 COUNT = 6000
 

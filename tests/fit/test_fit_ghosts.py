@@ -8,7 +8,7 @@ import pytest
 from gnrecon.fit.choose import ABOUT, LEAST_SHARE, Volume
 from gnrecon.fit.ghosts import GhostSearch
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import CoarseDistance
+from gnrecon.geometry.signed_distance import CoarseDistance
 
 GHOST, CAVITY, RADIUS = np.array([1.3, 0.2, 0.1]), np.array([0.1, -0.5, 0.0]), 0.2
 

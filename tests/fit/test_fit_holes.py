@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from made_shapes import bored_plate
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.holes import _shut_away, continued
 from gnrecon.fit.min_cut import minimal_inside
 from gnrecon.fit.mouths import mouths
 from gnrecon.fit.primitives import Cylinder, Plane, Wanted, agreed, planar_share, surfaces
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame, Samples
 
 SIDE = 0.6
 HEIGHT, BORE = 0.25, 0.4

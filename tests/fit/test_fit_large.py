@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.field.detail import Detail
 from gnrecon.field.siren import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
@@ -26,10 +25,11 @@ from gnrecon.fit.options import QUALITIES
 from gnrecon.fit.patch import Belief
 from gnrecon.fit.work import Work
 from gnrecon.geometry.arrays import Int
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.options import Options
 from gnrecon.runtime.errors import Cancelled, FitError, MemoryLimitError, UsageError
 from gnrecon.runtime.progress import Advance, unheard
-from gnrecon.sampling import Box
 
 COUNT = 1500
 AXES = np.array([1.0, 0.6, 0.5])

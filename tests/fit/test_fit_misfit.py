@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, Misfit, fit
-from gnrecon.histogram import Histogram
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.statistics import Histogram
 
 FRAME = Frame(np.array([100.0, -20.0, 5.0]), 4.0)
 

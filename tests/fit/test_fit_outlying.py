@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gnrecon.fit.outlying import LEAST, LEAST_POINTS, MOST, outlying
-from gnrecon.sampling import Density
+from gnrecon.geometry.signed_distance import Density
 
 COUNT = 1000
 

@@ -7,13 +7,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit.deep import hold_out
 from gnrecon.fit.options import NORMAL_RESIDUALS, OPTIMISERS, SEARCHES
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.wide import MAX_STEP_POINTS
-from gnrecon.linalg import SOLVERS
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.least_squares import SOLVERS
 from gnrecon.optim import Record
 from gnrecon.runtime.errors import FitError, UsageError
 

@@ -13,11 +13,11 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, fit
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.errors import InputError, OutputError
-from gnrecon.sampling import Box
 
 UNIT = Frame(np.zeros(3), 1.0)
 UTM = Frame(np.array([431_234.567, 5_412_345.678, 312.1]), 23.7)

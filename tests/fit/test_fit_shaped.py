@@ -8,14 +8,14 @@ import pytest
 import torch
 from holed_can import RADIUS, can, distance
 
-from gnrecon.cloud import Frame, PointCloud, Samples
 from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, adaptive, fit, sharp
 from gnrecon.fit.holes import Continued
 from gnrecon.fit.shaped import FREE, Free
 from gnrecon.fit.sheet import Sheet, _joined
+from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
+from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest import prepare
-from gnrecon.sampling import Density
 
 Float = npt.NDArray[np.float64]
 

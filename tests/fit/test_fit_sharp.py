@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit, sharp
 from gnrecon.fit.creases import Faces
 from gnrecon.fit.sharp import AVERAGING, Sharp
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest.normals import oriented_normals
-from gnrecon.sampling import Density
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
 SIDE = 0.8

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit.scene import Scene
 from gnrecon.fit.smoothness import LENGTHS, REACHES, Smoothness, global_smoothness
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame, Samples
 
 FRAME = Frame(np.zeros(3), 1.0)
 

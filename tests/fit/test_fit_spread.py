@@ -8,11 +8,11 @@ import pytest
 from made_shapes import bored_plate
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.spread import MOST, spread
 from gnrecon.geometry.arrays import Float
-from gnrecon.sampling import Density
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Density
 
 SIDE, HEIGHT, BORE = 0.7, 0.2, 0.25
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)

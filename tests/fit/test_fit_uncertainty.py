@@ -12,17 +12,17 @@ from scipy.stats import spearmanr
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
-from gnrecon.cloud import Frame, Samples
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
 from gnrecon.fit.data_rows import MOST_PARAMETERS, DataRows, free_units
 from gnrecon.fit.laplace import PRIOR, Laplace, laplace
 from gnrecon.fit.left_out import PATCHES, calibration, left_out_scores
 from gnrecon.fit.start import random_features
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import normal_projection, normal_vector
 from gnrecon.residuals.first_order import Residual
 from gnrecon.runtime.errors import FitError
-from gnrecon.sampling import Box
 
 UNIT = Frame(np.zeros(3), 1.0)
 BOX = Box(-1.2 * np.ones(3), 1.2 * np.ones(3))

@@ -8,7 +8,7 @@ from analytic_clouds import sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import IngestCounts, clean, find_outliers
 from gnrecon.runtime.errors import InputError, UsageError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare
 from gnrecon.ingest.layers import find_layers
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from analytic_clouds import Float, sphere, torus
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
 from gnrecon.ingest.normals import oriented_normals
 from gnrecon.ingest.sight import towards_scanner

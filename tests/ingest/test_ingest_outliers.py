@@ -7,7 +7,7 @@ import pytest
 from analytic_clouds import sphere, torus
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import clean, isolated_clusters
 from gnrecon.ingest.outlier_rules import OutlierRule, outliers_by_rule, parse_outliers
 from gnrecon.ingest.repeats import repeated_points

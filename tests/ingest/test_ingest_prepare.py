@@ -10,7 +10,7 @@ import pytest
 from analytic_clouds import sphere, torus
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import clean, oriented_normals, prepare
 from gnrecon.io import read_cloud, read_mesh
 from gnrecon.runtime.errors import InputError, UsageError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
 from gnrecon.ingest.smooth import smoothed
 from gnrecon.runtime.errors import UsageError

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import mean_spacing, subsample
 from gnrecon.ingest.subsample import METHODS
 from gnrecon.runtime.errors import UsageError

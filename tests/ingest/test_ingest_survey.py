@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from analytic_clouds import torus
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.survey import Survey, survey
 
 

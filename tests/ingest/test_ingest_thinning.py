@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import mean_spacing, prepare, subsample
 from gnrecon.ingest.by_curvature import surface_variation
 from gnrecon.ingest.farthest import farthest_points

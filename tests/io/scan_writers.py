@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import write_cloud
 
 Float = npt.NDArray[np.float64]
@@ -201,7 +201,7 @@ def _vtp(form: str, compressed: bool = False) -> Callable[[PointCloud, Path], No
 
 
 def _gltf_tree(cloud: PointCloud) -> tuple[dict[str, object], bytes]:
-    from gnrecon.colors import to_linear
+    from gnrecon.geometry.colors import to_linear
 
     light = np.rint(65535 * to_linear(cloud.attributes["colors"])).astype("<u2")
     assert cloud.normals is not None

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import as_cloud, holds, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 COLOURED = [".ply", ".obj", ".off", ".glb", ".3mf"]

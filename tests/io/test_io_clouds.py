@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_cloud, read_mesh, read_reference
-from gnrecon.mesh import Mesh
 
 UTM = np.array([[431234.123456789, 5412345.987654321, 312.1], [431235.000000001, 5412346.5, 313.25], [0.1, -2e5, 7.0]])
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scan_writers import FORMS, TURN, file_of, random_cloud
 
-from gnrecon.colors import as_bytes
+from gnrecon.geometry.colors import as_bytes
 from gnrecon.io import READERS, read_cloud
 
 MESHES_ONLY = {".stl", ".3mf"}

@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 from scan_writers import FORMS, file_of, random_cloud
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_scans, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode, InputError, UsageError
 
 MUTATIONS = 76

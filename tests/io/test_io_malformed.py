@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import READERS, WRITERS, read_cloud, read_mesh, write_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import GnreconError, InputError, UsageError
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256))

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gnrecon.cloud import PointCloud
-from gnrecon.colors import as_bytes
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import as_cloud, as_mesh, to_open3d, to_pymeshlab, to_trimesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 RNG = np.random.default_rng(0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gnrecon.export import require_sound, verify_file
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh, write_mesh, written_origin
 from gnrecon.io.origin import header, in_words, origin_in
-from gnrecon.mesh import Mesh
 
 UTM = np.array([512_345.678, 4_123_456.789, 123.4])
 

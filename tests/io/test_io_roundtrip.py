@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import WRITERS, read_cloud, read_mesh, write_mesh, written_origin
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, OutputError, UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.levelset import LevelSet
-from gnrecon.sampling import Box
 
 
 def cube(half: float) -> Box:

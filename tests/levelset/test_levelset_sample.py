@@ -11,9 +11,9 @@ from implicit_shapes import SHAPES, Shape, cube, level_set, sphere
 from scipy import stats
 from scipy.spatial import cKDTree
 
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.levelset import LevelSet, find_crossings, project, sample_surface
 from gnrecon.levelset.crossings import near_values
-from gnrecon.sampling import Box
 
 
 @pytest.fixture(params=SHAPES, scope="module")

@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from gnrecon.linalg import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
+from gnrecon.least_squares import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
 
 F64 = torch.float64
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from damped_problems import F64, randn
 
-from gnrecon.linalg import (
+from gnrecon.least_squares import (
     Auto,
     Cholesky,
     DenseJacobian,
@@ -18,7 +18,7 @@ from gnrecon.linalg import (
     identity,
     jacobian_scaled,
 )
-from gnrecon.linalg.auto import choose
+from gnrecon.least_squares.auto import choose
 
 MEMORY = 4 * 2**30
 

@@ -9,7 +9,7 @@ import torch
 from damped_problems import randn
 from torch import Tensor
 
-from gnrecon.linalg.gram import BLOCK, gram
+from gnrecon.least_squares.layer_products import BLOCK, gram
 
 
 def in_chunks(J: Tensor, size: int) -> Iterator[Tensor]:

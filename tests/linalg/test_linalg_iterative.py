@@ -9,7 +9,7 @@ import torch
 from damped_problems import F64, PROBLEMS, layered, multiplied_out, randn
 from torch import Tensor
 
-from gnrecon.linalg import (
+from gnrecon.least_squares import (
     DenseJacobian,
     Iterative,
     Jacobi,
@@ -21,7 +21,7 @@ from gnrecon.linalg import (
     SampledGram,
     identity,
 )
-from gnrecon.linalg.krylov import Apply
+from gnrecon.least_squares.krylov import Apply
 
 
 @dataclass

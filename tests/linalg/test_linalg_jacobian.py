@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gnrecon.linalg import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
-from gnrecon.linalg import jacobian as module
-from gnrecon.linalg.gram import gram
+from gnrecon.least_squares import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
+from gnrecon.least_squares import jacobian as module
+from gnrecon.least_squares.layer_products import gram
 
 Made = tuple[Jacobian, Tensor]
 

@@ -11,8 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gnrecon.linalg import KrylovResult, conjugate_gradients, gmres, minres
-from gnrecon.linalg.krylov import Apply
+from gnrecon.least_squares import KrylovResult, conjugate_gradients
+from gnrecon.least_squares import krylov as gmres
+from gnrecon.least_squares import krylov as minres
+from gnrecon.least_squares.krylov import Apply
 
 Method = Callable[[Apply, Tensor, Apply, float, int], KrylovResult]
 METHODS: list[Method] = [conjugate_gradients, minres, gmres]

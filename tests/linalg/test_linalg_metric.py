@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from damped_problems import layered
 
-from gnrecon.linalg import DenseJacobian, identity, jacobian_layer_scaled, jacobian_scaled, layer_scaled
+from gnrecon.least_squares import DenseJacobian, identity, jacobian_layer_scaled, jacobian_scaled, layer_scaled
 
 
 def test_identity_is_one_everywhere() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gnrecon.linalg import (
+from gnrecon.least_squares import (
     BlockJacobi,
     DenseJacobian,
     Jacobi,
@@ -24,9 +24,9 @@ from gnrecon.linalg import (
     Sketch,
     conjugate_gradients,
 )
-from gnrecon.linalg.draw import inclusion
-from gnrecon.linalg.krylov import Apply, KrylovResult
-from gnrecon.linalg.neighbours import AGAIN, PreparedNeighbours, run_lengths
+from gnrecon.least_squares.krylov import Apply, KrylovResult
+from gnrecon.least_squares.neighbour_sums import AGAIN, PreparedNeighbours, run_lengths
+from gnrecon.least_squares.preconditioners import inclusion
 
 PRECONDITIONERS: dict[str, Preconditioner] = {
     "jacobi": Jacobi(),

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gnrecon.linalg import (
+from gnrecon.least_squares import (
     SOLVERS,
     Averaged,
     DenseJacobian,

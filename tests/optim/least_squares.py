@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.functional import jacobian
 
-from gnrecon.linalg import DenseJacobian
+from gnrecon.least_squares import DenseJacobian
 
 Formula = Callable[[Tensor], Tensor]
 

@@ -9,7 +9,7 @@ import torch
 from least_squares import CASES, Formula, Plain, rosenbrock
 from torch import Tensor
 
-from gnrecon.linalg import Cholesky, DampedSystem, DenseJacobian
+from gnrecon.least_squares import Cholesky, DampedSystem, DenseJacobian
 from gnrecon.optim import Search
 
 

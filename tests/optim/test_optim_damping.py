@@ -13,7 +13,7 @@ from scripted import Scripted, posed
 from torch import Tensor
 from torch.func import jacrev
 
-from gnrecon.linalg import Cholesky, Iterative, Metric, Step, identity, jacobian_scaled
+from gnrecon.least_squares import Cholesky, Iterative, Metric, Step, identity, jacobian_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 
 F64 = torch.float64

@@ -7,7 +7,7 @@ import torch
 from least_squares import CASES, Plain, rosenbrock
 from torch import Tensor
 
-from gnrecon.linalg import DenseJacobian
+from gnrecon.least_squares import DenseJacobian
 from gnrecon.optim import GainRatioDamping, GaussNewton, LogLineSearch, Search, StopRule
 
 ROSENBROCK = CASES["rosenbrock"]

@@ -8,7 +8,7 @@ from least_squares import CASES, Case, Plain, rosenbrock
 from scripted import Scripted, posed
 from torch import Tensor
 
-from gnrecon.linalg import Cholesky, DenseJacobian, identity, jacobian_scaled, layer_scaled
+from gnrecon.least_squares import Cholesky, DenseJacobian, identity, jacobian_scaled, layer_scaled
 from gnrecon.optim import FixedStep, GainRatioDamping, GaussNewton, LogLineSearch, Search, StopRule
 from gnrecon.optim.problem import loss_of
 

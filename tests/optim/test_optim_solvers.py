@@ -9,7 +9,7 @@ import torch
 from least_squares import CASES, Case
 from torch import Tensor
 
-from gnrecon.linalg import SOLVERS, Cholesky, DampedSystem, Jacobian, Metric, Step, identity
+from gnrecon.least_squares import SOLVERS, Cholesky, DampedSystem, Jacobian, Metric, Step, identity
 from gnrecon.optim import GainRatioDamping, GaussNewton, LogLineSearch, StopRule
 
 DENSE = [name for name in SOLVERS if name != "cg-kronecker"]

@@ -85,7 +85,7 @@ def test_the_limit_of_steps() -> None:
 
 def test_the_limit_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("gnrecon.optim.stop.perf_counter", lambda: now[0])
+    monkeypatch.setattr("gnrecon.optim.loop.perf_counter", lambda: now[0])
     watch = Watch(at(0), StopRule(seconds=5.0))
     watch.started = 100.0
     now[0] = 102.5

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import measure, verify
-from gnrecon.histogram import Histogram
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.geometry.statistics import Histogram
 
 CENTRE = np.array([500_000.0, 4_500_000.0, 100.0])
 """Far from the origin, as projected coordinates are."""

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pages import torus
 
-from gnrecon.histogram import Histogram
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.statistics import Histogram
 from gnrecon.page import ticks
 from gnrecon.page.charts import Curve, bars, curves
 from gnrecon.page.convergence import convergence

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from pages import CENTRE, Elements, adorned, buffer, report, scan, scene, torus
 
-from gnrecon.cloud import PointCloud
 from gnrecon.export import verify
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.page import page_text, write_page
 from gnrecon.runtime.errors import MeshError, OutputError
 

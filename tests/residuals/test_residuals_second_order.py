@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import ACTIVATIONS, Network
-from gnrecon.linalg import LayerRows
+from gnrecon.least_squares import LayerRows
 from gnrecon.residuals import (
     SecondOrder,
     clipped_strain,

@@ -11,9 +11,9 @@ import torch
 
 from gnrecon.export import require_bordered, require_sound
 from gnrecon.field import Network
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import eikonal, interface, mean_curvature
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.sampling import Box
 from gnrecon.shapes import (
     Measurement,
     ShapeProblem,

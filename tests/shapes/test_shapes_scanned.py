@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.cloud import Frame, Samples
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.least_squares import Iterative, Neighbours
 from gnrecon.levelset import LevelSet
-from gnrecon.linalg import Iterative, Neighbours
 from gnrecon.shapes import ScannedSurface, learn, scanned
 from gnrecon.shapes.term import LAST, Drawn, Moment
 

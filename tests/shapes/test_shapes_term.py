@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from gnrecon.geometry.signed_distance import Box
 from gnrecon.levelset import LevelSet
 from gnrecon.residuals import interface
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.sampling import Box
 from gnrecon.shapes import (
     PROBLEMS,
     Moment,

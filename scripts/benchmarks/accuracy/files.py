@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.problem import Problem
-from gnrecon.cloud import Frame, PointCloud
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame, PointCloud
 from gnrecon.io import read_cloud, read_mesh
-from gnrecon.mesh import Mesh
 from gnrecon.runtime.errors import InputError
 
 SAMPLES_APART = 1_000_000

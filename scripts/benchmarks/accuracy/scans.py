@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.accuracy.solids import SOLIDS, Solid
 from benchmarks.problem import Problem
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import PointCloud
 
 ROOM = 1.1
 """Half the side of the box, in radii, in which outliers are scattered."""

@@ -9,8 +9,8 @@ from benchmarks.accuracy.table import method_title
 from benchmarks.arrays import load_mesh, load_scan, load_truth
 from benchmarks.problem import Problem
 from benchmarks.sheet import Part, Row
-from gnrecon.cloud import PointCloud
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 
 PANEL = (300, 270)
 """Width and height of a panel, in pixels."""

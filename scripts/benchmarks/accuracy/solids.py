@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from sample_shapes import Distance, gradient, project, smooth_cut
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract
 from gnrecon.export.metrics import sample_surface
 from gnrecon.geometry.arrays import Float
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import Frame
 
 FINE = 0.02
 """Longest edge of the meshes of plane faces: long slivers would be drawn with smeared shades."""

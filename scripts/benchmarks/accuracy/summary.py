@@ -11,7 +11,7 @@ from benchmarks.accuracy.cases import HARD
 from benchmarks.comparison import best_setting
 from benchmarks.methods import PEERS
 from benchmarks.problem import Problem
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 
 LENGTHS = (
     "reference_to_mesh_mean",

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.cloud import PointCloud
+from gnrecon.geometry.point_cloud import PointCloud
 
 Float = npt.NDArray[np.float64]
 

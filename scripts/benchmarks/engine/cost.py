@@ -28,7 +28,7 @@ from benchmarks.engine.loss import posed
 from benchmarks.engine.scans import sphere
 from gnrecon.field import Siren
 from gnrecon.fit.problem import FieldProblem
-from gnrecon.linalg import Jacobian
+from gnrecon.least_squares import Jacobian
 
 MATMUL = 4096
 MATRIX_BYTES = 2_000_000_000

@@ -23,7 +23,7 @@ from benchmarks.engine.process import run_alone
 from benchmarks.engine.scans import sphere
 from gnrecon.field import Siren
 from gnrecon.fit.problem import FieldProblem
-from gnrecon.linalg import RowSpace, identity
+from gnrecon.least_squares import RowSpace, identity
 
 MODULE = "benchmarks.engine.kernel"
 STEP_FILE = "step.pt"

@@ -20,8 +20,8 @@ from benchmarks.engine.loss import KEEP_BYTES, posed
 from benchmarks.engine.process import run_alone
 from benchmarks.engine.scans import sphere
 from gnrecon.field import Siren
-from gnrecon.linalg import Auto, Iterative, Jacobian, Metric, layer_scaled
-from gnrecon.linalg.system import DampedSystem
+from gnrecon.least_squares import Auto, Iterative, Jacobian, Metric, layer_scaled
+from gnrecon.least_squares.system import DampedSystem
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 
 MEMORY_MB = 8000.0

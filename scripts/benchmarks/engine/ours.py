@@ -24,7 +24,7 @@ from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
 from gnrecon.fit.method import ENERGY
 from gnrecon.fit.problem import FieldProblem
-from gnrecon.linalg import SOLVERS, layer_scaled
+from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 
 WIDTHS = (32, 32, 32)

@@ -19,7 +19,7 @@ from benchmarks.engine.clock import timed
 from benchmarks.engine.loss import posed
 from benchmarks.engine.step import Frozen
 from gnrecon.field import Siren
-from gnrecon.linalg import SOLVERS, Cholesky, Jacobian, layer_scaled
+from gnrecon.least_squares import SOLVERS, Cholesky, Jacobian, layer_scaled
 
 DAMPINGS = (1e-2, 1e-5)
 HELD = {"row-space": 3}

@@ -24,7 +24,7 @@ from benchmarks.engine.loss import Sample, posed
 from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
 from gnrecon.fit.method import ENERGY
-from gnrecon.linalg import SOLVERS, layer_scaled
+from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, Solution, StopRule
 
 CHUNK = 512

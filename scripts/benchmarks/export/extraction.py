@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.cloud import Frame
 from gnrecon.export import extract, project
 from gnrecon.export.lattice import Lattice
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame
 
 
 class Counting:

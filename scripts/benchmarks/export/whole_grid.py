@@ -11,7 +11,7 @@ from gnrecon.export.band import narrow_band
 from gnrecon.export.lattice import Lattice
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 
 TOLERANCE = 1e-4
 """Cells within which vertices are the same: scikit-image returns float32."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
-from gnrecon.linalg import Cholesky, DenseJacobian, identity
+from gnrecon.least_squares import Cholesky, DenseJacobian, identity
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
 
 CHUNK = 512

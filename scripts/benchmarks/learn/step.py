@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.learn.nested import nested_step, papers_step
-from gnrecon.linalg import Cholesky, LinearSolver, identity
+from gnrecon.least_squares import Cholesky, LinearSolver, identity
 from gnrecon.shapes import ShapeProblem, catenoid, learn
 from gnrecon.shapes.frozen import FrozenProblem
 

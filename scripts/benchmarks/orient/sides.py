@@ -12,8 +12,8 @@ from benchmarks.peers import oriented
 from benchmarks.problem import Problem
 from gnrecon.export.nearest import Surface
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.ingest import oriented_normals
-from gnrecon.mesh import Mesh
 
 
 def true_normals(problem: Problem) -> Float | None:

@@ -21,7 +21,7 @@ from gnrecon.export.decimate import collapsed
 from gnrecon.export.meshlab import from_meshlab, to_meshlab
 from gnrecon.export.solid import centre_and_size
 from gnrecon.fit import NeuralSDF
-from gnrecon.mesh import Mesh
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import write_text
 

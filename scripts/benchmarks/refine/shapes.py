@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gnrecon.cloud import Frame
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame
 
 STEP = 1e-6
 

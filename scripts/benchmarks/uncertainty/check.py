@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from benchmarks.uncertainty.scans import Case, draw, errors
-from gnrecon.cloud import PointCloud
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.pipeline import Reconstruction, reconstruct
 
 FAR = 2.0

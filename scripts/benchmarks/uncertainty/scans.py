@@ -8,9 +8,9 @@ import numpy as np
 from sample_shapes import SHAPES, Shape, gradient, project
 
 from benchmarks.provenance import REPOSITORY
-from gnrecon.cloud import Frame, PointCloud
 from gnrecon.export.metrics import sample_surface
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame, PointCloud
 from gnrecon.io import read_mesh
 
 NORMAL_NOISE = 0.05

@@ -23,13 +23,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.gmres import gmres
-from gnrecon.linalg.jacobian import Jacobian
-from gnrecon.linalg.krylov import Apply, KrylovResult, conjugate_gradients
-from gnrecon.linalg.metric import Metric
-from gnrecon.linalg.minres import minres
-from gnrecon.linalg.preconditioner import Jacobi, Preconditioner, Prepared
-from gnrecon.linalg.system import Equations, Linearisation, Step
+from gnrecon.least_squares.jacobian import Jacobian
+from gnrecon.least_squares.krylov import Apply, KrylovResult, conjugate_gradients, gmres, minres
+from gnrecon.least_squares.preconditioners import Jacobi, Preconditioner, Prepared
+from gnrecon.least_squares.system import Equations, Linearisation, Metric, Step
 
 METHODS = {"minres": minres, "gmres": gmres}
 NAMES = {"cg": "Conjugate gradients", "minres": "MINRES", "gmres": "GMRES"}

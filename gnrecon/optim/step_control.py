@@ -17,16 +17,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.metric import Metric, jacobian_scaled
-from gnrecon.linalg.system import DampedSystem, Step
+from gnrecon.least_squares.system import DampedSystem, Metric, Step, identity, jacobian_scaled
 from gnrecon.optim.problem import Problem, loss_of
-from gnrecon.optim.search import Move
 
 PROBE = 0.1
+
 BENT = 0.75
 
 
@@ -94,3 +94,106 @@ class GainRatioDamping:
 def _follows(metric: Tensor, step: Step, bend: Step) -> bool:
     """Whether |a|_D <= 3/4 |s|_D."""
     return float(metric @ bend.direction.square()) <= BENT**2 * float(metric @ step.direction.square())
+
+
+# Lengths along one direction: the paper's log-spaced line search, and a fixed multiple.
+#
+# The direction has a tiny fixed damping, so that it is the natural gradient of the paper's function space. *Log-
+# spaced*: lengths spaced evenly in their logarithm are all tried from the same start, and the best one is taken;
+# nothing is kept of a trial that lost. *Fixed*: the same multiple each step, as the paper steps on resampled moving
+# surfaces, where losses of different samples do not compare.
+
+
+@dataclass(frozen=True)
+class LogLineSearch:
+    """Fixed tiny damping, and the best of `trials` lengths from 1 down to `shortest`, evenly spaced in log."""
+
+    initial_damping: float = 1e-6
+    metric: Metric = identity
+    trials: int = 15
+    shortest: float = 2.0**-14
+
+    def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
+        """Try all lengths along one direction, each from the same start."""
+        step = system.solve(damping)
+        # At a stationary point nothing is predicted, and what the loss falls by is rounding.
+        if step.predicted <= 0.0:
+            return Move(free, system.loss, damping, 0.0, 0.0, damping * 10, step.iterations, step.failure)
+        best = Move(free, system.loss, damping, 0.0, 0.0, self.initial_damping, step.iterations)
+        for trial in range(self.trials):
+            length = self.shortest ** (trial / max(self.trials - 1, 1))
+            moved = free + length * step.direction.to(free.dtype)
+            loss = loss_of(problem, moved)
+            if loss < best.loss:
+                gain = (system.loss - loss) / step.predicted
+                best = Move(moved, loss, damping, gain, length, self.initial_damping, step.iterations)
+        return best
+
+    def describe(self) -> str:
+        """Name the search."""
+        return f"Gauss-Newton with a log-spaced line search, {self.trials} lengths."
+
+
+@dataclass(frozen=True)
+class FixedStep:
+    """Fixed damping, and `length` times the direction, whatever it does to the loss as long as that stays finite."""
+
+    length: float = 0.1
+    initial_damping: float = 1e-6
+    metric: Metric = identity
+
+    def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
+        """Take the step."""
+        step = system.solve(damping)
+        moved = free + self.length * step.direction.to(free.dtype)
+        loss = loss_of(problem, moved)
+        if step.predicted <= 0.0 or not math.isfinite(loss):
+            return Move(free, system.loss, damping, 0.0, 0.0, damping * 10, step.iterations, step.failure)
+        gain = (system.loss - loss) / step.predicted
+        return Move(moved, loss, damping, gain, self.length, self.initial_damping, step.iterations)
+
+    def describe(self) -> str:
+        """Name the search."""
+        return f"Gauss-Newton with steps of {self.length:g} times the direction."
+
+
+# How a search turns a linearisation into a move; the ways to do so are `damping` and `line`.
+
+
+@dataclass(frozen=True)
+class Move:
+    """Where a search ended: new free parameters and loss (the old ones when `length` is zero), and the next damping.
+
+    `iterations` counts those of iterative solvers, `failure` says why a solver found no step, if it did not.
+    """
+
+    free: Tensor
+    loss: float
+    damping: float
+    gain_ratio: float
+    length: float
+    next_damping: float
+    iterations: int = 0
+    failure: str | None = None
+
+
+class Search(Protocol):
+    """Turns a damped system into a move."""
+
+    @property
+    def initial_damping(self) -> float:
+        """Damping of the first step."""
+        ...
+
+    @property
+    def metric(self) -> Metric:
+        """What the damping is measured in."""
+        ...
+
+    def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
+        """Return the move from the free parameters, of shape (k,)."""
+        ...
+
+    def describe(self) -> str:
+        """Return what this search does, in a sentence."""
+        ...

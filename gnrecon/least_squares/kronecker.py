@@ -30,11 +30,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gnrecon.linalg.draw import draw
-from gnrecon.linalg.jacobian import Block, Jacobian, LayeredJacobian
-from gnrecon.linalg.krylov import Apply
-from gnrecon.linalg.preconditioner import positive
-from gnrecon.linalg.rows import LayerRows
+from gnrecon.least_squares.jacobian import Block, Jacobian, LayeredJacobian
+from gnrecon.least_squares.krylov import Apply
+from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.least_squares.preconditioners import draw, positive
 
 
 @dataclass(frozen=True)

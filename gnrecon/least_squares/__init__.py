@@ -2,24 +2,33 @@
 
 from collections.abc import Callable
 
-from gnrecon.linalg.auto import Auto
-from gnrecon.linalg.averaged import Averaged
-from gnrecon.linalg.cholesky import Cholesky
-from gnrecon.linalg.gmres import gmres
-from gnrecon.linalg.iterative import Iterative
-from gnrecon.linalg.jacobian import Block, DenseJacobian, Jacobian, LayeredJacobian
-from gnrecon.linalg.kronecker import Kronecker
-from gnrecon.linalg.krylov import KrylovResult, conjugate_gradients
-from gnrecon.linalg.metric import Metric, identity, jacobian_layer_scaled, jacobian_scaled, layer_scaled
-from gnrecon.linalg.minres import minres
-from gnrecon.linalg.neighbours import Neighbours
-from gnrecon.linalg.nystrom import Nystrom
-from gnrecon.linalg.preconditioner import BlockJacobi, Jacobi, Preconditioner, Prepared
-from gnrecon.linalg.qr import QR
-from gnrecon.linalg.row_space import RowSpace
-from gnrecon.linalg.rows import LayerRows
-from gnrecon.linalg.sampled_gram import SampledGram, Sketch
-from gnrecon.linalg.system import DampedSystem, LinearSolver, Step
+from gnrecon.least_squares.auto import Auto
+from gnrecon.least_squares.direct import QR, Averaged, Cholesky, RowSpace
+from gnrecon.least_squares.iterative import Iterative
+from gnrecon.least_squares.jacobian import Block, DenseJacobian, Jacobian, LayeredJacobian
+from gnrecon.least_squares.kronecker import Kronecker
+from gnrecon.least_squares.krylov import KrylovResult, conjugate_gradients, gmres, minres
+from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.least_squares.neighbour_sums import Neighbours
+from gnrecon.least_squares.preconditioners import (
+    BlockJacobi,
+    Jacobi,
+    Nystrom,
+    Preconditioner,
+    Prepared,
+    SampledGram,
+    Sketch,
+)
+from gnrecon.least_squares.system import (
+    DampedSystem,
+    LinearSolver,
+    Metric,
+    Step,
+    identity,
+    jacobian_layer_scaled,
+    jacobian_scaled,
+    layer_scaled,
+)
 
 SOLVERS: dict[str, Callable[..., LinearSolver]] = {
     "auto": lambda energy=0.0: Auto(energy),

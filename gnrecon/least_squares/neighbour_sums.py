@@ -30,12 +30,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.cholesky import solve_factored
-from gnrecon.linalg.gram import gram
-from gnrecon.linalg.jacobian import Jacobian
-from gnrecon.linalg.krylov import Apply
-from gnrecon.linalg.preconditioner import Prepared, definite_factor
-from gnrecon.linalg.sampled_gram import PreparedGram
+from gnrecon.least_squares.direct import solve_factored
+from gnrecon.least_squares.jacobian import Jacobian
+from gnrecon.least_squares.krylov import Apply
+from gnrecon.least_squares.layer_products import gram
+from gnrecon.least_squares.preconditioners import Prepared, PreparedGram, definite_factor
 
 LENGTHS = (2, 4, 8)
 """Rows of a run, if it is more than one."""

@@ -28,15 +28,12 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.cholesky import Cholesky
-from gnrecon.linalg.iterative import Iterative
-from gnrecon.linalg.jacobian import Jacobian, LayeredJacobian
-from gnrecon.linalg.kronecker import Kronecker
-from gnrecon.linalg.metric import Metric
-from gnrecon.linalg.preconditioner import Jacobi
-from gnrecon.linalg.row_space import RowSpace, constant_on_groups
-from gnrecon.linalg.sampled_gram import SampledGram
-from gnrecon.linalg.system import DampedSystem, LinearSolver
+from gnrecon.least_squares.direct import Cholesky, RowSpace, constant_on_groups
+from gnrecon.least_squares.iterative import Iterative
+from gnrecon.least_squares.jacobian import Jacobian, LayeredJacobian
+from gnrecon.least_squares.kronecker import Kronecker
+from gnrecon.least_squares.preconditioners import Jacobi, SampledGram
+from gnrecon.least_squares.system import DampedSystem, LinearSolver, Metric
 
 _log = logging.getLogger(__name__)
 

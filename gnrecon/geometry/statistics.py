@@ -59,3 +59,32 @@ class Histogram:
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain values, ready for JSON."""
         return {**asdict(self), "counts": list(self.counts)}
+
+
+# Statistics that a few outliers hardly move.
+
+
+def deviation(off: Float) -> float:
+    """Return the standard deviation of what is off its middle, of shape (N,), by the median of its size.
+
+    It is that of a normal distribution of as large a median.
+    """
+    return 1.4826 * float(np.median(np.abs(off)))
+
+
+# Angles about an axis.
+
+
+def widest_gap(directions: Float, axis: Float) -> float:
+    """Return the widest angle about an axis, of shape (3,), into which none of the directions looks, in radians.
+
+    Parameters
+    ----------
+    directions : array of shape (N, 3)
+        Their parts along the axis do not matter; without any the whole circle is bare.
+    """
+    if not len(directions):
+        return 2 * np.pi
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    angles = np.sort(np.arctan2(directions @ np.cross(axis, across), directions @ across))
+    return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())

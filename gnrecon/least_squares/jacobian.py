@@ -19,8 +19,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from gnrecon.linalg.gram import gram
-from gnrecon.linalg.rows import LayerRows
+from gnrecon.least_squares.layer_products import LayerRows, gram
 
 Block = Sequence[LayerRows]
 """Rows as one `LayerRows` a layer."""
