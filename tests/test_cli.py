@@ -346,10 +346,10 @@ from gnrecon.geometry.mesh import Mesh
 gnrecon.meshing.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
 """
 TORN_BY_WRITING = """
-import gnrecon.io.formats
+import gnrecon.io.format_registry
 from gnrecon.geometry.mesh import Mesh
-write = gnrecon.io.formats.WRITERS[".obj"]
-gnrecon.io.formats.WRITERS[".obj"] = lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path)
+write = gnrecon.io.format_registry.WRITERS[".obj"]
+gnrecon.io.format_registry.WRITERS[".obj"] = lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path)
 """
 
 

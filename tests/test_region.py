@@ -18,7 +18,7 @@ from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.geometry.units import parse_plane
 from gnrecon.io import cropped, read_scans
 from gnrecon.io.contents import Contents
-from gnrecon.io.gather import Gatherer
+from gnrecon.io.streaming import Gatherer
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gnrecon.batch.job import Job
-from gnrecon.io.members import members
+from gnrecon.io.merge import members
 from gnrecon.version import __version__
 
 

@@ -19,8 +19,8 @@ from gnrecon.io import (
     write_mesh,
     written_origin,
 )
-from gnrecon.io.losses import losses
 from gnrecon.io.origin import told
+from gnrecon.io.write import losses
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import require_files
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.least_squares import identity
 from gnrecon.least_squares.jacobian import DenseJacobian
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gnrecon.field.features import Features
-from gnrecon.field.partition import OFFSETS, Partition
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
+from gnrecon.field.partition_of_unity import OFFSETS, Partition
+from gnrecon.field.random_features import Features
 from gnrecon.fit.choose import Leftover, Volume
 from gnrecon.fit.detail import BEYOND, CLEAR, LEAST_POINTS, VOLUME, cube_length
 from gnrecon.fit.dipoles import Dipoles

@@ -22,7 +22,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.clean import clean_noise
 from gnrecon.fit.evidence import PATCHES as EVIDENT_PATCHES
 from gnrecon.fit.evidence import POINTS, Evidence

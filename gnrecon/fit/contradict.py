@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.loss import distance_term
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import Scene
@@ -24,7 +24,7 @@ from gnrecon.fit.start import wide_start
 from gnrecon.fit.terms import Term
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.residuals.first_order import interface
+from gnrecon.residuals.constraints import interface
 
 CLEARLY = -0.5
 """Slope along a normal below which the field contradicts it; one that agrees has 1."""

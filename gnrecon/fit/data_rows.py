@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.terms import Term
 from gnrecon.least_squares import LayeredJacobian
-from gnrecon.residuals.first_order import Residual, interface
+from gnrecon.residuals.constraints import Residual, interface
 
 MOST_PARAMETERS = 3000
 WIDE = 600

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.loss import data_terms, start_terms, step_terms
 from gnrecon.fit.method import optimiser_for
 from gnrecon.fit.options import FitOptions

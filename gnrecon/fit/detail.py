@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.field.detail import Detail
-from gnrecon.field.features import Features
-from gnrecon.field.partition import Partition
+from gnrecon.field.partition_of_unity import Detail, Partition
+from gnrecon.field.random_features import Features
 from gnrecon.fit.averaged import Told
 from gnrecon.fit.choose import Leftover, Volume
 from gnrecon.fit.patch import Belief, PatchSystem

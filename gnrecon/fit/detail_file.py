@@ -8,9 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gnrecon.field.detail import Detail
-from gnrecon.field.features import Features
-from gnrecon.field.partition import Partition
+from gnrecon.field.partition_of_unity import Detail, Partition
+from gnrecon.field.random_features import Features
 from gnrecon.runtime.errors import InputError
 
 LATTICE, NOISE, KEYS, LENGTHS = "detail.lattice", "detail.noise", "detail.keys", "detail.lengths"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.options import FitOptions
 from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.sdf import NeuralSDF

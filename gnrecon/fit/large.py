@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from gnrecon.field.detail import Detail
-from gnrecon.field.features import Features
-from gnrecon.field.partition import Partition
+from gnrecon.field.partition_of_unity import Detail, Partition
+from gnrecon.field.random_features import Features
 from gnrecon.fit.choose import Leftover, choose
 from gnrecon.fit.detail import CELL, CHOSEN
 from gnrecon.fit.dipoles import Dipoles

@@ -22,7 +22,7 @@ from gnrecon.fit.options import FitOptions, normal_residual
 from gnrecon.fit.scene import REACH, Scene
 from gnrecon.fit.terms import Term
 from gnrecon.geometry.signed_distance import near_surface
-from gnrecon.residuals.first_order import eikonal, interface, signed_distance
+from gnrecon.residuals.constraints import eikonal, interface, signed_distance
 
 LEAST_REACH = 0.012
 EIKONAL_REACH = 0.05

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.detail_file import detail_of, detail_tensors
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.point_cloud import Frame

@@ -7,9 +7,8 @@ from typing import Any
 
 from gnrecon.fit.regulariser import Regulariser, regularisers
 from gnrecon.least_squares import SOLVERS
-from gnrecon.residuals.first_order import Residual, normal_cosine, normal_projection, normal_vector
-from gnrecon.residuals.named import named
-from gnrecon.residuals.second_order import SecondOrder
+from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, normal_projection, normal_vector
+from gnrecon.residuals.named_residuals import named
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.plugins import RESIDUALS, find, installed
 
@@ -45,7 +44,7 @@ class FitOptions:
     quality : ``"draft"``, ``"normal"`` or ``"high"``
         Features of the detail a cube, 300, 600 or 1,000, where there is detail.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
-        Residual of the given normals, see `gnrecon.residuals.first_order`.
+        Residual of the given normals, see `gnrecon.residuals.constraints`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
         Gauss-Newton, or one of the methods that the paper compares with.
     solver : str

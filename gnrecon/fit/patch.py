@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram
 from gnrecon.runtime.parallel import slices

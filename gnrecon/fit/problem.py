@@ -14,11 +14,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.terms import Term, groups
 from gnrecon.least_squares.jacobian import Block, LayeredJacobian
 from gnrecon.least_squares.layer_products import LayerRows
-from gnrecon.residuals.first_order import Linearised
+from gnrecon.residuals.constraints import Linearised
 from gnrecon.runtime.parallel import slices
 
 CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000

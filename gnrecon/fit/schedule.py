@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.adaptive import fit_adaptive
 from gnrecon.fit.deep import fit_deep
 from gnrecon.fit.options import FitOptions

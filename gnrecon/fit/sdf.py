@@ -13,8 +13,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.field.detail import Detail
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.geometry.signed_distance import Box

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.bend import Jet, Sines, Wish, bent
 from gnrecon.fit.loss import data_terms, distance_term
 from gnrecon.fit.options import FitOptions

@@ -19,7 +19,7 @@ from torch import Tensor
 from gnrecon.fit.sdf import NeuralSDF
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.levelset import LevelSet, sample_surface
+from gnrecon.level_set import LevelSet, sample_surface
 
 NEAR, FAR = 2.0, 3.5
 """Where far begins to count, and where it counts fully."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gnrecon.field.features import DEGREES_OF_FREEDOM, Features
+from gnrecon.field.random_features import DEGREES_OF_FREEDOM, Features
 from gnrecon.fit.choose import SPARSE
 from gnrecon.fit.patch import Patch, PatchSystem
 from gnrecon.fit.scene import REACH, Scene

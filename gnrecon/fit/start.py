@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
 from gnrecon.fit.ghosts import GhostSearch
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.scene import Scene

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from gnrecon.residuals.first_order import Residual
+from gnrecon.residuals.constraints import Residual
 
 
 @dataclass(frozen=True)

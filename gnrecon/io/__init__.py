@@ -1,13 +1,9 @@
 """Reading clouds and meshes, writing both, and converting other libraries' objects."""
 
-from gnrecon.io.formats import CLOUD_WRITERS, READERS, WRITERS
-from gnrecon.io.handed import to_open3d, to_pymeshlab, to_trimesh
-from gnrecon.io.members import all_members
-from gnrecon.io.objects import as_cloud, as_mesh, as_shape
-from gnrecon.io.plugged import readable, writable
-from gnrecon.io.read import read_any, read_cloud, read_mesh, read_reference
-from gnrecon.io.scans import MOST_POINTS, Reading, cropped, read_scans
-from gnrecon.io.unpack import extension_of
+from gnrecon.io.format_registry import CLOUD_WRITERS, READERS, WRITERS, readable, writable
+from gnrecon.io.interop import as_cloud, as_mesh, as_shape, to_open3d, to_pymeshlab, to_trimesh
+from gnrecon.io.merge import MOST_POINTS, Reading, all_members, cropped, read_scans
+from gnrecon.io.read import extension_of, read_any, read_cloud, read_mesh, read_reference
 from gnrecon.io.write import check_writable, holds, unverified, write_cloud, write_mesh, written_origin
 from gnrecon.runtime.files import atomic_write, write_text
 

@@ -17,10 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.io.beside import beside
 from gnrecon.io.contents import Contents, joined
+from gnrecon.io.parse import beside, numbers, read_text
 from gnrecon.io.ply import read_ply
-from gnrecon.io.text import numbers, read_text
 from gnrecon.runtime.errors import InputError
 
 _DISTANCE = 100.0

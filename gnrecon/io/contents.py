@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.plugins import guarded, told
 
 Columns = Mapping[str, Values]
 
 _POSITION = (("x", "y", "z"),)
+
 _NORMAL = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
+
 _COLOR = (
     ("red", "green", "blue", "alpha"),
     ("red", "green", "blue"),
@@ -122,3 +126,47 @@ def _origins(pieces: Sequence[Contents]) -> Float | None:
     return np.concatenate(
         [np.full((len(piece.points), 3), np.nan) if piece.origins is None else piece.origins for piece in pieces]
     )
+
+
+# Polygons of any number of corners, cut into fans of triangles.
+
+
+def fan(counts: Int, corners: Int) -> Int:
+    """Return triangles, of shape (F, 3), that cover polygons.
+
+    A polygon v0 v1 ... v(n-1) becomes the n - 2 triangles v0 v(k+1) v(k+2); fewer than three corners give none.
+
+    Parameters
+    ----------
+    counts : integer array of shape (P,), the number of corners of each polygon
+    corners : integer array of shape (counts.sum(),), the vertex indices of all polygons in a row
+    """
+    triangles = np.maximum(counts - 2, 0)
+    polygon = np.repeat(np.arange(len(counts)), triangles)
+    first = (np.cumsum(counts) - counts)[polygon]
+    k = np.arange(len(polygon)) - (np.cumsum(triangles) - triangles)[polygon]
+    return np.column_stack([corners[first], corners[first + k + 1], corners[first + k + 2]])
+
+
+def not_triangles(counts: Int) -> tuple[str, ...]:
+    """Say what `fan` does not keep of polygons with so many corners, of shape (P,); nothing for triangles."""
+    larger, smaller = int((counts > 3).sum()), int((counts < 3).sum())
+    sentences = (
+        (larger, f"{larger} polygons of more than three corners as such (they are cut into triangles)"),
+        (smaller, f"{smaller} polygons of less than three corners"),
+    )
+    return tuple(sentence for count, sentence in sentences if count)
+
+
+# Guarding a call into a library that parses files.
+
+
+def parsing(kind: str) -> AbstractContextManager[None]:
+    """Guard a block that parses a file of a kind, such as ``"LAS"``.
+
+    Raises
+    ------
+    InputError
+        When the library in the block fails in whichever way; see `gnrecon.runtime.plugins.guarded`.
+    """
+    return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({told(error)}).")

@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Values
-from gnrecon.io.contents import Columns, Contents, joined, no_faces
-from gnrecon.io.foreign import parsing
+from gnrecon.io.contents import Columns, Contents, joined, no_faces, parsing
 from gnrecon.runtime.errors import InputError
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")

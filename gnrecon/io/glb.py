@@ -22,8 +22,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents
-from gnrecon.io.foreign import parsing
+from gnrecon.io.contents import Contents, parsing
 from gnrecon.runtime.errors import InputError
 
 _COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"

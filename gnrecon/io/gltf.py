@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from gnrecon.io.beside import beside
-from gnrecon.io.contents import Contents
-from gnrecon.io.foreign import parsing
+from gnrecon.io.contents import Contents, parsing
 from gnrecon.io.glb import packed, read_glb_bytes
+from gnrecon.io.parse import beside
 from gnrecon.runtime.errors import InputError
 
 

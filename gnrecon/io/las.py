@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Mask, Values
-from gnrecon.io.contents import Columns, Contents, from_columns, joined
-from gnrecon.io.foreign import parsing
+from gnrecon.io.contents import Columns, Contents, from_columns, joined, parsing
 from gnrecon.runtime.errors import InputError
 
 _LEAST_HEADER, _VLR, _EVLR = 227, 54, 60  # bytes, from the specification

@@ -10,9 +10,8 @@ import numpy as np
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.polygons import fan, not_triangles
-from gnrecon.io.text import format_rows, meaningful_lines, numbers, read_text, rows_of
+from gnrecon.io.contents import Contents, fan, no_faces, not_triangles
+from gnrecon.io.parse import format_rows, meaningful_lines, numbers, read_text, rows_of
 from gnrecon.runtime.errors import InputError
 
 _KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF\b", re.IGNORECASE)

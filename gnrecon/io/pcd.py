@@ -14,7 +14,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.text import numbers
+from gnrecon.io.parse import numbers
 from gnrecon.runtime.errors import InputError
 
 Header = dict[str, list[str]]

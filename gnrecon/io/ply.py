@@ -15,11 +15,10 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Int, Values
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, from_columns
+from gnrecon.io.contents import Contents, fan, from_columns, not_triangles
+from gnrecon.io.parse import numbers
 from gnrecon.io.ply_columns import vertex_columns
 from gnrecon.io.ply_header import ORDERS, PLY_TYPES, Element, Property, parse_header, too_short
-from gnrecon.io.polygons import fan, not_triangles
-from gnrecon.io.text import numbers
 from gnrecon.runtime.errors import InputError
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.io.contents import Contents, joined, no_faces
-from gnrecon.io.text import numbers
+from gnrecon.io.parse import numbers
 from gnrecon.runtime.errors import InputError
 
 _POSE_LINES = 8

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import gzip
 import logging
+import shutil
+import sys
+import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +16,7 @@ from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import Contents
-from gnrecon.io.formats import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED
-from gnrecon.io.plugged import is_readable, readable, reader_of
-from gnrecon.io.unpack import extension_of, plain_file
+from gnrecon.io.format_registry import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED, is_readable, readable, reader_of
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import STANDARD_INPUT
 
@@ -173,3 +176,67 @@ def check_file(path: Path, extension: str) -> None:
     if kind in READERS:
         raise InputError(f"the file holds {kind[1:].upper()} data; rename it or give its format as {kind[1:]!r}.")
     raise InputError(f"expected {extension[1:].upper()} data, but the file is a {kind} file.")
+
+
+_GZIP = b"\x1f\x8b"
+
+_SUFFIX = ".gz"
+
+
+# Where a scan's bytes come from: a file, a gzip-compressed one, or standard input, always as a file to be read.
+#
+# Readers seek, compare sizes and hand names to libraries, so what is no plain file is first copied into a temporary
+# one.
+
+
+def extension_of(path: Path) -> str:
+    """Return the extension that says how a file is read: the one before ``.gz`` where it ends so; in lower case."""
+    return Path(path.stem if path.suffix.lower() == _SUFFIX else path.name).suffix.lower()
+
+
+@contextmanager
+def plain_file(path: Path, extension: str) -> Iterator[Path]:
+    """Yield a file that holds what is to be read, neither compressed nor a stream.
+
+    Parameters
+    ----------
+    path : file to read; ``-`` for standard input
+    extension : how it is to be read, with the dot; a copy has it
+
+    Raises
+    ------
+    InputError
+        When compressed data is damaged.
+    UsageError
+        When standard input is a terminal, where nobody would be waiting for points to be typed.
+    """
+    if path != STANDARD_INPUT and not _is_compressed(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="gnrecon-") as folder:
+        source = _from_standard_input(Path(folder) / f"stream{extension}") if path == STANDARD_INPUT else path
+        yield _unpacked(source, Path(folder) / f"unpacked{extension}") if _is_compressed(source) else source
+
+
+def _is_compressed(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(2) == _GZIP
+
+
+def _from_standard_input(copy: Path) -> Path:
+    if sys.stdin.isatty():
+        raise UsageError("Standard input is a terminal; send it a file, as in: gnrecon - --format xyz < scan.xyz")
+    with copy.open("wb") as file:
+        shutil.copyfileobj(sys.stdin.buffer, file)
+    return copy
+
+
+def _unpacked(packed: Path, target: Path) -> Path:
+    try:
+        with gzip.open(packed) as source, target.open("wb") as file:
+            shutil.copyfileobj(source, file)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(f"the compressed data is damaged ({error}).") from None
+    return target

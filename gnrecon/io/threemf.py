@@ -20,7 +20,7 @@ import numpy.typing as npt
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.text import format_rows
+from gnrecon.io.parse import format_rows
 
 CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 MATERIAL = "http://schemas.microsoft.com/3dmanufacturing/material/2015/02"

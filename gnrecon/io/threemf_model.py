@@ -20,7 +20,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
-from gnrecon.io.text import numbers
+from gnrecon.io.parse import numbers
 from gnrecon.io.threemf import MODEL_TYPE
 from gnrecon.runtime.errors import InputError
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.text import numbers
+from gnrecon.io.parse import numbers
 from gnrecon.io.vtk_data import assemble, split_counts, triangles
 from gnrecon.runtime.errors import InputError
 

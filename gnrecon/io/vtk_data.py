@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.polygons import fan
+from gnrecon.io.contents import Contents, fan, no_faces
 from gnrecon.runtime.errors import InputError
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Int, Values
 from gnrecon.io.contents import Contents, joined, no_faces
-from gnrecon.io.text import numbers
+from gnrecon.io.parse import numbers
 from gnrecon.io.vtk_data import assemble, split_counts, triangles
 from gnrecon.runtime.errors import InputError
 

@@ -16,8 +16,8 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, from_columns
+from gnrecon.io.parse import read_text
 from gnrecon.io.ply_columns import vertex_columns
-from gnrecon.io.text import read_text
 from gnrecon.runtime.errors import InputError
 
 _COMMENTS = ("#", "//", ";", "%")

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gnrecon.field import CurvedJet, Network
 from gnrecon.least_squares import Block, LayeredJacobian
-from gnrecon.levelset import transported
+from gnrecon.level_set import transported
 from gnrecon.residuals import Linearised, Residual, SecondOrder, tangents
 from gnrecon.runtime.parallel import slices
 

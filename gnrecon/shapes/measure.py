@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gnrecon.levelset import chamfer_divergence
+from gnrecon.level_set import chamfer_divergence
 from gnrecon.runtime.errors import FitError
 from gnrecon.shapes.problem import ShapeProblem
 from gnrecon.shapes.term import LAST

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon import levelset
+from gnrecon import level_set as levelset
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import mean_curvature
 from gnrecon.shapes.curves import through_curves

@@ -32,10 +32,10 @@ import torch
 
 from gnrecon.design import Design, InterfaceSample
 from gnrecon.field import Network
-from gnrecon.field.activation import WAVELET
+from gnrecon.field.layers import WAVELET
 from gnrecon.geometry.arrays import Float
 from gnrecon.least_squares import Averaged, identity
-from gnrecon.levelset import Beside, Joints, LevelSet, Region, joints
+from gnrecon.level_set import Beside, Joints, LevelSet, Region, joints
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import (
     clipped_strain,

@@ -13,7 +13,7 @@ from gnrecon.field import TANH, Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.least_squares import Iterative, LinearSolver, Neighbours, identity
-from gnrecon.levelset import KnownSurface, LevelSet
+from gnrecon.level_set import KnownSurface, LevelSet
 from gnrecon.optim import GainRatioDamping, Search
 from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
 from gnrecon.shapes.term import Drawn, Moment, Term

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field import Network
-from gnrecon.field.activation import SINE
+from gnrecon.field.layers import SINE
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Box, CoarseDistance, halved, least_values
 from gnrecon.least_squares import Iterative, LinearSolver, Neighbours, Preconditioner, jacobian_layer_scaled

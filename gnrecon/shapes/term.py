@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.geometry.signed_distance import Box, halved
-from gnrecon.levelset import LevelSet, sample_surface
+from gnrecon.level_set import LevelSet, sample_surface
 from gnrecon.residuals import Residual, SecondOrder
 from gnrecon.runtime.errors import FitError
 
@@ -28,7 +28,7 @@ MOST_GROWTH = 20.0
 """Logarithm of the most by which a number of points grows: by then it is all points of any scan."""
 
 NODES = 30_000
-"""Evaluations that the search for a surface costs at each step; see `gnrecon.levelset.sample_surface`."""
+"""Evaluations that the search for a surface costs at each step; see `gnrecon.level_set.sample_surface`."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from benchmarks.provenance import provenance
 from gnrecon.least_squares import LayeredJacobian
-from gnrecon.levelset import derivative_along, sample_surface, transported
+from gnrecon.level_set import derivative_along, sample_surface, transported
 from gnrecon.optim import Problem, StopRule
 from gnrecon.residuals import Linearised, SecondOrder, mean_curvature
 from gnrecon.runtime.errors import ExitCode, UsageError

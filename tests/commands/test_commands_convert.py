@@ -204,7 +204,7 @@ def test_refusals(tmp_path: Path, command: CommandLine) -> None:
 def test_a_file_that_comes_back_otherwise_is_not_kept(
     tmp_path: Path, command: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gnrecon.io.formats import WRITERS
+    from gnrecon.io.format_registry import WRITERS
 
     write = WRITERS[".obj"]
     monkeypatch.setitem(WRITERS, ".obj", lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path))

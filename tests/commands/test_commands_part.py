@@ -10,7 +10,7 @@ from command_line import CommandLine
 
 from gnrecon.export import verify_file
 from gnrecon.field import Network
-from gnrecon.field.activation import WAVELET
+from gnrecon.field.layers import WAVELET
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.shapes import pretrain

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import ACTIVATIONS, SINE, Network, Siren
-from gnrecon.field.activation import indices
+from gnrecon.field.layers import indices
 
 DEPTHS = [(5,), (1,), (4, 3), (3, 5, 4)]
 EXACT = {"rtol": 1e-9, "atol": 1e-9}

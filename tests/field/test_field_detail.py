@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.field.detail import AROUND, TOGETHER, Detail
-from gnrecon.field.features import Features
-from gnrecon.field.partition import Partition
+from gnrecon.field.partition_of_unity import AROUND, TOGETHER, Detail, Partition
+from gnrecon.field.random_features import Features
 from gnrecon.pipeline import limited
 
 

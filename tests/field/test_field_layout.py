@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gnrecon.field import Siren
-from gnrecon.field.layout import Layout
+from gnrecon.field.layers import Layout
 
 SIZES = [(3, 4, 1), (3, 5, 2, 1), (2, 3, 3, 4)]
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from gnrecon.field.partition import Partition
+from gnrecon.field.partition_of_unity import Partition
 
 
 @pytest.fixture(params=[0.2, 0.5, 1.0], ids=lambda overlap: f"overlap {overlap}")

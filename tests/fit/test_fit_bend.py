@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.bend import BendProblem, Sines, Wish, bent
 from gnrecon.fit.regulariser import CREASE, FILL, regularisers
 from gnrecon.residuals import SecondOrder, free_space, gauss_curvature, interface, mean_curvature, surface_strain

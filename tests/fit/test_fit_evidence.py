@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.choose import Leftover, Trials
 from gnrecon.fit.evidence import ANGLES, POINTS, POSITIONS, Evidence, log_density
 from gnrecon.fit.patch import SIZE, Patch, data_kernel

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.field.detail import Detail
-from gnrecon.field.siren import Siren
+from gnrecon.field.networks import Siren
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
 from gnrecon.fit.averaged import Told
 from gnrecon.fit.choose import Leftover

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gnrecon.field.features import Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.patch import SHARE, SIZE, Patch, PatchSystem, RowSystem, patch_system
 
 LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2

@@ -9,7 +9,7 @@ from scipy.special import kv
 from torch import Tensor
 
 from gnrecon.field import Siren
-from gnrecon.field.features import DEGREES_OF_FREEDOM
+from gnrecon.field.random_features import DEGREES_OF_FREEDOM
 from gnrecon.fit.problem import FieldProblem
 from gnrecon.fit.start import COARSE, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.terms import Term

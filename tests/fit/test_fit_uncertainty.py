@@ -21,7 +21,7 @@ from gnrecon.fit.start import random_features
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import normal_projection, normal_vector
-from gnrecon.residuals.first_order import Residual
+from gnrecon.residuals.constraints import Residual
 from gnrecon.runtime.errors import FitError
 
 UNIT = Frame(np.zeros(3), 1.0)

@@ -10,7 +10,7 @@ from scan_files import sphere, torus, write_scan
 from scipy.spatial.transform import Rotation
 
 from gnrecon.io import read_scans
-from gnrecon.io.same_scan import Moments
+from gnrecon.io.merge import Moments
 
 
 def moments(*chunks: np.ndarray) -> Moments:

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scan_writers import FORMS, file_of, random_cloud
 
-from gnrecon.io import chunks, read_cloud, read_scans
+from gnrecon.io import read_cloud, read_scans
+from gnrecon.io import streaming as chunks
 from gnrecon.io.conf import parse_conf
 from gnrecon.io.contents import Contents
-from gnrecon.io.gather import Gatherer
+from gnrecon.io.streaming import Gatherer
 from gnrecon.runtime.errors import InputError
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"

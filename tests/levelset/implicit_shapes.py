@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.geometry.signed_distance import Box
-from gnrecon.levelset import LevelSet
+from gnrecon.level_set import LevelSet
 
 
 def cube(half: float) -> Box:

@@ -10,9 +10,9 @@ import torch
 from implicit_shapes import cube, level_set
 from torch import Tensor
 
-from gnrecon.levelset import LevelSet, ParametricSurface, catenoid, chamfer_divergence, cone, enneper
-from gnrecon.levelset.chamfer import distances_to
-from gnrecon.levelset.sample import sample_surface
+from gnrecon.level_set import LevelSet, ParametricSurface, catenoid, chamfer_divergence, cone, enneper
+from gnrecon.level_set.known_surfaces import distances_to
+from gnrecon.level_set.sampling import sample_surface
 
 KNOWN: dict[str, Callable[[], ParametricSurface]] = {"catenoid": catenoid, "enneper": enneper, "cone": cone}
 IMPLICIT: dict[str, Callable[[Tensor], Tensor]] = {

@@ -10,7 +10,7 @@ import torch
 from implicit_shapes import cube, level_set
 from scipy import ndimage
 
-from gnrecon.levelset import Beside, LevelSet, Region, joints, refined, separate_components
+from gnrecon.level_set import Beside, LevelSet, Region, joints, refined, separate_components
 
 
 def balls(*centers: tuple[float, float, float], width: float = 0.25, level: float = 0.5) -> LevelSet:

@@ -12,8 +12,8 @@ from scipy import stats
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.signed_distance import Box
-from gnrecon.levelset import LevelSet, find_crossings, project, sample_surface
-from gnrecon.levelset.crossings import near_values
+from gnrecon.level_set import LevelSet, find_crossings, project, sample_surface
+from gnrecon.level_set.surface_search import near_values
 
 
 @pytest.fixture(params=SHAPES, scope="module")

@@ -16,7 +16,7 @@ from implicit_shapes import cube
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
-from gnrecon.levelset import LevelSet, derivative_along, sample_surface, transported
+from gnrecon.level_set import LevelSet, derivative_along, sample_surface, transported
 from gnrecon.residuals import Linearised, SecondOrder, eikonal, gauss_curvature, mean_curvature, surface_strain
 
 Family = Callable[[Tensor, Tensor], Tensor]

@@ -23,7 +23,7 @@ from gnrecon.residuals import (
     surface_strain,
     tangents,
 )
-from gnrecon.residuals.second_order import tangent_frame
+from gnrecon.residuals.constraints import tangent_frame
 
 F64 = torch.float64
 Function = Callable[[Tensor], Tensor]

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from gnrecon.design import Design, read_design
 from gnrecon.field import Network
-from gnrecon.field.activation import WAVELET
-from gnrecon.levelset import LevelSet
+from gnrecon.field.layers import WAVELET
+from gnrecon.level_set import LevelSet
 from gnrecon.shapes import ShapeProblem, bracket, learn, part
 from gnrecon.shapes.pretrain import pretrained
 from gnrecon.shapes.term import LAST, Drawn, Moment

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gnrecon.field import Network
-from gnrecon.field.activation import SINE, TANH, WAVELET
+from gnrecon.field.layers import SINE, TANH, WAVELET
 from gnrecon.residuals import signed_distance
 from gnrecon.runtime.errors import UsageError
 from gnrecon.shapes import catenoid, learn

@@ -10,7 +10,7 @@ import torch
 
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import Iterative, Neighbours
-from gnrecon.levelset import LevelSet
+from gnrecon.level_set import LevelSet
 from gnrecon.shapes import ScannedSurface, learn, scanned
 from gnrecon.shapes.term import LAST, Drawn, Moment
 

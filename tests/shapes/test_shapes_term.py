@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gnrecon.geometry.signed_distance import Box
-from gnrecon.levelset import LevelSet
+from gnrecon.level_set import LevelSet
 from gnrecon.residuals import interface
 from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.shapes import (

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.io.text import format_rows
+from gnrecon.io.parse import format_rows
 
 BLOCK = 1_000_000
 _CORNER = np.array([431_000.0, 5_412_000.0, 300.0])

@@ -94,3 +94,20 @@ def meaningful_lines(text: str, comment: str = "#") -> list[str]:
 def head(text: str, lines: int) -> list[str]:
     """Return the first lines of a text without splitting the rest of it."""
     return list(islice((line for line in text[: 4096 * lines].splitlines()), lines))
+
+
+# Files that another file names: they are read only where they lie in its folder or below, whatever the name says.
+
+
+def beside(folder: Path, name: str, what: str) -> Path:
+    """Return the path of a file that one in `folder` names; `what` says in words what it holds.
+
+    Raises
+    ------
+    InputError
+        When the name leads out of the folder.
+    """
+    target = folder / name
+    if not target.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"the {what} {name[:80]!r} lies outside of the file's folder, so it is not read.")
+    return target

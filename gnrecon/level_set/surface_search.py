@@ -16,16 +16,23 @@ of integral geometry for three families of lines; Santalo, Integral Geometry and
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from types import TracebackType
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.levelset.level_set import LevelSet
+from gnrecon.level_set.sampling import LevelSet
+from gnrecon.runtime.parallel import set_threads
 
 _TRIES = 4
+
 _BLOCK = 3
+
 _REACH = 1.5
 
 
@@ -163,3 +170,166 @@ def _false_position(low: Tensor, high: Tensor, f_low: Tensor, f_high: Tensor) ->
     """Return where the chord between (low, f_low < 0) and (high, f_high >= 0) is zero."""
     share = f_low / (f_low - f_high).clamp_max(-torch.finfo(f_low.dtype).tiny)
     return low + share.clamp(0.0, 1.0) * (high - low)
+
+
+TOLERANCE = 1e-14
+"""Distance from the level set, in diagonals of the box, at which a point counts as on it, unless rounding forbids."""
+
+_ROUNDING = 20 * TOLERANCE
+
+_QUADRATIC = 5
+
+
+# Orthogonal Newton projection: along the gradient onto the level set, and to the nearest point of it.
+#
+# The first-order expansion of f along its own gradient g vanishes after the step
+#
+#     x  <-  x - f g / |g|^2,
+#
+# which the paper uses to refine surface samples (its appendix on surface sampling, after Chopp, Some improvements of
+# the fast marching method, 2001). It is quadratic near the surface. Far from it, or where g is small, the step is a
+# wild guess, so its length is capped; at a critical point, where there is no direction at all, the point stays where it
+# is and is reported as not converged. No division is by zero.
+#
+# The point of the level set that is *nearest* to a given q satisfies more: q - x is parallel to g there. Each step
+# takes for x the foot of q on the tangent plane of f's level at x,
+#
+#     x  <-  q - (f + g . (q - x)) g / |g|^2,
+#
+# whose fixed points are those feet; it contracts by (distance of q) x (curvature), so it is for points near the
+# surface.
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Points after a projection.
+
+    Parameters
+    ----------
+    points : of shape (N, 3)
+    gradients : grad f there, of shape (N, 3)
+    distances : f / |grad f| there, of shape (N,): the distance that is left, to first order, with its sign
+    converged : of shape (N,), whether it is as good as zero
+    """
+
+    points: Tensor
+    gradients: Tensor
+    distances: Tensor
+    converged: Tensor
+
+
+def newton_step(level_set: LevelSet, points: Tensor, cap: float) -> Projection:
+    """Return points, of shape (N, 3), after one step of at most `cap`; gradients and distances are those before it."""
+    value, gradient = level_set.values_and_gradients(points)
+    distance, normal = _measured(value, gradient)
+    moved = points - distance.clamp(-cap, cap)[:, None] * normal
+    return Projection(moved, gradient, distance, _is_on(distance, level_set, TOLERANCE))
+
+
+def project(level_set: LevelSet, points: Tensor, cap: float, iterations: int = 30) -> Projection:
+    """Move points, of shape (N, 3), along the gradient onto the level set, each step by at most `cap`.
+
+    Points that have not arrived after `iterations` steps, or that met a critical point, are not `converged`.
+    """
+    points = points.clone()
+    value, gradient = level_set.values_and_gradients(points)
+    distance = _measured(value, gradient)[0]
+    for number in range(iterations):
+        # Steps that only stir the rounding errors are not worth their evaluations.
+        active = (~_is_on(distance, level_set, TOLERANCE if number < _QUADRATIC else _ROUNDING)).nonzero()[:, 0]
+        if not len(active):
+            break
+        before, normal = _measured(value[active], gradient[active])
+        points[active] -= before.clamp(-cap, cap)[:, None] * normal
+        value[active], gradient[active] = level_set.values_and_gradients(points[active])
+        distance[active] = _measured(value[active], gradient[active])[0]
+    return Projection(points, gradient, distance, _is_on(distance, level_set, _ROUNDING))
+
+
+def nearest(level_set: LevelSet, queries: Tensor, starts: Tensor, cap: float, iterations: int = 50) -> Projection:
+    """Find the feet of `queries`, of shape (N, 3), on the level set near `starts`, of the same shape.
+
+    A foot is `converged` where it lies on the level set and moved no more; it is then a point of the level set whose
+    gradient points to the query, and the nearest one if the start was near it.
+    """
+    points = project(level_set, starts, cap).points
+    moved = torch.full_like(points[:, 0], torch.inf)
+    for _ in range(iterations):
+        active = (moved > TOLERANCE * level_set.diagonal).nonzero()[:, 0]
+        if not len(active):
+            break
+        step = _foot_step(level_set, queries[active], points[active], cap)
+        points[active] += step
+        moved[active] = torch.linalg.vector_norm(step, dim=1)
+    # What little the last step left of f is no matter of the nearest point any more.
+    on = project(level_set, points, cap)
+    settled = moved <= 1e-9 * level_set.diagonal
+    return Projection(on.points, on.gradients, on.distances, on.converged & settled)
+
+
+def _foot_step(level_set: LevelSet, queries: Tensor, points: Tensor, cap: float) -> Tensor:
+    """Return the step from x to the foot of q on the tangent plane at x, at most `cap` long, of shape (N, 3)."""
+    value, gradient = level_set.values_and_gradients(points)
+    distance, normal = _measured(value, gradient)
+    toward = queries - points
+    step = toward - ((normal * toward).sum(1) + distance)[:, None] * normal
+    length = torch.linalg.vector_norm(step, dim=1, keepdim=True)
+    capped: Tensor = torch.where(distance[:, None].isfinite(), step, 0.0) * (cap / length.clamp_min(cap))
+    return capped
+
+
+def _measured(value: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Return f / |g|, of shape (N,), infinite where g vanishes, and g / |g|, of shape (N, 3), zero there."""
+    length = torch.linalg.vector_norm(gradient, dim=1)
+    # Twice, because the inverse of a subnormal length would overflow.
+    defined = (length > torch.finfo(length.dtype).tiny) & value.isfinite() & length.isfinite()
+    safe = torch.where(defined, length, 1.0)
+    normal = torch.where(defined[:, None], gradient / safe[:, None], 0.0)
+    return torch.where(defined, value / safe, torch.inf), normal
+
+
+def _is_on(distance: Tensor, level_set: LevelSet, tolerance: float) -> Tensor:
+    return distance.abs() <= tolerance * level_set.diagonal
+
+
+Input = TypeVar("Input")
+
+Answer = TypeVar("Answer")
+
+
+# Work that runs beside the caller's, on what the caller had one call ago.
+#
+# An answer that is computed in another thread would usually be taken whenever it is there, and a run would depend on
+# how busy the machine is. Here the lag is fixed: each call hands over a new input and returns the answer to the one
+# before, for which it waits if need be. So the same run gives the same result, and as long as the work takes no longer
+# than what the caller does between two calls, it costs nothing but a processor that was idle. What does the work must
+# release Python's lock while it does, as torch and gudhi do.
+
+
+class Beside(Generic[Input, Answer]):
+    """One worker for one function; use it in a `with` statement, which ends the worker.
+
+    Parameters
+    ----------
+    work : a function of nothing but its input, which must not change any more once it is handed over
+    """
+
+    def __init__(self, work: Callable[[Input], Answer]) -> None:
+        self._work = work
+        # As many of torch's threads as the one that asks has.
+        self._pool = ThreadPoolExecutor(1, initializer=set_threads, initargs=(torch.get_num_threads(),))
+        self._last: Future[Answer] | None = None
+
+    def __call__(self, current: Input) -> Answer:
+        """Hand over an input and return the answer to the previous one; at the first call, that to this one."""
+        following = self._pool.submit(self._work, current)
+        previous, self._last = self._last, following
+        return (previous or following).result()
+
+    def __enter__(self) -> Beside[Input, Answer]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from gnrecon.residuals.first_order import (
+from gnrecon.residuals.constraints import (
     Linearised,
     Residual,
+    SecondOrder,
     design_region,
     eikonal,
+    gauss_curvature,
     interface,
+    mean_curvature,
     normal_cosine,
     normal_projection,
     normal_vector,
     signed_distance,
+    surface_strain,
 )
-from gnrecon.residuals.second_order import SecondOrder, gauss_curvature, mean_curvature, surface_strain
 from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.runtime.plugins import RESIDUALS as GROUP
 from gnrecon.runtime.plugins import Plugin, find, installed

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
+import numpy as np
+
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.io.chunks import SETTLED, chunks
+from gnrecon.io.conf import parse_conf
 from gnrecon.io.contents import Contents
-from gnrecon.io.gather import Gatherer
-from gnrecon.io.read import check_file, extension_for, reading
-from gnrecon.io.same_scan import Moments, same_scans
-from gnrecon.io.unpack import plain_file
+from gnrecon.io.parse import beside, read_text
+from gnrecon.io.read import check_file, extension_for, extension_of, plain_file, reading
+from gnrecon.io.streaming import SETTLED, Gatherer, chunks
 from gnrecon.runtime.errors import InputError, UsageError
 
 _log = logging.getLogger(__name__)
@@ -151,3 +155,104 @@ def _with_normals(contents: Contents) -> Contents:
     if contents.normals is None and len(contents.faces):
         contents = replace(contents, normals=Mesh(contents.points, contents.faces).vertex_normals())
     return replace(contents, faces=contents.faces[:0])
+
+
+_LEAST = 25
+"""Points below which moments may agree by chance."""
+
+_AGREEMENT = 1e-5
+"""Of the moments, as a share of the largest: what float32 leaves of coordinates."""
+
+
+# Telling that two files hold the same scan, wherever each of them puts it.
+#
+# The number of points and the principal moments of inertia do not change when a scan is moved. They are summed while
+# the chunks pass, about a scan's first point, so that far-off coordinates lose no digits.
+
+
+class Moments:
+    """Sums over the points of one file."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._first: Float | None = None
+        self._sum, self._products = np.zeros(3), np.zeros((3, 3))
+
+    def add(self, points: Float) -> None:
+        """Take a chunk of points, of shape (N, 3); those that are not finite do not count."""
+        finite = np.isfinite(points).all(axis=1)
+        points = points if finite.all() else points[finite]
+        if not len(points):
+            return
+        if self._first is None:
+            self._first = points[0].copy()
+        with np.errstate(over="ignore", invalid="ignore"):
+            offsets = points - self._first
+            self.count += len(points)
+            self._sum += offsets.sum(axis=0)
+            self._products += offsets.T @ offsets
+
+    def principal(self) -> Float:
+        """Return the variances along the principal axes, of shape (3,); NaN where they are not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = self._sum / max(self.count, 1)
+            covariance: Float = self._products / max(self.count, 1) - np.outer(mean, mean)
+        if not np.isfinite(covariance).all():
+            return np.full(3, np.nan)
+        return np.asarray(np.linalg.eigvalsh(covariance), np.float64)
+
+    def same_as(self, other: Moments) -> bool:
+        """Whether both may be the same scan, moved or not."""
+        if self.count != other.count or self.count < _LEAST:
+            return False
+        mine, theirs = self.principal(), other.principal()
+        return bool((np.abs(mine - theirs) <= _AGREEMENT * mine.max()).all())
+
+
+def same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[str, str], ...]:
+    """Return pairs of files that hold the same scan, each file at most once as the second one."""
+    found = []
+    for place, name in enumerate(files):
+        earlier = (one for one in range(place) if moments[one].same_as(moments[place]))
+        if (first := next(earlier, None)) is not None:
+            found.append((files[first], name))
+    return tuple(found)
+
+
+# Which files a scan consists of: its own, and those that its own names.
+
+
+def members(path: Path, format: str | None = None) -> list[Path]:
+    """Return a scan's file and all files that it names and that exist, each once.
+
+    A file that cannot be parsed names none: its reader reports what is wrong with it.
+
+    Parameters
+    ----------
+    path : the scan's file
+    format : extension that says how the file is read, such as ``"conf"``; by default its own
+    """
+    extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
+    try:
+        named = _NAMES.get(extension, lambda _: [])(path)
+        there = [beside(path.parent, name, "file") for name in named]
+    except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError):
+        there = []
+    return list(dict.fromkeys([path, *(member for member in there if member.is_file())]))
+
+
+def all_members(paths: Iterable[Path], format: str | None = None) -> list[Path]:
+    """Return all files that scans are read from, see `members`: none of them may be written."""
+    return [member for path in paths for member in members(path, format)]
+
+
+def _of_conf(path: Path) -> list[str]:
+    return [pose.file for pose in parse_conf(read_text(path))]
+
+
+def _of_gltf(path: Path) -> list[str]:
+    uris = [str(one["uri"]) for one in json.loads(path.read_bytes()).get("buffers", [])]
+    return [unquote(uri) for uri in uris if not uri.startswith("data:")]
+
+
+_NAMES = {".conf": _of_conf, ".gltf": _of_gltf}

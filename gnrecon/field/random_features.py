@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.field.stencil import Stencil
 from gnrecon.geometry.arrays import Float
 
 DEGREES_OF_FREEDOM = 12.0
@@ -65,7 +64,7 @@ class Features:
         return self.local(x, center, length) @ self._affine
 
     def stencil(self, offsets: Float) -> Stencil:
-        """Return the stencil for offsets over the length, of shape (K, 3), see `gnrecon.field.stencil`."""
+        """Return the stencil for offsets over the length, of shape (K, 3), see `gnrecon.field.random_features`."""
         return Stencil.of(self.frequencies, torch.as_tensor(offsets).to(self.frequencies))
 
     def sums(self, amplitudes: Tensor, x: Tensor, center: Tensor, length: float, order: int) -> list[Tensor]:
@@ -98,3 +97,36 @@ class Features:
     def _squares(self) -> Tensor:
         """Products of each frequency's components, of shape (m, 9)."""
         return (self.frequencies[:, :, None] * self.frequencies[:, None, :]).reshape(-1, 9)
+
+
+# Sines at points that lie alike around many centres, such as the nodes of a lattice's blocks.
+#
+#     sin(F . (c + o) + p) = sin(F . c + p) cos(F . o) + cos(F . c + p) sin(F . o)
+#
+# Sums of m sines at K offsets from each of N centres so take N m sines and cosines and two matrix products, in place of
+# N K m sines.
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """What m features turn by from a centre to K offsets from it: cosine and sine of F . o, both of shape (m, K)."""
+
+    cosine: Tensor
+    sine: Tensor
+
+    @classmethod
+    def of(cls, frequencies: Tensor, offsets: Tensor) -> Stencil:
+        """Return the stencil of frequencies, of shape (m, 3), for offsets, of shape (K, 3)."""
+        turned = frequencies @ offsets.T
+        return cls(turned.cos(), turned.sin_())
+
+    def sums(self, phases: Tensor, amplitudes: Tensor) -> Tensor:
+        """Return the weighted sums of the sines, of shape (N, K), by their phases at the centres.
+
+        Parameters
+        ----------
+        phases : of shape (N, m), F . c + p
+        amplitudes : of shape (m,), or (N, m) of each centre its own
+        """
+        along = phases.cos().mul_(amplitudes) @ self.sine
+        return along.addmm_(phases.sin().mul_(amplitudes), self.cosine)

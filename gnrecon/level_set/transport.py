@@ -33,7 +33,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gnrecon.residuals.first_order import Linearised
+from gnrecon.residuals.constraints import Linearised
 
 
 def transported(
