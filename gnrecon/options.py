@@ -10,14 +10,14 @@ import numpy as np
 
 from gnrecon.export import RefineOptions
 from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
-from gnrecon.fit.large import LARGE
-from gnrecon.fit.options import FitOptions
+from gnrecon.fit.blocks.solve import LARGE
+from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Region
 from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.ingest import parse_outliers, require_mode
-from gnrecon.ingest.orient import require_orientation
-from gnrecon.ingest.spacing import neighbour_spacing
+from gnrecon.ingest.noise import neighbour_spacing
+from gnrecon.ingest.orientation import require_orientation
 from gnrecon.io import MOST_POINTS
 from gnrecon.runtime.errors import UsageError
 
@@ -57,9 +57,9 @@ class Options:
         Share of the points that the fit does not see; how far they lie from its surface is reported.
     outliers : str
         Whether scattered points are removed: ``"auto"`` leaves them when they are more than 5 % of all, ``"on"``,
-        ``"off"``; ``"statistical:2"`` and ``"radius:3s,4"`` use other rules, see `gnrecon.ingest.outlier_rules`.
+        ``"off"``; ``"statistical:2"`` and ``"radius:3s,4"`` use other rules, see `gnrecon.ingest.outliers`.
     clusters : ``"auto"``, ``"on"`` or ``"off"``
-        The same for small isolated clusters, see `gnrecon.ingest.clusters`.
+        The same for small isolated clusters, see `gnrecon.ingest.clean`.
     smooth_scan : float or str, optional
         Width over which the points are smoothed by moving least squares before the fit, in file units, in another unit
         as in ``"2mm"``, or in spacings of the points as in ``"8s"``, see `gnrecon.ingest.smooth`.
@@ -95,14 +95,14 @@ class Options:
     smooth, fill, prior : str, optional
         What is asked of the surface besides lying near the points: ``"strain=1e-4"`` to be smooth, by the square of the
         principal curvatures with that weight, all in radii; ``"minimal"`` to close holes as a soap film would;
-        ``"developable"`` to unroll into the plane, as sheet metal does. See `gnrecon.fit.regulariser`.
+        ``"developable"`` to unroll into the plane, as sheet metal does. See `gnrecon.fit.regularisers`.
     widths, steps, quality, normal_residual, optimiser, solver, search, seed, device
         Of the fit, see `FitOptions`; `device` is ``"cpu"`` or ``"cuda"``.
     threads : int, optional
         CPU threads of the fit, and processes that solve the blocks of a large one; by default what torch chooses.
     work_dir : str, optional
         Folder in which the work of the fit is kept, so that a run that was killed is taken up again by the same one.
-        The fit is then solved by blocks, as that of 200,000 points or more always is; see `gnrecon.fit.large`.
+        The fit is then solved by blocks, as that of 200,000 points or more always is; see `gnrecon.fit.blocks.solve`.
     block_scheduler : str, optional
         Address of a Dask scheduler, such as ``"tcp://host:8786"``, whose workers solve the blocks; they must see the
         work folder by the same path.

@@ -34,7 +34,7 @@ from gnrecon.export import (
     vertex_error,
 )
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
-from gnrecon.fit.work import require_work_folder
+from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units, layers_of, prepare, survey

@@ -156,7 +156,7 @@ def test_the_first_set_up_can_ask_for_packages_without_any() -> None:
         ("def f():\n    from trimesh import Trimesh", [Import("trimesh", True)]),
         ("if TYPE_CHECKING:\n    import trimesh", [Import("trimesh", True)]),
         ("from gnrecon import io", [Import("gnrecon.io", False)]),
-        ("from .ply import read_ply", [Import("gnrecon.io.ply", False)]),
+        ("from .ply import read_ply", [Import("gnrecon.io.formats.ply", False)]),
         ("from ..export import repair", [Import("gnrecon.export", False)]),
         ("from .. import export", [Import("gnrecon.export", False)]),
     ],

@@ -18,7 +18,7 @@ from analytic_fields import UTM, Field, torus
 from gnrecon import meshing
 from gnrecon.export import SignedDistance
 from gnrecon.export.fineness import chord_error
-from gnrecon.ingest.spacing import neighbour_spacing
+from gnrecon.ingest.noise import neighbour_spacing
 from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct

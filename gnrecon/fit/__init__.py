@@ -1,10 +1,10 @@
 """From samples to a fitted signed distance field."""
 
-from gnrecon.fit.misfit import Misfit
-from gnrecon.fit.options import FitOptions
-from gnrecon.fit.scene import bounds_of
-from gnrecon.fit.schedule import fit
-from gnrecon.fit.sdf import NeuralSDF
+from gnrecon.fit.field_model import NeuralSDF
+from gnrecon.fit.fit_field import fit
+from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.objective import bounds_of
+from gnrecon.fit.residual_stats import Misfit
 from gnrecon.fit.uncertainty import Uncertainty
 
 __all__ = ["FitOptions", "Misfit", "NeuralSDF", "Uncertainty", "bounds_of", "fit"]

@@ -1,18 +1,13 @@
 """From a cloud as read to samples in the unit ball: cleaning, orientation, thinning."""
 
-from gnrecon.ingest.clean import clean, require_mode
-from gnrecon.ingest.clusters import isolated_clusters
+from gnrecon.ingest.clean import clean, isolated_clusters, require_mode
 from gnrecon.ingest.counts import IngestCounts
-from gnrecon.ingest.layers import Layers, layers_of
-from gnrecon.ingest.noise import Noise, estimate_noise
+from gnrecon.ingest.noise import Noise, estimate_noise, mean_spacing
 from gnrecon.ingest.normals import flip_if_inward, oriented_normals
-from gnrecon.ingest.outlier_rules import parse_outliers
-from gnrecon.ingest.outliers import find_outliers
+from gnrecon.ingest.outliers import find_outliers, parse_outliers
 from gnrecon.ingest.prepare import prepare
-from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample
-from gnrecon.ingest.survey import Survey, survey
-from gnrecon.ingest.units import UnitsGuess, guess_units
+from gnrecon.ingest.survey import Layers, Survey, UnitsGuess, guess_units, layers_of, survey
 
 __all__ = [
     "IngestCounts",

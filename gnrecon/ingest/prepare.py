@@ -11,9 +11,9 @@ from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.clean import LEAST_POINTS, clean
 from gnrecon.ingest.counts import IngestCounts
-from gnrecon.ingest.orient import require_orientation, with_outward_normals
+from gnrecon.ingest.noise import mean_spacing
+from gnrecon.ingest.orientation import require_orientation, with_outward_normals
 from gnrecon.ingest.smooth import smoothed
-from gnrecon.ingest.spacing import mean_spacing
 from gnrecon.ingest.subsample import subsample as thin
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import Advance, unheard

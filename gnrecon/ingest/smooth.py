@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.ingest.spacing import neighbour_spacing
+from gnrecon.ingest.noise import neighbour_spacing
 from gnrecon.runtime.parallel import slices
 
 _LEAST = 9

@@ -6,27 +6,33 @@ of its neighbours leave it too: by chance, or where a sheet is thin or bends sha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Float
-from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.clusters import isolated_clusters
-from gnrecon.ingest.noise import estimate_noise, local_frames
+from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.point_cloud import PointCloud, Samples
+from gnrecon.ingest.clean import isolated_clusters, repeated_points
+from gnrecon.ingest.noise import estimate_noise, local_frames, neighbour_spacing
 from gnrecon.ingest.normals import flip_if_inward
 from gnrecon.ingest.outliers import find_outliers
-from gnrecon.ingest.repeats import repeated_points
 
 _MOST = 10_000
 """Points that neighbourhoods are measured at; more would change no figure."""
 
 _NEIGHBOURS, _MORE_NEIGHBOURS = 24, 40
+
 _DENSITY = 8  # neighbours that tell how densely points lie
+
 _GAP = np.radians(120)
+
 _OPEN_SHARE = 0.005
+
 _UNIT = 0.05
+
 _DISAGREEING = 0.02
 
 
@@ -148,3 +154,228 @@ def _state(points: Float, normals: Float) -> str:
     if flip_if_inward(points, directions)[1]:
         return "inward"
     return "good" if (np.abs(lengths[usable] - 1) < _UNIT).all() else "unnormalised"
+
+
+_TESTED = 500
+
+_WIDTH, _HEIGHT = 3.0, 12.0
+"""Radius and half height of a cylinder, in spacings of the points."""
+
+_FACING = 0.5  # cosine
+
+_LEAST = 24  # points that face one way, for a quadric twice
+
+_TURNS = 6
+
+_SEPARATION = 5.0
+"""Offset over what remains: 2.7 for a normal distribution that is cut in two, 3.5 for a uniform one."""
+
+_LEAST_OFFSET = 0.05
+"""In spacings; what a quadric leaves over of an exact scan may look like two layers, far nearer to each other."""
+
+_BALANCE = 0.2  # least share of a layer
+
+_APART = 0.5  # of the layers' middles in the plane, in units of their spread
+
+_BETWEEN = 0.1  # share of points that face the other way
+
+_SHARE, _SHARE_UNSURE = 0.05, 0.15
+"""Of the tested points, from which on layers are more than chance; the second where normals had to be estimated."""
+
+
+# Double walls: two layers of points where there is one surface, as of scans that are not registered well.
+#
+# About a point, the points that face its way within a cylinder along its normal are described by a quadric, and by the
+# same quadric twice, an offset apart, with each point on the nearer of the two (found by turns). Two layers are there
+# where the offset is many times what remains about them, where both are about the same place in the tangent plane, so
+# that neither a step nor an edge is taken for them, and where nothing between them faces the other way, as the back of
+# a thin wall does: along a line, surfaces of a solid face this way and that way by turns.
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Two layers where there should be one.
+
+    Parameters
+    ----------
+    share : of the points about which there are two
+    offset : median distance between the layers, in the unit of the points
+    """
+
+    share: float
+    offset: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields by name."""
+        return asdict(self)
+
+    def describe(self) -> str:
+        """Return the finding as a sentence; lengths in file units."""
+        return (
+            f"At {self.share:.0%} of the points there are two layers, about {self.offset:.3g} file units apart: "
+            f"scans seem not to be registered well."
+        )
+
+
+def layers_of(samples: Samples, normals: str) -> Layers | None:
+    """Return how far apart layers of samples lie, in file units, or None where there are none.
+
+    Parameters
+    ----------
+    samples : Samples
+    normals : how theirs came about, as of `IngestCounts`; estimated ones may be wrong on the sides of thin walls
+    """
+    sure = normals in ("given", "given, flipped") or normals.endswith("origins")
+    least = _SHARE if sure else _SHARE_UNSURE
+    found = find_layers(samples.points, samples.normals, least)
+    return None if found is None else Layers(found.share, found.offset * samples.frame.scale)
+
+
+def find_layers(points: Float, normals: Float, least: float = _SHARE) -> Layers | None:
+    """Return how far apart layers lie, or None where there are none.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), centred, distinct
+    normals : array of shape (N, 3), of unit length, oriented
+    least : share of the points, from which on there are layers
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) < 4 * _LEAST:
+        return None
+    tree, spacing = cKDTree(points), neighbour_spacing(points)
+    chosen = np.random.default_rng(0).permutation(len(points))[:_TESTED]
+    offsets = []
+    for row in chosen:
+        near = np.array(tree.query_ball_point(points[row], np.hypot(_WIDTH, _HEIGHT) * spacing))
+        local = _in_cylinder(points[near] - points[row], normals[row], spacing)
+        facing = normals[near] @ normals[row]
+        offsets.append(_offset(local, facing))
+    found = np.array([offset for offset in offsets if offset is not None])
+    if len(found) < least * len(chosen):
+        return None
+    return Layers(len(found) / len(chosen), float(np.median(found)) * spacing)
+
+
+def _in_cylinder(offsets: Float, normal: Float, spacing: float) -> Float:
+    """Offsets, of shape (n, 3), as two coordinates in the tangent plane and one along the normal, in spacings.
+
+    Those outside of the cylinder become NaN.
+    """
+    axes = np.linalg.svd(normal[None, :])[2]  # the normal, and two directions across it
+    local: Float = offsets @ np.roll(axes, -1, axis=0).T / spacing
+    local[:, 2] *= np.sign(axes[0] @ normal)
+    outside = (np.hypot(local[:, 0], local[:, 1]) > _WIDTH) | (np.abs(local[:, 2]) > _HEIGHT)
+    local[outside] = np.nan
+    return local
+
+
+def _offset(local: Float, facing: Float) -> float | None:
+    """The distance between two layers of points, in spacings; None where there is only one."""
+    inside = np.isfinite(local[:, 0])
+    same = local[inside & (facing > _FACING)]
+    if len(same) < _LEAST:
+        return None
+    upper, quadric, offset, remaining = _twice(same)
+    balance = min(upper.mean(), 1 - upper.mean())
+    least = max(_LEAST_OFFSET, _SEPARATION * remaining)
+    if offset < least or balance < _BALANCE or not _mixed(same[:, :2], upper):
+        return None
+    back = local[inside & (facing < -_FACING)]
+    heights = back[:, 2] - _columns(back) @ quadric
+    between = int(((heights > 0) & (heights < offset)).sum())
+    return offset if between < _BETWEEN * len(same) else None
+
+
+def _twice(local: Float) -> tuple[Mask, Float, float, float]:
+    """Fit a quadric twice: which points are on the upper one, the lower quadric, the offset, and what remains."""
+    columns, heights = _columns(local), local[:, 2]
+    rest = heights - columns @ np.linalg.lstsq(columns, heights, rcond=None)[0]
+    upper = rest > (rest.min() + rest.max()) / 2
+    for _ in range(_TURNS):
+        both = np.column_stack([columns, upper])
+        solution = np.linalg.lstsq(both, heights, rcond=None)[0]
+        rest = heights - columns @ solution[:-1]
+        turned = rest > solution[-1] / 2
+        if (turned == upper).all() or turned.all() or not turned.any():
+            break
+        upper = turned
+    remaining = np.sqrt(((rest - upper * solution[-1]) ** 2).sum() / (len(local) - both.shape[1]))
+    return upper, solution[:-1], float(solution[-1]), float(remaining)
+
+
+def _columns(local: Float) -> Float:
+    u, v = local[:, 0], local[:, 1]
+    return np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+
+
+def _mixed(plane: Float, upper: Mask) -> bool:
+    """Whether both layers are about the same place in the plane."""
+    spread = float(np.sqrt(plane.var(axis=0).sum()))
+    return float(np.linalg.norm(plane[upper].mean(axis=0) - plane[~upper].mean(axis=0))) < _APART * spread
+
+
+_METRES = {".e57": "E57", ".ptx": "PTX", ".gltf": "glTF", ".glb": "glTF", ".las": "LAS", ".laz": "LAZ"}
+
+_FAR, _FAR_SHARE = 1e4, 30.0
+
+_SIDE_TOLERANCE = 5e-3
+
+_SMALLEST, _MIDDLE, _LARGEST = 0.005, 5.0, 5000.0
+
+
+# Which unit a scan's coordinates may be in: a guess, with its reason, because few formats say it.
+#
+# E57, PTX and glTF are in metres by their definitions, and LAS nearly always is. Projected coordinates are metres too.
+# Elsewhere only the size speaks: most things that are scanned are between a few millimetres and a few metres long.
+
+
+@dataclass(frozen=True)
+class UnitsGuess:
+    """A unit, a name of `gnrecon.geometry.units.METRES` or None where there is nothing to go by, and why it is that."""
+
+    unit: str | None
+    reason: str
+
+    def as_dict(self) -> dict[str, str | None]:
+        """Return the fields by name."""
+        return asdict(self)
+
+
+def guess_units(lower: Sequence[float], upper: Sequence[float], files: Sequence[str] = ()) -> UnitsGuess:
+    """Guess the unit of a scan.
+
+    Parameters
+    ----------
+    lower, upper : corners of its box
+    files : that it was read from
+    """
+    named = {_METRES.get(_extension(file)) for file in files}
+    if len(named) == 1 and (name := named.pop()) is not None:
+        usual = "usually" if name.startswith("LA") else "by definition"
+        return UnitsGuess("m", f"{name} files are {usual} in metres")
+    low, high = np.asarray(lower), np.asarray(upper)
+    longest, place = float((high - low).max()), float(np.abs(low + high).max() / 2)
+    if place > max(_FAR, _FAR_SHARE * longest):
+        return UnitsGuess("m", f"coordinates about {place:,.0f} look like projected ones")
+    if _normalised(low, high):
+        return UnitsGuess(None, "the shape seems to have been scaled to a unit box or ball")
+    if _SMALLEST < longest <= _MIDDLE:
+        return UnitsGuess("m", f"its longest side, {longest:.3g}, would be {1000 * longest:,.4g} mm then")
+    if _MIDDLE < longest <= _LARGEST:
+        return UnitsGuess("mm", f"its longest side would be {longest:.4g} mm then, as of most things that are scanned")
+    return UnitsGuess(None, f"its longest side, {longest:.3g}, is not like that of most things in mm or m")
+
+
+def _extension(file: str) -> str:
+    path = Path(file)
+    return (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower()
+
+
+def _normalised(low: Float, high: Float) -> bool:
+    """Whether the box is one about the origin, or in its corner, that programs scale shapes to."""
+    longest = float((high - low).max())
+    centred = float(np.abs(low + high).max()) < 0.5 * longest
+    sizes = [abs(longest - side) < _SIDE_TOLERANCE * side for side in (1.0, 2.0)]
+    return any(sizes) and (centred or float(np.abs(low).max()) < _SIDE_TOLERANCE)

@@ -12,24 +12,22 @@ import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.conf import read_conf
 from gnrecon.io.contents import Contents
-from gnrecon.io.e57 import read_e57
-from gnrecon.io.glb import fits_glb, read_glb, write_glb
-from gnrecon.io.gltf import read_gltf
+from gnrecon.io.formats.e57 import read_e57
+from gnrecon.io.formats.gltf import fits_glb, read_glb, read_gltf, write_glb
+from gnrecon.io.formats.las import read_las
+from gnrecon.io.formats.obj import read_obj, write_obj
+from gnrecon.io.formats.off import read_off, write_off
+from gnrecon.io.formats.pcd import read_pcd
+from gnrecon.io.formats.ply import read_ply, write_ply
+from gnrecon.io.formats.ptx import read_ptx
+from gnrecon.io.formats.stanford_conf import read_conf
+from gnrecon.io.formats.stl import read_stl, write_stl
+from gnrecon.io.formats.threemf import read_3mf, write_3mf
+from gnrecon.io.formats.vtk import read_vtk
+from gnrecon.io.formats.vtp import read_vtp
+from gnrecon.io.formats.xyz import read_xyz, write_xyz
 from gnrecon.io.interop import as_shape
-from gnrecon.io.las import read_las
-from gnrecon.io.obj import read_obj, write_obj
-from gnrecon.io.off import read_off, write_off
-from gnrecon.io.pcd import read_pcd
-from gnrecon.io.ply import read_ply, write_ply
-from gnrecon.io.ptx import read_ptx
-from gnrecon.io.stl import read_stl, write_stl
-from gnrecon.io.threemf import write_3mf
-from gnrecon.io.threemf_model import read_3mf
-from gnrecon.io.vtk import read_vtk
-from gnrecon.io.vtp import read_vtp
-from gnrecon.io.xyz import read_xyz, write_xyz
 from gnrecon.runtime.errors import InputError, OutputError
 from gnrecon.runtime.plugins import READERS as READER_GROUP
 from gnrecon.runtime.plugins import WRITERS as WRITER_GROUP

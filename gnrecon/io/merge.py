@@ -15,8 +15,8 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.io.conf import parse_conf
 from gnrecon.io.contents import Contents
+from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.parse import beside, read_text
 from gnrecon.io.read import check_file, extension_for, extension_of, plain_file, reading
 from gnrecon.io.streaming import SETTLED, Gatherer, chunks

@@ -17,10 +17,10 @@ from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Region
 from gnrecon.io.contents import Contents, joined
 from gnrecon.io.format_registry import reader_of
-from gnrecon.io.las import las_chunks, settled
-from gnrecon.io.ply_chunks import ply_chunks
-from gnrecon.io.ptx import ptx_chunks
-from gnrecon.io.xyz_chunks import xyz_chunks
+from gnrecon.io.formats.las import las_chunks, settled
+from gnrecon.io.formats.ply import ply_chunks
+from gnrecon.io.formats.ptx import ptx_chunks
+from gnrecon.io.formats.xyz import xyz_chunks
 
 _REACH = 1 << 20
 """Cubes from the first point in each direction: three such numbers fit into one key of 64 bits."""

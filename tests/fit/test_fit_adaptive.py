@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, adaptive, fit
-from gnrecon.fit.choose import ANGLES, LENGTHS, POSITIONS, Leftover, _smoothest, choose
+from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
+from gnrecon.fit import two_level as adaptive
+from gnrecon.fit.model_selection import ANGLES, LENGTHS, POSITIONS, Leftover, _smoothest, choose
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.runtime.errors import InputError
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.fit import FitOptions, NeuralSDF, averaged, fit
-from gnrecon.fit.averaged import NOISY, Told, _best, has_edges, told
-from gnrecon.fit.bilateral import Averaging
-from gnrecon.fit.choose import Choice, Leftover
-from gnrecon.fit.patch import Belief
+from gnrecon.fit import FitOptions, NeuralSDF, fit
+from gnrecon.fit import denoising as averaged
+from gnrecon.fit.denoising import NOISY, Told, _best, has_edges, told
+from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.model_selection import Choice, Leftover
+from gnrecon.fit.shape_priors.bilateral_filter import Averaging
 from gnrecon.geometry.point_cloud import Frame, Samples
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)

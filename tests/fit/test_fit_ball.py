@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.ball import Ball
+from gnrecon.fit.shape_priors.ball_fit import Ball
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 

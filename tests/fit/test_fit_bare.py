@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_shapes import bored_plate, cube
 
-from gnrecon.fit.bare import laid_bare
+from gnrecon.fit.shape_priors.snapping import laid_bare
 from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.normals import oriented_normals
 

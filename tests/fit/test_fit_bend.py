@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.bend import BendProblem, Sines, Wish, bent
-from gnrecon.fit.regulariser import CREASE, FILL, regularisers
+from gnrecon.fit.regularisers import CREASE, FILL, BendProblem, Sines, Wish, bent, regularisers
 from gnrecon.residuals import SecondOrder, free_space, gauss_curvature, interface, mean_curvature, surface_strain
 from gnrecon.runtime.errors import UsageError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit import bilateral
-from gnrecon.fit.bilateral import Averaging
+from gnrecon.fit.shape_priors import bilateral_filter as bilateral
+from gnrecon.fit.shape_priors.bilateral_filter import Averaging
 
 WIDE = Averaging(3.0, 0.4)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.choose import LENGTHS, Choice, Leftover, Trials
-from gnrecon.fit.clean import ANGLE, ESTIMATED, POSITION, clean_noise, heights
+from gnrecon.fit.marginal_likelihood import ANGLE, ESTIMATED, POSITION, clean_noise, heights
+from gnrecon.fit.model_selection import LENGTHS, Choice, Leftover, Trials
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.fit.adaptive import fit_adaptive
-from gnrecon.fit.contradict import reconciled
-from gnrecon.fit.options import FitOptions
+from gnrecon.fit.consistency import reconciled
+from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.two_level import fit_adaptive
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.dipoles import FEW, Dipoles
+from gnrecon.fit.blocks.tree import FEW, Dipoles
 from gnrecon.geometry.signed_distance import Density, winding_number
 
 COUNT = 6000

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.choose import Leftover, Trials
-from gnrecon.fit.evidence import ANGLES, POINTS, POSITIONS, Evidence, log_density
-from gnrecon.fit.patch import SIZE, Patch, data_kernel
+from gnrecon.fit.local_solve import SIZE, Patch, data_kernel
+from gnrecon.fit.marginal_likelihood import ANGLES, POINTS, POSITIONS, Evidence, log_density
+from gnrecon.fit.model_selection import Leftover, Trials
 
 LENGTH, RADIUS = 0.4, 0.05
 

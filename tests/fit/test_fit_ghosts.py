@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.choose import ABOUT, LEAST_SHARE, Volume
-from gnrecon.fit.ghosts import GhostSearch
+from gnrecon.fit.initialisation import GhostSearch
+from gnrecon.fit.model_selection import ABOUT, LEAST_SHARE, Volume
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
 

@@ -8,10 +8,9 @@ import pytest
 from made_shapes import bored_plate
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.holes import _shut_away, continued
-from gnrecon.fit.min_cut import minimal_inside
-from gnrecon.fit.mouths import mouths
-from gnrecon.fit.primitives import Cylinder, Plane, Wanted, agreed, planar_share, surfaces
+from gnrecon.fit.shape_priors.hole_completion import _shut_away, continued, mouths
+from gnrecon.fit.shape_priors.min_cut import minimal_inside
+from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, Wanted, agreed, planar_share, surfaces
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_shapes import bored_plate
 
-from gnrecon.fit.laid import Laid, laid
-from gnrecon.fit.sharp import AVERAGING
+from gnrecon.fit.shape_priors.sharp_shape import AVERAGING
+from gnrecon.fit.shape_priors.snapping import Laid, laid
 from gnrecon.geometry.arrays import Float
 
 SIDE, HEIGHT, BORE, NOISE = 0.7, 0.2, 0.12, 0.006

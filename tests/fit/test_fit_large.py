@@ -17,13 +17,16 @@ import torch
 
 from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Detail
-from gnrecon.fit import FitOptions, NeuralSDF, block, large, scheduled, workers
-from gnrecon.fit.averaged import Told
-from gnrecon.fit.choose import Leftover
-from gnrecon.fit.detail import CHOSEN, fit_detail
-from gnrecon.fit.options import QUALITIES
-from gnrecon.fit.patch import Belief
-from gnrecon.fit.work import Work
+from gnrecon.fit import FitOptions, NeuralSDF
+from gnrecon.fit.blocks import block, workers
+from gnrecon.fit.blocks import solve as large
+from gnrecon.fit.blocks import workers as scheduled
+from gnrecon.fit.blocks.store import Work
+from gnrecon.fit.denoising import Told
+from gnrecon.fit.fit_options import QUALITIES
+from gnrecon.fit.local_fields import CHOSEN, fit_detail
+from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.model_selection import Leftover
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box

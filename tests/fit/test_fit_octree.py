@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.fit.octree import BITS, morton, octree_blocks
+from gnrecon.fit.blocks.tree import BITS, morton, octree_blocks
 
 
 def interleaved(cell: tuple[int, int, int]) -> int:

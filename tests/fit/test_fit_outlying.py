@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.outlying import LEAST, LEAST_POINTS, MOST, outlying
+from gnrecon.fit.consistency import LEAST, LEAST_POINTS, MOST, outlying
 from gnrecon.geometry.signed_distance import Density
 
 COUNT = 1000

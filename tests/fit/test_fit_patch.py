@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.patch import SHARE, SIZE, Patch, PatchSystem, RowSystem, patch_system
+from gnrecon.fit.local_solve import SHARE, SIZE, Patch, PatchSystem, RowSystem, patch_system
 
 LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
 

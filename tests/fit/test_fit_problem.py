@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
-from gnrecon.fit.problem import FieldProblem
-from gnrecon.fit.terms import Term, groups
+from gnrecon.fit.objective import FieldProblem, Term, groups
 from gnrecon.residuals import (
     eikonal,
     interface,

@@ -8,10 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from gnrecon.fit import FitOptions, NeuralSDF, fit
-from gnrecon.fit.deep import hold_out
-from gnrecon.fit.options import NORMAL_RESIDUALS, OPTIMISERS, SEARCHES
-from gnrecon.fit.scene import Scene
-from gnrecon.fit.wide import MAX_STEP_POINTS
+from gnrecon.fit.fit_options import NORMAL_RESIDUALS, OPTIMISERS, SEARCHES
+from gnrecon.fit.objective import Scene
+from gnrecon.fit.single_network import MAX_STEP_POINTS, hold_out
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import SOLVERS
 from gnrecon.optim import Record

@@ -9,10 +9,11 @@ import torch
 from holed_can import RADIUS, can, distance
 
 from gnrecon.export import curvatures
-from gnrecon.fit import FitOptions, NeuralSDF, adaptive, fit, sharp
-from gnrecon.fit.holes import Continued
-from gnrecon.fit.shaped import FREE, Free
-from gnrecon.fit.sheet import Sheet, _joined
+from gnrecon.fit import FitOptions, NeuralSDF, fit
+from gnrecon.fit import two_level as adaptive
+from gnrecon.fit.regularised import FREE, Free, Sheet, _joined
+from gnrecon.fit.shape_priors import sharp_shape as sharp
+from gnrecon.fit.shape_priors.hole_completion import Continued
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest import prepare

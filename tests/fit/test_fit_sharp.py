@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.fit import FitOptions, fit, sharp
-from gnrecon.fit.creases import Faces
-from gnrecon.fit.sharp import AVERAGING, Sharp
+from gnrecon.fit import FitOptions, fit
+from gnrecon.fit.shape_priors import sharp_shape as sharp
+from gnrecon.fit.shape_priors.edge_completion import Faces
+from gnrecon.fit.shape_priors.sharp_shape import AVERAGING, Sharp
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest.normals import oriented_normals

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.scene import Scene
-from gnrecon.fit.smoothness import LENGTHS, REACHES, Smoothness, global_smoothness
+from gnrecon.fit.global_field import LENGTHS, REACHES, Smoothness, global_smoothness
+from gnrecon.fit.objective import Scene
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 

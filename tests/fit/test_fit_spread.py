@@ -9,7 +9,7 @@ from made_shapes import bored_plate
 from scipy.spatial import cKDTree
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.spread import MOST, spread
+from gnrecon.fit.shape_priors.resampling import MOST, spread
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density

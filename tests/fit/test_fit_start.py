@@ -10,9 +10,8 @@ from torch import Tensor
 
 from gnrecon.field import Siren
 from gnrecon.field.random_features import DEGREES_OF_FREEDOM
-from gnrecon.fit.problem import FieldProblem
-from gnrecon.fit.start import COARSE, Spectrum, random_features, solve_last_layer
-from gnrecon.fit.terms import Term
+from gnrecon.fit.initialisation import COARSE, Spectrum, random_features, solve_last_layer
+from gnrecon.fit.objective import FieldProblem, Term
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
 

@@ -14,10 +14,9 @@ from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
-from gnrecon.fit.data_rows import MOST_PARAMETERS, DataRows, free_units
-from gnrecon.fit.laplace import PRIOR, Laplace, laplace
-from gnrecon.fit.left_out import PATCHES, calibration, left_out_scores
-from gnrecon.fit.start import random_features
+from gnrecon.fit.initialisation import random_features
+from gnrecon.fit.laplace_approximation import MOST_PARAMETERS, PRIOR, DataRows, Laplace, free_units, laplace
+from gnrecon.fit.uncertainty import PATCHES, calibration, left_out_scores
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import normal_projection, normal_vector

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnrecon.fit.work import MANIFEST, Work, require_work_folder
+from gnrecon.fit.blocks.store import MANIFEST, Work, require_work_folder
 from gnrecon.runtime.errors import InputError, UsageError
 
 ARRAYS = {"points": np.arange(12.0).reshape(4, 3), "cells": np.arange(3, dtype=np.uint64)}

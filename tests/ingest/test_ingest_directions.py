@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from analytic_clouds import Float, sphere, torus
 
-from gnrecon.ingest.directions import directions, tangent_planes
+from gnrecon.ingest.normals import directions, tangent_planes
 
 
 def degrees(found: Float, truth: Float) -> Float:

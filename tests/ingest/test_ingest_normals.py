@@ -9,10 +9,8 @@ import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
 from gnrecon.ingest import flip_if_inward, oriented_normals
-from gnrecon.ingest.consistent import consistent_normals
-from gnrecon.ingest.gauss import gauss_normals
-from gnrecon.ingest.winding import agreement as confirmed
-from gnrecon.ingest.winding import disorder, outwardness, winding_on_surface
+from gnrecon.ingest.orientation import agreement as confirmed
+from gnrecon.ingest.orientation import consistent_normals, disorder, gauss_normals, outwardness, winding_on_surface
 from gnrecon.runtime.errors import InputError
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import clean, isolated_clusters
-from gnrecon.ingest.outlier_rules import OutlierRule, outliers_by_rule, parse_outliers
-from gnrecon.ingest.repeats import repeated_points
+from gnrecon.ingest.clean import repeated_points
+from gnrecon.ingest.outliers import OutlierRule, outliers_by_rule, parse_outliers
 from gnrecon.runtime.errors import UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])

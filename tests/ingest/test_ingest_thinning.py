@@ -8,9 +8,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import mean_spacing, prepare, subsample
-from gnrecon.ingest.by_curvature import surface_variation
-from gnrecon.ingest.farthest import farthest_points
-from gnrecon.ingest.subsample import METHODS
+from gnrecon.ingest.subsample import METHODS, farthest_points, surface_variation
 from gnrecon.runtime.errors import UsageError
 
 

@@ -12,8 +12,8 @@ from scan_writers import FORMS, file_of, random_cloud
 
 from gnrecon.io import read_cloud, read_scans
 from gnrecon.io import streaming as chunks
-from gnrecon.io.conf import parse_conf
 from gnrecon.io.contents import Contents
+from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.streaming import Gatherer
 from gnrecon.runtime.errors import InputError
 

@@ -19,7 +19,7 @@ from benchmarks.alone import run_program
 from benchmarks.blocks.plot import draw
 from benchmarks.engine.plot import require_matplotlib
 from benchmarks.provenance import provenance
-from gnrecon.fit.large import LARGE
+from gnrecon.fit.blocks.solve import LARGE
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 from gnrecon.runtime.files import write_text
 

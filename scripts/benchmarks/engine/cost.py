@@ -27,7 +27,7 @@ from benchmarks.engine.clock import timed
 from benchmarks.engine.loss import posed
 from benchmarks.engine.scans import sphere
 from gnrecon.field import Siren
-from gnrecon.fit.problem import FieldProblem
+from gnrecon.fit.objective import FieldProblem
 from gnrecon.least_squares import Jacobian
 
 MATMUL = 4096

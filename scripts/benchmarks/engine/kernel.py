@@ -22,7 +22,7 @@ from benchmarks.engine.loss import posed
 from benchmarks.engine.process import run_alone
 from benchmarks.engine.scans import sphere
 from gnrecon.field import Siren
-from gnrecon.fit.problem import FieldProblem
+from gnrecon.fit.objective import FieldProblem
 from gnrecon.least_squares import RowSpace, identity
 
 MODULE = "benchmarks.engine.kernel"

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field import Siren
-from gnrecon.fit.problem import FieldProblem
-from gnrecon.fit.terms import Term
+from gnrecon.fit.objective import FieldProblem, Term
 from gnrecon.residuals import eikonal, interface, normal_projection
 
 WEIGHTS = (1.0, 1.0, 1e-2)

@@ -22,8 +22,8 @@ from benchmarks.engine.loss import WEIGHTS, Sample, posed
 from benchmarks.engine.scans import VOLUME_COUNT, surrounded
 from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
-from gnrecon.fit.method import ENERGY
-from gnrecon.fit.problem import FieldProblem
+from gnrecon.fit.objective import FieldProblem
+from gnrecon.fit.single_network import ENERGY
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 

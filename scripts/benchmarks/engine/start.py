@@ -15,9 +15,8 @@ from torch import Tensor
 
 from benchmarks.engine.loss import Sample
 from gnrecon.field import Siren
-from gnrecon.fit.scene import Scene
-from gnrecon.fit.start import solve_last_layer
-from gnrecon.fit.terms import Term
+from gnrecon.fit.initialisation import solve_last_layer
+from gnrecon.fit.objective import Scene, Term
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.residuals import interface, normal_vector, signed_distance
 

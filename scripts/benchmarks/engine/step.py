@@ -23,7 +23,7 @@ from benchmarks.engine.clock import timed
 from benchmarks.engine.loss import Sample, posed
 from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
-from gnrecon.fit.method import ENERGY
+from gnrecon.fit.single_network import ENERGY
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, Solution, StopRule
 

@@ -1,0 +1,146 @@
+"""Whether a scan's points are averaged before their detail is fitted, and how: what predicts left-out points better.
+
+The left-out points are as they were scanned, and the patches are the same, so that scores compare patch by patch. Only
+scans in which noise was found are tried.
+
+Some tens of patches tell a gain of less than their scatter from a loss no better than a coin does, so that it decides
+what is known of the shape beside them. Where faces meet at edges, the fit is better for averaging unless the patches
+contradict; anywhere else it smooths better by itself, unless they show that it does not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gnrecon.fit.field_model import NeuralSDF
+from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.model_selection import Choice, Leftover, Trials
+from gnrecon.fit.shape_priors.bilateral_filter import Averaging
+from gnrecon.fit.shape_priors.sharp_shape import Sharp, has_edges
+from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.point_cloud import Samples
+
+_log = logging.getLogger(__name__)
+
+FIRST = Averaging(2.5, 0.4)
+"""What is tried first; only where it helps are the others."""
+
+OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4))
+
+CLEARLY = 2.0
+"""Standard errors by which patches must be better for averaging where no edges are seen."""
+
+NOISY = 0.05
+"""Noise of the positions, in radii of a point's disk, above which points are averaged."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a fit of the detail is told.
+
+    Parameters
+    ----------
+    samples : averaged, or as they were
+    leftover : of a global field at the samples
+    belief : about them
+    averaging : how they were averaged, or None
+    """
+
+    samples: Samples
+    leftover: Leftover
+    belief: Belief
+    averaging: Averaging | None = None
+
+    @classmethod
+    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> Told:
+        """Return what faces that were continued to their edges tell by themselves, beside a global field."""
+        return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
+
+
+def told(
+    sdf: NeuralSDF,
+    samples: Samples,
+    held: Mask,
+    features: int,
+    rng: np.random.Generator,
+    device: str,
+    outliers: bool = False,
+) -> Told:
+    """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
+
+    A clean scan is not averaged, and its belief is what its points tell by themselves.
+
+    Parameters
+    ----------
+    sdf : the global field, in the samples' frame
+    samples : all of them
+    held : mask of shape (N,), of samples that the global field has not seen
+    features : number of features a cube
+    rng : draws patches and features
+    device : a torch device
+    outliers : whether some were found; those that are left would make horns on what is fitted as clean
+    """
+    leftover = Leftover.of(sdf, samples)
+    radius = leftover.density.radius
+    trials = Trials.draw(leftover, held, radius, rng, device, features)
+    clean = None if outliers else trials.clean()
+    if clean is not None:
+        return Told(samples, leftover, clean)
+    choice = trials.choice()
+    # Outliers that are left have no part in the noise that evidence tells.
+    plain = choice.belief if outliers else choice.best
+    # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
+    if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
+        return Told(samples, leftover, plain)
+
+    def with_kept(averaging: Averaging) -> Trials:
+        points, normals = samples.points.copy(), samples.normals.copy()
+        points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
+        # The noise of averaged points is alike among neighbours, of which no evidence is made.
+        of_averaged = Leftover.of(sdf, replace(samples, points=points, normals=normals))
+        return replace(trials, leftover=of_averaged, evidence=None)
+
+    found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
+    if found is None:
+        return Told(samples, leftover, plain)
+    averaging, better = found
+    points, normals = averaging.of(samples.points, samples.normals)
+    samples = replace(samples, points=points, normals=normals)
+    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
+    return Told(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
+
+
+def _best(
+    choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: Callable[[], bool]
+) -> tuple[Averaging, Trials] | None:
+    """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
+
+    Whether there are edges is asked where the patches alone do not decide. All are compared at the length that suits
+    the points as they are; a better one is chosen afterwards.
+    """
+    plain = _of_best_noise(choice.scores)
+
+    def tried(averaging: Averaging) -> tuple[Float, Trials]:
+        trials = kept_averaged(averaging)
+        return plain - _of_best_noise(trials.scores(choice.belief.length)), trials
+
+    gain, trials = tried(FIRST)
+    doubt = gain.std() / np.sqrt(len(gain))
+    if not (gain.mean() > CLEARLY * doubt or (gain.mean() > -doubt and edges())):
+        return None
+    best, averaging = float(gain.mean()), FIRST
+    for other in OTHERS:
+        gain, of_other = tried(other)
+        if gain.mean() > best:
+            best, averaging, trials = float(gain.mean()), other, of_other
+    return averaging, trials
+
+
+def _of_best_noise(scores: Float) -> Float:
+    """Return the patches' scores, of shape (patches,), of the noise that is best on the mean of (patches, noises)."""
+    best: Float = scores[:, int(scores.mean(axis=0).argmin())]
+    return best

@@ -1,0 +1,165 @@
+"""The choices of a fit, with their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gnrecon.fit.regularisers import Regulariser, regularisers
+from gnrecon.least_squares import SOLVERS
+from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, normal_projection, normal_vector
+from gnrecon.residuals.named_residuals import named
+from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.plugins import RESIDUALS, find, installed
+
+NORMAL_RESIDUALS: dict[str, Residual] = {
+    "vector": normal_vector,
+    "projection": normal_projection,
+    "cosine": normal_cosine,
+}
+WIDE_STEPS, DEEP_STEPS, LEAST_POINTS_TO_REFINE = 4, 120, 1000
+UNITS_PER_POINT, LEAST_UNITS = 3, 1000
+POINTS_PER_UNIT, SPARSE_UNITS, DENSE_UNITS = 4, 2000, 3000
+QUALITIES = {"draft": 300, "normal": 600, "high": 1000}
+SEARCHES = ("auto", "damping", "geodesic", "line")
+OPTIMISERS = {"gn": "Gauss-Newton", "adam": "Adam", "lbfgs": "L-BFGS"}
+BASELINE_STEPS = {"adam": 2000, "lbfgs": 40}
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What a fit is asked to do.
+
+    Parameters
+    ----------
+    widths : tuple of int, optional
+        Hidden layers of one network for the whole shape. By default there is a smooth global layer and local detail of
+        the size that the data asks for, see `gnrecon.fit.two_level`. One wide layer starts from random sine features
+        and an exact linear solve; several layers from random frequencies.
+    steps : int, optional
+        Steps after the start of one network; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or
+        more, none for fewer points, 120 for several layers; 2,000 of Adam, and 40 of L-BFGS, each of 20 iterations.
+        Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
+        point from 1,000 to 2,000, and of one for four points from there to 3,000.
+    quality : ``"draft"``, ``"normal"`` or ``"high"``
+        Features of the detail a cube, 300, 600 or 1,000, where there is detail.
+    normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
+        Residual of the given normals, see `gnrecon.residuals.constraints`.
+    optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
+        Gauss-Newton, or one of the methods that the paper compares with.
+    solver : str
+        Linear solver of Gauss-Newton's steps, a name of `gnrecon.least_squares.SOLVERS`; ``"auto"`` picks by rows,
+        parameters, memory and device.
+    search : ``"auto"``, ``"damping"``, ``"geodesic"`` or ``"line"``
+        Step control of Gauss-Newton: gain-ratio damping, the same with geodesic acceleration, or the paper's log-spaced
+        line search with tiny damping; by default the one that suits the network's start.
+    seed : int
+        Seeds features and samples.
+    device : str
+        A torch device, ``"cpu"`` or ``"cuda"``.
+    smooth, fill, prior : str, optional
+        What is asked of the surface besides, as ``"strain=1e-4"``, ``"minimal"`` and ``"developable"``, see
+        `gnrecon.fit.regularisers`; not of one network.
+
+    Raises
+    ------
+    UsageError
+        When a value is out of its range.
+    """
+
+    widths: tuple[int, ...] | None = None
+    steps: int | None = None
+    quality: str = "normal"
+    normals: str = "vector"
+    optimiser: str = "gn"
+    solver: str = "auto"
+    search: str = "auto"
+    seed: int = 0
+    device: str = "cpu"
+    smooth: str | None = None
+    fill: str | None = None
+    prior: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.widths is not None and (not self.widths or min(self.widths) < 1):
+            raise UsageError(f"Network widths must be positive numbers, not {self.widths}.")
+        if self.steps is not None and self.steps < 0:
+            raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
+        normal_residual(self.normals)
+        if self.quality not in QUALITIES:
+            raise UsageError(f"The quality must be one of {', '.join(QUALITIES)}, not {self.quality!r}.")
+        for name, known in (("optimiser", OPTIMISERS), ("solver", SOLVERS)):
+            if getattr(self, name) not in known:
+                raise UsageError(f"The {name} must be one of {', '.join(known)}, not {getattr(self, name)!r}.")
+        if self.search not in SEARCHES:
+            raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
+        if self.regularisers and not self.adaptive:
+            raise UsageError(
+                "smooth, fill and prior belong to the default fit; they do not go with widths, steps, another "
+                "optimiser or another normal residual."
+            )
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the data chooses network and detail, because nothing was asked that only one network can do."""
+        one = self.widths is not None or self.steps is not None
+        return not one and self.optimiser == "gn" and self.normals == "vector"
+
+    @property
+    def regularisers(self) -> tuple[Regulariser, ...]:
+        """What is asked of the surface besides."""
+        return regularisers(self.smooth, self.fill, self.prior)
+
+    @property
+    def features(self) -> int:
+        """Features of the detail a cube."""
+        return QUALITIES[self.quality]
+
+    def steps_for(self, points: int) -> int:
+        """Return the most steps after the start, for a number of points.
+
+        Below 1,000 points frequencies that follow the data fit it better and what lies between it worse (measured, see
+        docs/accuracy.md), so that by default the exact linear solve is left as it is.
+        """
+        if self.adaptive:
+            return 0
+        if self.steps is not None:
+            return self.steps
+        if self.optimiser in BASELINE_STEPS:
+            return BASELINE_STEPS[self.optimiser]
+        if len(self.widths_for(points)) > 1:
+            return DEEP_STEPS
+        return WIDE_STEPS if points >= LEAST_POINTS_TO_REFINE else 0
+
+    def widths_for(self, points: int) -> tuple[int, ...]:
+        """Return the hidden layers for a number of points.
+
+        Fewer units than data rows smooth dense clouds; more of them only make sparse ones slower and less smooth.
+        """
+        if self.widths is not None:
+            return self.widths
+        most = min(max(points // POINTS_PER_UNIT, SPARSE_UNITS), DENSE_UNITS)
+        return (min(max(UNITS_PER_POINT * points, LEAST_UNITS), most),)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the options as plain values."""
+        return asdict(self)
+
+
+def normal_residual(name: str) -> Residual:
+    """Return the residual of normals of a name: of this library, or of another package's ``gnrecon.residuals``.
+
+    Raises
+    ------
+    UsageError
+        When there is none, it cannot be loaded, or it needs second derivatives, which fits to scans do not have.
+    """
+    if name in NORMAL_RESIDUALS:
+        return NORMAL_RESIDUALS[name]
+    if find(RESIDUALS, name) is None:
+        known = [*NORMAL_RESIDUALS, *(one.entry.name for one in installed(RESIDUALS))]
+        raise UsageError(f"The normal residual must be one of {', '.join(known)}, not {name!r}.")
+    residual = named(name)
+    if isinstance(residual, SecondOrder):
+        raise UsageError(f"The residual {name!r} needs second derivatives, so that it cannot be that of normals.")
+    return residual

@@ -1,0 +1,220 @@
+"""The start of a fit, which decides how it ends.
+
+*Wide and linear.* One hidden layer of random sine features sin(w . x + b) is linear in its output weights, so that
+f = 0, grad f = n and the coarse signed distance have one exact least-squares solution (variable projection). The
+frequencies w follow the spectral density of a Matern kernel, a Student t distribution: w = z / (l sqrt(c / nu)) with z
+normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of
+kernel interpolation with Hermite data.
+Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
+Where the solution's sign disagrees with the coarse distance ("ghosts"), samples are added and the solve is repeated.
+
+*Spectral.* Deeper networks begin with normal frequencies of standard deviation OMEGA in the first layer, hidden weights
+that keep the variance of sines (Sitzmann et al. 2020, theorem 1.8), uniform phases, and one exact solve of the last
+layer, with a ridge that keeps its weights small: from large weights every direction of Gauss-Newton is a bad one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gnrecon.field.networks import Siren
+from gnrecon.fit.objective import FieldProblem, Scene, Term
+from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.signed_distance import CoarseDistance
+from gnrecon.least_squares.direct import Cholesky
+from gnrecon.least_squares.system import identity
+from gnrecon.runtime.errors import FitError
+from gnrecon.runtime.progress import Advance, unheard
+
+RIDGE = 1e-8
+
+ROUNDS, TRIALS = 3, 3
+"""Solves, and how many times a solve's samples are searched for ghosts after it."""
+
+WRONG_WEIGHT = 5
+"""How much more a sample counts that an earlier round gave the wrong sign: without it, horns grow on sparse scans."""
+
+ATTEMPTS = 6
+
+OMEGA = 4.0
+
+SPECTRAL_RIDGE, SPECTRAL_SAMPLES = 1e-4, 4000
+
+SEARCH_POINTS, FINAL_POINTS = 5000, 20000
+"""Most data points of the rounds that look for ghosts, and of the last round."""
+
+TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
+"""Terms of volume samples x, their coarse distances, and at most so many data points."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Of random features: their length l, in radii, and nu, the degrees of freedom: the more, the smoother."""
+
+    length: float
+    degrees_of_freedom: float
+
+
+COARSE = Spectrum(0.12, 4.0)
+
+
+def random_features(
+    width: int, rng: np.random.Generator, like: Tensor, spectrum: Spectrum = COARSE
+) -> tuple[Tensor, Tensor]:
+    """Return frequencies, of shape (width, 3), and phases, of shape (width,), of sine features of a spectrum."""
+    direction = rng.standard_normal((width, 3))
+    spread = np.sqrt(rng.chisquare(spectrum.degrees_of_freedom, width) / spectrum.degrees_of_freedom)
+    frequencies = direction / spread[:, None] / spectrum.length
+    phases = rng.uniform(0.0, 2 * np.pi, width)
+    return torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like)
+
+
+def wide_start(
+    field: Siren,
+    scene: Scene,
+    terms_of: TermsOf,
+    rng: np.random.Generator,
+    spectrum: Spectrum = COARSE,
+    advance: Advance = unheard,
+) -> Tensor:
+    """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
+
+    `advance` is told of the share of the rounds that is done.
+
+    Raises
+    ------
+    FitError
+        When the linear system cannot be solved.
+    """
+    like = scene.points
+    frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
+    theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
+    x, distance = scene.volume(scene.volume_count, rng)
+    search = GhostSearch(scene.coarse, x, np.sign(distance))
+    for round_number in range(ROUNDS):
+        last = round_number + 1 == ROUNDS
+        terms = terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS if last else SEARCH_POINTS)
+        theta = solve_last_layer(field, terms, theta)
+        advance((round_number + 1) / ROUNDS)
+        if not last:
+            trial = scene.places(TRIALS * scene.volume_count, rng)
+            wrong, expected = search.ghosts(trial, partial(_value, field, theta, scene))
+            some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], WRONG_WEIGHT)
+            x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
+    return theta
+
+
+def _value(field: Siren, theta: Tensor, scene: Scene, x: Float) -> Float:
+    """Return the field's values, of shape (Q,), at points, of shape (Q, 3)."""
+    values: Float = field.value(theta, scene.tensor(x)).cpu().numpy()
+    return values
+
+
+def spectral_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator) -> Tensor:
+    """Return parameters, of shape (p,), of a network of several layers whose last one solves `terms_of` the volume.
+
+    Raises
+    ------
+    FitError
+        When the linear system cannot be solved.
+    """
+    theta = random_network(field, rng, scene.points)
+    x, distance = scene.volume(SPECTRAL_SAMPLES, rng)
+    terms = terms_of(scene.tensor(x), scene.tensor(distance), SPECTRAL_SAMPLES)
+    total = sum(float(torch.as_tensor(term.weight).mean()) for term in terms)
+    return solve_last_layer(field, terms, theta, SPECTRAL_RIDGE * total)
+
+
+def random_network(field: Siren, rng: np.random.Generator, like: Tensor) -> Tensor:
+    """Return random sine layers, of shape (p,), with a last layer of zeros."""
+    layers = []
+    for number, (out, into) in enumerate(field.layout.shapes):
+        if number == 0:
+            weights, bias = OMEGA * rng.standard_normal((out, into)), rng.uniform(0.0, 2 * np.pi, out)
+        elif number == len(field.widths):
+            weights, bias = np.zeros((out, into)), np.zeros(out)
+        else:
+            bound = np.sqrt(6.0 / into)
+            weights, bias = rng.uniform(-bound, bound, (out, into)), rng.uniform(-np.pi, np.pi, out)
+        layers.append((torch.as_tensor(weights).to(like), torch.as_tensor(bias).to(like)))
+    return field.layout.flatten(layers)
+
+
+def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor, ridge: float | None = None) -> Tensor:
+    """Return theta, of shape (p,), with its last layer solved by least squares; exact for terms linear in f.
+
+    The ridge damps the change of the last layer, by default as little as rounding allows.
+
+    Raises
+    ------
+    FitError
+        When the system is not finite.
+    """
+    none = torch.zeros(0, dtype=torch.long, device=theta.device)
+    units = (*(none for _ in field.widths), None)
+    problem = FieldProblem(field, terms, theta, units)
+    free = problem.free()
+    system = Cholesky().linearise(*problem.linearise(free), identity)
+    ridge = RIDGE / max(len(term) for term in terms) if ridge is None else ridge
+    for _ in range(ATTEMPTS):
+        step = system.solve(ridge)
+        if step.failure is None:
+            return problem.whole(free + step.direction)
+        # Features that nearly depend on each other: what rounding takes from the smallest eigenvalue, the ridge gives.
+        ridge *= 10
+    raise FitError("The linear start could not be solved: the system holds values that are not finite.")
+
+
+# Where in free space a field has the wrong sign: what makes the ghost sheets and the horns of a mesh.
+#
+# The sign is that of the winding number, which costs as much as several values of a field. But from place to place it
+# changes only through the data, or where a hole is closed: so the nearest sample of known sign nearly always tells it,
+# and the winding number is asked for only where the field contradicts that sample.
+
+
+@dataclass
+class GhostSearch:
+    """A search that remembers the signs which it has found.
+
+    Parameters
+    ----------
+    coarse : CoarseDistance
+    points : array of shape (K, 3), samples whose sign is known; there may be none
+    signs : array of shape (K,)
+    """
+
+    coarse: CoarseDistance
+    points: Float
+    signs: Float
+
+    def ghosts(self, x: Float, value: Callable[[Float], Float]) -> tuple[Float, Float]:
+        """Return those of x where the value has the wrong sign, of shape (G, 3), and the coarse distances there.
+
+        Parameters
+        ----------
+        x : array of shape (Q, 3); what is too near to the data for a coarse distance is left out
+        value : gives the field's values, of shape (N,), at points, of shape (N, 3)
+        """
+        known, size, _ = self.coarse.size(x)
+        x = x[known]
+        own = value(x)
+        doubtful = np.flatnonzero(own * self._nearest_signs(x) <= 0)
+        x, own, size = x[doubtful], own[doubtful], size[doubtful]
+        sign = self.coarse.sign(x)
+        self.points, self.signs = np.concatenate([self.points, x]), np.concatenate([self.signs, sign])
+        wrong = own * sign <= 0
+        return x[wrong], (sign * size)[wrong]
+
+    def _nearest_signs(self, x: Float) -> Float:
+        """Return the signs of the nearest known samples, of shape (Q,), or zeros where none is known."""
+        if not len(self.points):
+            return np.zeros(len(x))
+        signs: Float = self.signs[cKDTree(self.points).query(x)[1]]
+        return signs

@@ -1,0 +1,392 @@
+"""Length and noise of a scan, chosen by what they predict where data is left out.
+
+Around some points of the scan a patch is fitted without some points, which the global field has not seen either, for
+several lengths and noises. The score of each is what the left-out points then say: their mean distance to the predicted
+surface, |f| / (n . grad f), and how far the gradient there is from their normal n, as a height over the radius of the
+disk that a point stands for. The distance alone would not do: where noisy points are closer than they are exact, a
+field that is zero and flat around all of them has none.
+
+Left-out points are few, and have noise of their own. Where normals are given, all points tell the noise better, by its
+evidence (`evidence`), and the left-out ones choose the length for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gnrecon.field.random_features import Features
+from gnrecon.fit.field_model import NeuralSDF
+from gnrecon.fit.local_solve import Belief, Patch, patch_system
+from gnrecon.fit.marginal_likelihood import PATCHES as EVIDENT_PATCHES
+from gnrecon.fit.marginal_likelihood import POINTS, Evidence, clean_noise
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density
+from gnrecon.runtime.parallel import abreast
+
+LENGTHS = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)
+POSITIONS = (0.02, 0.1, 0.3, 0.8)
+"""Lengths and noise of the positions that are tried, over the radius of a point's disk."""
+
+ANGLES = (0.03, 0.1, 0.3)
+CHOICES = tuple(itertools.product(POSITIONS, ANGLES))
+ALIKE = 0.025
+"""Share by which a score may exceed the best and yet count as alike."""
+
+LEAST_NOISE = 1e-3
+"""Least noise of the positions, over the radius of a point's disk; below it rounding would decide."""
+
+FIRST = 2
+"""Number of the length that is tried first."""
+
+PATCHES, DENSE_PATCHES, HELD_NEAR = 10, 20, 20
+"""Patches, those of a dense scan, and how many left-out points each of them predicts."""
+
+DENSE = 8000
+"""Points beyond which patches are more, of fewer features; those of smaller scans would share what they predict."""
+
+SPARSE = 20_000
+"""Points up to which estimated normals are not heeded; those of denser scans are means over little of the surface, and
+where many scans do not quite match, distances alone are least for a field that winds through all of them."""
+
+MOST_POINTS = 2500
+FEATURES, DENSE_FEATURES = 700, 300
+LEAST_SLOPE = 0.05
+ABOUT = 0.7, 1.5
+"""The field in free space that is left as it is, over the coarse distance."""
+
+LEAST_SHARE = 0.5
+"""Least size that the field must have there, as a share of the coarse distance's."""
+
+BEYOND = 1.5
+"""How far a patch's data reaches beyond what it predicts, in lengths."""
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What a global field leaves over at the points: everything of shape (N,) or (N, 3), unit coordinates.
+
+    `estimated` says that the normals were found from the points.
+    """
+
+    points: Float
+    normals: Float
+    value: Float
+    gradient: Float
+    estimated: bool = False
+
+    @classmethod
+    def of(cls, sdf: NeuralSDF, samples: Samples) -> Leftover:
+        """Return what a field leaves over at samples."""
+        value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
+        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def density(self) -> Density:
+        """How densely the points lie."""
+        return Density(self.points)
+
+    @cached_property
+    def over(self) -> float:
+        """Root mean square of the values that are left over."""
+        return float(np.sqrt(np.mean(self.value**2)))
+
+    def within(self, center: Float, reach: float) -> Int:
+        """Return the rows of the points in the cube of half an edge `reach` about a centre, in order."""
+        return np.sort(np.array(self.density.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64))
+
+    def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
+        """Return the patch of some rows, with samples of the volume."""
+        turn = self.normals[rows] - self.gradient[rows]
+        arrays = (self.points[rows], -self.value[rows], turn, *volume.rows(), center)
+        return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Samples of space, of shape (Q, 3), where a correction is known roughly; the rest of shape (Q,).
+
+    Parameters
+    ----------
+    wanted : what it should be
+    lower, upper : what it must be at least, and at most
+    distance : how far the data is
+    """
+
+    points: Float
+    wanted: Float
+    lower: Float
+    upper: Float
+    distance: Float
+
+    @classmethod
+    def around(cls, points: Float, own: Float, signed: Float, certain: Mask, distance: Float) -> Volume:
+        """Return samples at which a field is to be about the coarse distance, and of its sign where that is certain.
+
+        A field that is somewhat steeper or flatter than a distance needs no correction: one that brought it to the
+        distance would go too far between samples, and make a horn. Nor does one of the other sign where neither sign is
+        beyond doubt, as in a cavity of which little was seen: the field there is smooth, and closes it no worse.
+
+        Parameters
+        ----------
+        points : array of shape (Q, 3)
+        own, signed : arrays of shape (Q,), the field, and the coarse distance
+        certain : mask of shape (Q,), where the sign of that is beyond doubt
+        distance : array of shape (Q,), of the data
+        """
+        near, far = (share * signed for share in ABOUT)
+        agreed = certain | (own * signed > 0)
+        wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
+        bound = LEAST_SHARE * signed - own
+        lower = np.where(certain & (signed > 0), bound, -np.inf)
+        upper = np.where(certain & (signed < 0), bound, np.inf)
+        return cls(points, wanted, lower, upper, distance)
+
+    @classmethod
+    def none(cls) -> Volume:
+        """Return no samples."""
+        return cls(np.zeros((0, 3)), *np.zeros((4, 0)))
+
+    def rows(self) -> tuple[Float, Float, Float, Float, Float]:
+        """Return all five arrays."""
+        return self.points, self.wanted, self.lower, self.upper, self.distance
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What left-out points choose.
+
+    Parameters
+    ----------
+    belief : of the tabled noises
+    scores : of its length at each patch with each tabled noise, of shape (patches, noises), in radii
+    evident : belief of the noise that has most evidence at its length; None where points do not tell it
+    """
+
+    belief: Belief
+    scores: Float
+    evident: Belief | None = None
+
+    @property
+    def best(self) -> Belief:
+        """Return the belief for points as they were scanned."""
+        return self.evident or self.belief
+
+
+def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
+    """Return the belief that a clean scan tells by itself, and of any other that which predicts left-out points best.
+
+    The noise is then that of most evidence (`evidence`), unless normals were estimated.
+
+    Parameters
+    ----------
+    leftover : Leftover
+    held : mask of shape (N,), of the points that are left out
+    radius : of the disk that a point stands for, unit coordinates
+    rng : draws patches, features and what is left out
+    device : a torch device
+    """
+    trials = Trials.draw(leftover, held, radius, rng, device)
+    return trials.clean() or trials.choice().best
+
+
+def _evidence(leftover: Leftover, radius: float, rng: np.random.Generator, device: str) -> Evidence:
+    """Return the evidence of points about places that are drawn; the other parameters as those of `choose`."""
+    centers = leftover.points[rng.choice(len(leftover), min(EVIDENT_PATCHES, len(leftover)), replace=False)]
+    near = leftover.density.tree.query(centers, list(range(1, min(POINTS, len(leftover)) + 1)))[1]
+    pairs = zip(np.sort(near), centers, strict=True)
+    patches = [leftover.patch(rows, center, Volume.none(), device) for rows, center in pairs]
+    return Evidence.of(patches, radius, rng, device)
+
+
+def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
+    """Return the number of the length and of the noise that assume most noise, and are as good as the best.
+
+    As good is what lies within its standard error of the best, patch against patch, or within a share. Noise that is
+    alike among neighbours, as that of scans that do not quite match, shows little where single points are left out.
+    Source: the one-standard-error rule, Hastie et al., The Elements of Statistical Learning (2009), section 7.10.
+
+    Parameters
+    ----------
+    scores : for each number of a length, of shape (patches, noises)
+    """
+    numbers = sorted(scores)
+    table = np.stack([scores[number] for number in numbers], axis=1)
+    mean = table.mean(axis=0)
+    best = np.unravel_index(int(np.argmin(mean)), mean.shape)
+    over = table - table[:, best[0], best[1]][:, None, None]
+    tolerance = np.maximum(over.std(axis=0) / np.sqrt(len(table)), ALIKE * mean[best])
+    alike = [(CHOICES[c][0], LENGTHS[numbers[n]], n, c) for n, c in np.argwhere(over.mean(axis=0) <= tolerance)]
+    _, _, row, choice = max(alike)
+    return numbers[int(row)], int(choice)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Patches with what they are to predict.
+
+    Parameters
+    ----------
+    leftover : what the patches are fitted to
+    told : what the left-out points say, whose rows are those of `leftover`
+    radius : of the disk that a point stands for, unit coordinates
+    features : of the patches
+    centers : of the patches, of shape (patches, 3)
+    predicted : rows of the left-out points that each patch predicts
+    held : mask of shape (N,), of the points that are left out
+    device : a torch device
+    known : noise of positions and normals, where it is known; then no other is tried
+    evidence : which tells one more noise for each length; None of estimated normals, which are alike by what they are
+        means of, and not by the surface alone
+    """
+
+    leftover: Leftover
+    told: Leftover
+    radius: float
+    features: Features
+    centers: Float
+    predicted: Sequence[Int]
+    held: Mask
+    device: str
+    known: tuple[float, float] | None = None
+    evidence: Evidence | None = None
+    _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
+    _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def draw(
+        cls,
+        leftover: Leftover,
+        held: Mask,
+        radius: float,
+        rng: np.random.Generator,
+        device: str,
+        cube_features: int = FEATURES,
+    ) -> Trials:
+        """Draw the patches, for cubes of so many features; the other parameters as those of `choose`."""
+        out = np.flatnonzero(held)
+        dense = len(leftover) > DENSE
+        patches = DENSE_PATCHES if dense else PATCHES
+        # What is to predict a cube of few features resolves no more than it.
+        count = DENSE_FEATURES if dense or cube_features <= DENSE_FEATURES else FEATURES
+        chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
+        # As a list, so that the answer has two dimensions also where a single point is left out.
+        ranks = list(range(1, min(HELD_NEAR, len(out)) + 1))
+        near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
+        features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
+        centers = leftover.points[chosen]
+        evidence = None if leftover.estimated else _evidence(leftover, radius, rng.spawn(1)[0], device)
+        return cls(leftover, leftover, radius, features, centers, list(out[near]), held, device, evidence=evidence)
+
+    def clean(self) -> Belief | None:
+        """Return the belief of a scan so clean that its points tell their noise by themselves, or None.
+
+        Its length is the shortest whose next is not better beyond its standard error. All that clean points tell asks
+        for that; only where they, or a cube's features, are too few for it are longer ones clearly better.
+        """
+        left = self.leftover
+        noise = clean_noise(left.points, left.normals, left.density, left.over, left.estimated)
+        if noise is None:
+            return None
+        known = replace(self, known=noise)
+        number = 0
+        while number + 1 < len(LENGTHS) and known._clearly_better(number + 1, number):
+            number += 1
+        return Belief(LENGTHS[number] * self.radius, *noise)
+
+    def choice(self) -> Choice:
+        """Return the belief that predicts best."""
+        scores: dict[int, Float] = {}
+
+        def least(number: int) -> float:
+            """Return the least score of a length, over the noises."""
+            if not 0 <= number < len(LENGTHS):
+                return np.inf
+            scores[number] = self.scores(LENGTHS[number] * self.radius)
+            return float(scores[number].mean(axis=0).min())
+
+        at = FIRST
+        step = 1 if least(at + 1) < least(at) else -1
+        while least(at + step) < least(at):
+            at += step
+        tabled = {number: of_length[:, : len(CHOICES)] for number, of_length in scores.items()}
+        number, noise = _smoothest(tabled)
+        evident = None
+        if self.evidence is not None:
+            last, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
+            evident = self._belief(last, -1)
+        return Choice(self._belief(number, noise), tabled[number], evident)
+
+    def _belief(self, number: int, noise: int) -> Belief:
+        """Return the belief of the numbers of a length and of one of its noises."""
+        length = LENGTHS[number] * self.radius
+        return Belief(length, *self.noises(length)[noise])
+
+    def _clearly_better(self, number: int, than: int) -> bool:
+        """Return whether a length's score is better than another's by more than the standard error."""
+        gain = self.scores(LENGTHS[than] * self.radius)[:, 0] - self.scores(LENGTHS[number] * self.radius)[:, 0]
+        return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
+
+    def noises(self, length: float) -> list[tuple[float, float]]:
+        """Return the noises to try with a length, of positions and normals; that of most evidence is the last one.
+
+        Unless they are known, points are taken to be no noisier than what is left over says.
+        """
+        if self.known is not None:
+            return [self.known]
+        if length not in self._noises:
+            tried = [(position * self.radius, angle) for position, angle in CHOICES]
+            tried += [] if self.evidence is None else [self.evidence.noise(length)]
+            most = max(self.leftover.over, LEAST_NOISE * self.radius)
+            self._noises[length] = [(min(position, most), angle) for position, angle in tried]
+        return self._noises[length]
+
+    def scores(self, length: float) -> Float:
+        """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
+        if length not in self._scored:
+            self.noises(length)  # once, before the patches ask for them side by side
+            found = abreast(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
+            self._scored[length] = np.array(found) / self.radius
+        return self._scored[length]
+
+    def _scores(self, number: int, length: float) -> list[float]:
+        """Return the scores of one patch for each choice of noise."""
+        center, predicted = self.centers[number], self.predicted[number]
+        reach = np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max() + BEYOND * length
+        rows = self.leftover.within(center, reach)
+        rows = rows[~self.held[rows]]
+        # Beyond this many the nearest tell enough, and time would grow with the length's square.
+        if len(rows) > MOST_POINTS:
+            far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
+            rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
+        patch = self.leftover.patch(rows, center, Volume.none(), self.device)
+        system = patch_system(patch, self.features, length, patch.size)
+        target = self.told.patch(predicted, center, Volume.none(), self.device)
+        normals = torch.as_tensor(self.told.normals[predicted], device=self.device)
+        # Of a scan that is nearly exact, what is left over makes several noises one.
+        noises = self.noises(length)
+        found = {each: self._score(system.solve(*each), target, normals, length) for each in set(noises)}
+        return [found[each] for each in noises]
+
+    def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
+        value, gradient = self.features.sums(amplitudes, target.points, target.center, length, 1)
+        # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
+        missing, turn = target.value - value, target.gradient - gradient
+        slope = 1.0 - (turn * normals).sum(dim=1)
+        if self.leftover.estimated and len(self.leftover) <= SPARSE:
+            # Such normals are means of their neighbours', which a field that is too smooth predicts best. So distances
+            # alone count, and a field that is steep because it winds through every point is not nearer for that.
+            return float((missing.abs() / slope.clamp(LEAST_SLOPE, 1.0)).mean())
+        distance = missing.abs() / slope.clamp_min(LEAST_SLOPE)
+        return float(distance.mean() + self.radius * turn.norm(dim=1).mean())

@@ -1,0 +1,363 @@
+"""A field's residuals under a list of terms, as the least-squares problem that the optimisers solve.
+
+Row i of a term with weight w and N points is sqrt(w / N) r_i, so that |r|^2 / 2 is the paper's loss (its equations for
+the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is an operator made of the factors
+of its rows (`linalg.jacobian`); it is never held whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.field.networks import Siren
+from gnrecon.fit.fit_options import FitOptions, normal_residual
+from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
+from gnrecon.least_squares.jacobian import Block, LayeredJacobian
+from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.residuals.constraints import Linearised, Residual, eikonal, interface, signed_distance
+from gnrecon.runtime.parallel import slices
+
+CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000
+"""Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""
+
+
+@dataclass(frozen=True)
+class FieldProblem:
+    """Terms on a sine network, of which all parameters or those of some units are free.
+
+    Parameters
+    ----------
+    field : Siren
+    terms : the constraints, each on frozen points
+    theta : all parameters, of shape (p,), where the problem was posed
+    units : for each layer the units whose incoming parameters are free (None: all of them), or None for all layers
+    precision : in which the factors of J's rows are made and stored, by default that of theta; residuals keep theta's
+    keep_bytes : memory that the factors of J's rows may take; above it they are made afresh for each product
+    """
+
+    field: Siren
+    terms: Sequence[Term]
+    theta: Tensor
+    units: tuple[Tensor | None, ...] | None = None
+    precision: torch.dtype | None = None
+    keep_bytes: int = 1_500_000_000
+
+    @cached_property
+    def columns(self) -> Tensor | None:
+        """Places of the free parameters in theta, or None when all are free."""
+        return None if self.units is None else self.field.layout.columns(self.units).to(self.theta.device)
+
+    def free(self) -> Tensor:
+        """Return the free parameters at theta."""
+        return self.theta if self.columns is None else self.theta[self.columns]
+
+    def whole(self, free: Tensor) -> Tensor:
+        """Return all parameters, of shape (p,), from the free ones."""
+        return free if self.columns is None else self.theta.index_copy(0, self.columns, free)
+
+    def residual(self, theta: Tensor) -> Tensor:
+        """Return the weighted residuals, of shape (M,), in the order of `linearise`'s rows."""
+        whole = self.whole(theta)
+        return torch.cat([rows for group in groups(self.terms) for rows in self._residuals(whole, group)])
+
+    def _residuals(self, whole: Tensor, group: list[Term]) -> Iterator[Tensor]:
+        needs_gradient = any(not _is_value_only(term) for term in group)
+        for rows in self._chunks(group):
+            points = group[0].points[rows]
+            if needs_gradient:
+                value, gradient = self.field.value_and_gradient(whole, points)
+            else:
+                value, gradient = self.field.value(whole, points), points
+            for term in group:
+                linear, scale = _evaluate(term, rows, value, gradient)
+                yield (linear.residual * scale).T.flatten()
+
+    def linearise(self, theta: Tensor) -> tuple[LayeredJacobian, Tensor]:
+        """Return J, of shape (M, free), and r, of shape (M,), at the free parameters `theta`.
+
+        The factors of J's rows are kept where they take at most `keep_bytes`, and made afresh for each
+        product otherwise.
+        """
+        whole = self.whole(theta).to(self.precision or theta.dtype)
+        gathered = groups([term for group in groups(self.terms) for term in _in_precision(group, whole.dtype)])
+
+        def blocks() -> Iterable[Block]:
+            return self._blocks(whole, gathered)
+
+        kept = list(blocks()) if self._factor_bytes(whole) <= self.keep_bytes else None
+        residual = self.residual(theta)
+        source = blocks if kept is None else lambda: kept
+        return LayeredJacobian(source, len(residual), self._layer_sizes(), theta.device, stored=whole.dtype), residual
+
+    def _blocks(self, whole: Tensor, gathered: list[list[Term]]) -> Iterator[Block]:
+        """Yield the factors of J's rows: for each chunk of points, one block for each residual of each term."""
+        for group in gathered:
+            for rows in self._chunks(group):
+                jet = self.field.jet(whole, group[0].points[rows])
+                for term in group:
+                    linear, scale = _evaluate(term, rows, jet.value, jet.gradient)
+                    for column in range(linear.residual.shape[1]):
+                        yield self._free_rows(jet.rows(*_column(linear, column, scale)))
+
+    def _free_rows(self, layers: list[LayerRows]) -> list[LayerRows]:
+        if self.units is None:
+            return layers
+        return [r if units is None else r.into(units) for r, units in zip(layers, self.units, strict=True)]
+
+    def _free_outs(self) -> list[int]:
+        """Number of free units of each layer."""
+        shapes = self.field.layout.shapes
+        chosen = self.units or [None] * len(shapes)
+        return [out if units is None else len(units) for (out, _), units in zip(shapes, chosen, strict=True)]
+
+    def _layer_sizes(self) -> tuple[int, ...]:
+        shapes = self.field.layout.shapes
+        return tuple(out * (into + 1) for out, (_, into) in zip(self._free_outs(), shapes, strict=True))
+
+    def _chunks(self, group: list[Term]) -> list[slice]:
+        """Return slices of the group's points, of which the activations take at most `CHUNK_BYTES` a layer."""
+        size = max(256, min(CHUNK_POINTS, CHUNK_BYTES // (8 * max(self.field.widths))))
+        return slices(len(group[0].points), size)
+
+    def _factor_bytes(self, whole: Tensor) -> int:
+        """Memory of all factors: inputs and adjoints once a point, lefts and tangents for each residual."""
+        ins, outs = sum(into for _, into in self.field.layout.shapes), sum(self._free_outs())
+        numbers = 0
+        for group in groups(self.terms):
+            numbers += len(group[0]) * (ins + outs)
+            for term in group:
+                linear = _probe(term)
+                numbers += len(term) * linear.residual.shape[1] * (outs + (0 if linear.by_gradient is None else ins))
+        return numbers * whole.element_size()
+
+
+def _column(linear: Linearised, column: int, scale: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Return the scaled derivatives of one of the m residuals of each point: (N,) by value, (N, 3) by gradient."""
+    by_value = None if linear.by_value is None else linear.by_value[:, column] * scale[:, 0]
+    by_gradient = None if linear.by_gradient is None else linear.by_gradient[:, column] * scale
+    return by_value, by_gradient
+
+
+def _row_scale(weight: float | Tensor, count: int, like: Tensor) -> Tensor:
+    """Return sqrt(weight / N) with shape (1, 1) or (N, 1)."""
+    return torch.as_tensor(weight, dtype=like.dtype, device=like.device).div(count).sqrt().reshape(-1, 1)
+
+
+def _evaluate(term: Term, rows: slice, value: Tensor, gradient: Tensor) -> tuple[Linearised, Tensor]:
+    """Return a term's residuals at some of its points, linearised, and the scale of their rows."""
+    target = None if term.target is None else term.target[rows]
+    linear = term.residual(value, gradient, target)
+    weight = term.weight[rows] if isinstance(term.weight, Tensor) else term.weight
+    return linear, _row_scale(weight, len(term), linear.residual)
+
+
+def _in_precision(group: list[Term], dtype: torch.dtype) -> list[Term]:
+    """Return the terms of a group with points and targets in `dtype`, the points still one tensor for all of them."""
+    points = group[0].points.to(dtype)
+    return [
+        replace(term, points=points, target=None if term.target is None else term.target.to(dtype)) for term in group
+    ]
+
+
+def _is_value_only(term: Term) -> bool:
+    """Whether the residual can be evaluated without the gradient."""
+    return _probe(term).by_gradient is None
+
+
+def _probe(term: Term) -> Linearised:
+    """Return what the residual looks like at one point."""
+    probe = term.points.new_zeros(1)
+    target = None if term.target is None else term.target[:1]
+    return term.residual(probe, term.points.new_ones(1, 3), target)
+
+
+# Terms of a fit: a residual, where it is sampled, and its weight.
+
+
+@dataclass(frozen=True)
+class Term:
+    """One constraint on one frozen set of points.
+
+    The loss is  weight / (2 N) sum_i |r_i|^2  over the term's N points, the paper's Monte Carlo quadrature.
+
+    Parameters
+    ----------
+    name : str
+        What the history and the report call it.
+    residual : function of (value, gradient, target)
+    points : of shape (N, 3), unit coordinates
+    target : of shape (N,) or (N, 3), or None
+    weight : float, or a tensor of shape (N,) for weights that differ from point to point
+    """
+
+    name: str
+    residual: Residual
+    points: Tensor
+    target: Tensor | None = None
+    weight: float | Tensor = 1.0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def groups(terms: Sequence[Term]) -> list[list[Term]]:
+    """Gather the terms that share one tensor of points, so that the network is differentiated once for all of them."""
+    by_points: dict[int, list[Term]] = {}
+    for term in terms:
+        by_points.setdefault(id(term.points), []).append(term)
+    return list(by_points.values())
+
+
+LEAST_REACH = 0.012
+
+EIKONAL_REACH = 0.05
+
+DISTANCE_ROW, DISTANCE_WEIGHT = 1e-4, 4e-4
+
+EIKONAL_COUNT = 3000
+
+LINEAR = ("vector", "projection")
+"""Residuals of normals that are linear in the field."""
+
+
+# The terms of a fit, drawn afresh for each step.
+#
+# In the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
+#
+#     interface   f = 0                  at the points        1
+#     normal      grad f = n             at the points        max(r h, 0.012)^2, an angle as a height over that length;
+#                                                             r is the scene's reach, 0.4 where nothing chose it
+#     distance    f = coarse distance    in the box           max(1e-4 M / N, 4e-4), M samples and N points
+#     eikonal     |grad f| = 1           near the surface     (0.05 h)^2
+#                                        and in the box
+
+
+def start_terms(
+    scene: Scene, options: FitOptions, rng: np.random.Generator, x: Tensor, distance: Tensor, most: int
+) -> list[Term]:
+    """Return the terms of a linear start: at most `most` data points, and volume samples x with their distances."""
+    # The start is a linear solve, and other residuals than these two are not linear in f, or not known to be.
+    linear = options if options.normals in LINEAR else replace(options, normals="vector")
+    return [*data_terms(scene, linear, rng, most), distance_term(scene, x, distance)]
+
+
+def step_terms(
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    volume: tuple[Tensor, Tensor],
+    most: int,
+    data_weight: float = 1.0,
+) -> list[Term]:
+    """Draw the terms of one step: at most `most` data points, with `data_weight` times their weight, and the volume.
+
+    Parameters
+    ----------
+    volume : samples, of shape (Q, 3), and their coarse distances, of shape (Q,)
+    """
+    eikonal_count = min(EIKONAL_COUNT, most)
+    near = near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
+    around = np.concatenate([near, scene.box.sample(eikonal_count // 3, rng)])
+    eikonal_weight = (EIKONAL_REACH * scene.coarse.spacing) ** 2 * data_weight**0.5
+    return [
+        *data_terms(scene, options, rng, most, data_weight),
+        distance_term(scene, *volume),
+        Term("eikonal", eikonal, scene.tensor(around), None, eikonal_weight),
+    ]
+
+
+def data_terms(
+    scene: Scene, options: FitOptions, rng: np.random.Generator, most: int, weight: float = 1.0
+) -> list[Term]:
+    """Return interface and normals at the data points, or at `most` of them drawn afresh."""
+    points, normals = scene.points, scene.normals
+    if len(points) > most:
+        rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
+        points, normals = points[rows], normals[rows]
+    beside = normal_weight(scene.coarse.spacing, scene.reach)
+    return [
+        Term("interface", interface, points, None, weight),
+        Term("normal", normal_residual(options.normals), points, normals, weight * beside),
+    ]
+
+
+REACH = 0.4
+"""Length over which an angle of a normal counts as a height, in spacings."""
+
+
+def normal_weight(spacing: float, reach: float = REACH) -> float:
+    """Return the weight of normals beside that of the interface, for data of a spacing in radii."""
+    return max(reach * spacing, LEAST_REACH) ** 2
+
+
+def distance_term(scene: Scene, x: Tensor, distance: Tensor) -> Term:
+    """The sparser the data, the more the free space must be told; the denser, the steeper a fit can turn in it."""
+    weight = max(DISTANCE_ROW * len(x) / len(scene.points), DISTANCE_WEIGHT)
+    return Term("distance", signed_distance, x, distance, weight)
+
+
+MARGIN = 0.1
+"""How far the box reaches beyond the data, in radii."""
+
+VOLUME_COUNT = 10000
+
+SHELL = 4.0
+"""Standard deviation of the samples near the data, in spacings."""
+
+
+# What a fit is made in: the samples as tensors, their coarse distance, and the box around them.
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Data points and normals, of shape (N, 3), on the device; the rest in numpy, for sampling.
+
+    `reach` says what the normals are worth beside the points: see `REACH`.
+    """
+
+    points: Tensor
+    normals: Tensor
+    samples: Samples
+    coarse: CoarseDistance
+    box: Box
+    volume_count: int = VOLUME_COUNT
+    reach: float = REACH
+
+    @classmethod
+    def of(cls, samples: Samples, device: str, rng: np.random.Generator) -> Scene:
+        """Put samples on a device."""
+        points, normals = (torch.as_tensor(rows, device=device) for rows in (samples.points, samples.normals))
+        coarse = CoarseDistance(samples.points, samples.normals, rng)
+        return cls(points, normals, samples, coarse, _box(samples))
+
+    def volume(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+        """Return about `count` points of the box, (Q, 3), half of them near the data, and their coarse distances."""
+        return self.coarse.sample(self.places(count, rng))
+
+    def places(self, count: int, rng: np.random.Generator) -> Float:
+        """Return such points, of shape (Q, 3), also where no distance is known because the data is too near."""
+        shell = near_surface(self.samples.points, SHELL * self.coarse.spacing, count // 2, rng)
+        inside = ((shell > self.box.lower) & (shell < self.box.upper)).all(axis=1)
+        return np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]])
+
+    def tensor(self, values: Float) -> Tensor:
+        """Return `values` as a tensor like the data's."""
+        return torch.as_tensor(values).to(self.points)
+
+
+def bounds_of(samples: Samples) -> Float:
+    """Lower and upper corner of the box in which samples will be fitted, of shape (2, 3), file units."""
+    box = _box(samples)
+    return samples.frame.to_world(np.stack([box.lower, box.upper]))
+
+
+def _box(samples: Samples) -> Box:
+    return Box.around(samples.points, MARGIN)

@@ -1,0 +1,329 @@
+"""A global field and the cubes of its detail, bent to what the regularisers ask for (`regulariser`, `bend`).
+
+Where a hole is to be filled by a film of its own, the coarse distances there say something else: their sign is that of
+the winding number, another film's, and their size the distance to the hole's rim. So samples of the volume that are
+nearer to the film than to any scanned point are told the distance to the film instead, as it is then: that keeps the
+field's sign and slope beside it, and hardly holds it, because these rows weigh little.
+
+So little that features which are bent to a surface's curvature may run off in the free space beside it, and leave
+sheets there. Where the sign is beyond doubt the field is asked to keep it, by a residual that is zero where it does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gnrecon.field.random_features import Features
+from gnrecon.fit.field_model import NeuralSDF
+from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.initialisation import FINAL_POINTS, RIDGE
+from gnrecon.fit.local_solve import Belief, PatchSystem
+from gnrecon.fit.objective import FieldProblem, Scene, Term, data_terms, distance_term
+from gnrecon.fit.regularisers import Jet, Regulariser, Sines, Wish, bent
+from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.signed_distance import Density, least_values
+from gnrecon.least_squares.direct import damped_factor
+from gnrecon.level_set import LevelSet, sample_surface
+from gnrecon.residuals import SecondOrder, free_space
+from gnrecon.runtime.errors import FitError
+
+GLOBAL_STEPS, CUBE_STEPS = 8, 3
+"""Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""
+
+FOLLOW = 0.05, 0.5
+"""How far points may go in one step to follow the global field's surface, in radii, and a cube's, in its lengths."""
+
+PER_LENGTH = 2.0
+"""Points of the surface along one length of the features."""
+
+ROUNDS = 2
+"""Times that the global field is bent, each with more samples where the last one has the wrong sign."""
+
+ATTEMPTS = 8
+
+FREE, CLEAR, MORE = 100.0, 0.05, 3
+"""Weight of the free space, how far from the scan it begins, in radii, and how many times the fit's samples it has."""
+
+DEEP = 0.03
+"""The most that is asked of f there, in magnitude."""
+
+_FREE_SPACE = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
+
+
+@dataclass(frozen=True)
+class Free:
+    """Points of the volume at which the sign is beyond doubt, and what f should be there at least.
+
+    Parameters
+    ----------
+    points : of shape (Q, 3)
+    least : of shape (Q,), signed
+    """
+
+    points: Float
+    least: Float
+
+    @classmethod
+    def of(cls, scene: Scene, rng: np.random.Generator) -> Free:
+        """Draw points of a scan's box."""
+        x = scene.places(MORE * scene.volume_count, rng)
+        known, distance, _, certain = scene.coarse.at(x)
+        kept = certain & (np.abs(distance) > CLEAR)
+        return cls(x[known][kept], least_values(distance[kept], DEEP))
+
+    def wishes(self, rows: Mask, known: Float, scale: float, like: Tensor) -> list[Wish]:
+        """Return what is asked at some of the points.
+
+        Parameters
+        ----------
+        rows : mask of them
+        known : value at all points, of shape (Q,), of what the features are added to
+        scale : of the root mean square residual of all points, for a weight of one
+        like : tensor whose device is used
+        """
+        if not rows.any():
+            return []
+        points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
+        scales = torch.full_like(least, scale * (FREE / len(rows)) ** 0.5)[:, None]
+        return [Wish(_FREE_SPACE, points, scales, target=least, still=still)]
+
+
+@dataclass(frozen=True)
+class Shaping:
+    """What is asked of a field's surface, and where.
+
+    Parameters
+    ----------
+    wanted : the regularisers
+    sheet : points of the surface, at which they are asked for
+    sdf : the global field
+    density : of the scanned points
+    free : where the field is to keep its sign
+    """
+
+    wanted: Sequence[Regulariser]
+    sheet: Sheet
+    sdf: NeuralSDF
+    density: Density
+    free: Free
+
+    @classmethod
+    def of(
+        cls,
+        wanted: Sequence[Regulariser],
+        sdf: NeuralSDF,
+        density: Density,
+        free: Free,
+        length: float,
+        rng: np.random.Generator,
+    ) -> Shaping:
+        """Draw points of the surface for features of a length, in radii."""
+        return cls(wanted, Sheet.of(sdf, density, length / PER_LENGTH, rng), sdf, density, free)
+
+    @cached_property
+    def in_free(self) -> Float:
+        """Values of the global field at the points of the free space, of shape (Q,)."""
+        return self.sdf.sdf(self.sdf.frame.to_world(self.free.points)) / self.sdf.frame.scale
+
+    def told(self, x: Float, signed: Float) -> Float:
+        """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
+        if not any(one.holes for one in self.wanted):
+            return signed
+        return self.sheet.told(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
+
+    def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
+        """Return what is asked of the surface at some of its points.
+
+        Parameters
+        ----------
+        rows : mask of the sheet's points
+        scale : of each point's residuals, for a weight of one
+        like : tensor whose device is used
+        """
+        found = []
+        for one in self.wanted:
+            share = self.sheet.far * rows if one.holes else 1.0 * rows
+            asked = np.flatnonzero(share)
+            if len(asked):
+                points, weights = (torch.as_tensor(part[asked]).to(like) for part in (self.sheet.points, share))
+                scales = scale * (one.weight * weights[:, None]).sqrt()
+                found.append(Wish(one.residual, points, scales, one.crease))
+        return found
+
+    def bend_cube(
+        self, features: Features, length: float, center: Float, reach: float, belief: Belief, system: PatchSystem
+    ) -> Tensor:
+        """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
+        amplitudes = system.solve_within(belief.position, belief.angle)
+        equations = system.equations(belief.position, belief.angle)
+        rows = np.asarray((np.abs(self.sheet.points - center) < reach).all(axis=1))
+        scale = (len(self.density.points) / len(self.sheet)) ** 0.5 / belief.position
+        wishes = self.wishes(rows, scale, amplitudes)
+        if equations is None or not wishes:
+            return amplitudes
+        near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
+        wishes += self.free.wishes(near, self.in_free, len(self.density.points) ** 0.5 / belief.position, amplitudes)
+        whole, known = as_sines(self.sdf)
+
+        def base(x: Tensor) -> Jet:
+            return whole.jet(known, x, whole.known(x))
+
+        sines = Sines(features, torch.as_tensor(center).to(amplitudes), length, FOLLOW[1] * length, base)
+        return bent(sines, *equations, wishes, amplitudes, CUBE_STEPS)
+
+
+def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.random.Generator) -> NeuralSDF:
+    """Return the global field with output weights that heed the regularisers.
+
+    Raises
+    ------
+    FitError
+        When the data's system cannot be factored.
+    """
+    sdf, like = shaping.sdf, scene.points
+    everywhere, free = (np.ones(len(one), dtype=bool) for one in (shaping.sheet.points, shaping.free.points))
+    wishes = shaping.wishes(everywhere, max(len(everywhere), 1) ** -0.5, like)
+    # The global field is all of f.
+    wishes += shaping.free.wishes(free, np.zeros(len(free)), 1.0, like)
+    x, wanted = _volume(shaping, scene, scene.volume_count, rng)
+    for left in reversed(range(ROUNDS)):
+        volume = scene.tensor(x), scene.tensor(wanted)
+        terms = [*data_terms(scene, options, rng, FINAL_POINTS), distance_term(scene, *volume)]
+        sines, amplitudes = as_sines(sdf)
+        problem, factor, right = _linear_part(sdf, terms, amplitudes)
+        sdf = replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, GLOBAL_STEPS)))
+        if left:
+            # Where the sign has become wrong, more samples bring it back, as at the fit's start.
+            trial, expected = _volume(shaping, scene, 3 * scene.volume_count, rng)
+            wrong = np.flatnonzero(sdf.sdf(sdf.frame.to_world(trial)) * expected <= 0)[: scene.volume_count // 2]
+            x, wanted = np.concatenate([x, trial[wrong]]), np.concatenate([wanted, expected[wrong]])
+    return sdf
+
+
+def _volume(shaping: Shaping, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Return points of the volume, of shape (Q, 3), and what their signed distances should be, of shape (Q,)."""
+    x, distance = scene.volume(count, rng)
+    return x, shaping.told(x, distance)
+
+
+def _linear_part(sdf: NeuralSDF, terms: Sequence[Term], amplitudes: Tensor) -> tuple[FieldProblem, Tensor, Tensor]:
+    """Return the last layer's problem, and L and b of its normal equations L L^T a = b."""
+    none = torch.zeros(0, dtype=torch.long, device=amplitudes.device)
+    problem = FieldProblem(sdf.field, terms, sdf.theta, (none, None))
+    jacobian, residual = problem.linearise(problem.free())
+    product, ridge = jacobian.gram(), RIDGE / max(len(term) for term in terms)
+    right = jacobian.tmv(jacobian.mv(amplitudes) - residual)
+    for _ in range(ATTEMPTS):
+        factor = damped_factor(product, torch.full_like(right, ridge))
+        if factor is not None:
+            # The ridge holds the amplitudes where they are, as damping does.
+            return problem, factor, right + ridge * amplitudes
+        ridge *= 10
+    raise FitError("The surface could not be shaped: the data's system holds values that are not finite.")
+
+
+def as_sines(sdf: NeuralSDF) -> tuple[Sines, Tensor]:
+    """Return a network of one layer as sine features, of which one more is its bias, and their amplitudes."""
+    (weights, bias), (out, constant) = sdf.field.layout.layers(sdf.theta)
+    frequencies = torch.cat([weights, weights.new_zeros(1, 3)])
+    phases = torch.cat([bias, bias.new_full((1,), torch.pi / 2)])
+    sines = Sines(Features(frequencies, phases), weights.new_zeros(3), 1.0, FOLLOW[0])
+    return sines, torch.cat([out[0], constant])
+
+
+NEAR, FAR = 2.0, 3.5
+"""Where far begins to count, and where it counts fully."""
+
+LEAST, MOST = 1000, 30_000
+"""Fewest and most points."""
+
+NODES = 30_000
+
+JOINED = 3.0
+"""Mean distances between points within which two of them belong to one sheet."""
+
+
+# Points of a fitted field's surface, and how far each is from the scan, as in its holes.
+#
+# Distances count in radii of the disk that the nearest scanned point stands for. On points thrown evenly at random onto
+# a surface, one in fifty of its places is 2 radii from all of them, and five in a million are 3.5 radii away. What lies
+# between counts in part, so that nothing is left without a say at a hole's rim.
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Points of a surface, about uniform by area, unit coordinates.
+
+    Parameters
+    ----------
+    points : of shape (N, 3)
+    far : how much each counts as far from the scan, from 0 to 1, of shape (N,)
+    """
+
+    points: Float
+    far: Float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def of(cls, sdf: NeuralSDF, density: Density, spacing: float, rng: np.random.Generator) -> Sheet:
+        """Draw points of a field's zero level about `spacing` apart, in radii; none where there is no surface.
+
+        Sheets on which no point is near the scan are no part of the shape, and are left out.
+        """
+        scanned = float(np.pi * np.square(density.disks).sum())
+        count = int(np.clip(scanned / spacing**2, LEAST, MOST))
+        points = sample_surface(_level_set(sdf), count, rng, NODES, sweeps=0).points.cpu().numpy()
+        distance, nearest = density.tree.query(points)
+        far = np.clip((distance / density.disks[nearest] - NEAR) / (FAR - NEAR), 0.0, 1.0)
+        kept = _joined(points, far == 0.0, JOINED * np.sqrt(scanned / count))
+        return cls(points[kept], far[kept])
+
+    def told(self, x: Float, signed: Float, value: Float, density: Density) -> Float:
+        """Return coarse signed distances, with those to the far part where it is nearer than all scanned points.
+
+        Parameters
+        ----------
+        x : points of the volume, of shape (Q, 3)
+        signed : what their coarse distances are, of shape (Q,)
+        value : of the field there, whose sign tells the far part's sides, of shape (Q,)
+        density : of the scanned points
+        """
+        film = self.points[self.far == 1.0]
+        if not len(film):
+            return signed
+        distance = cKDTree(film).query(x)[0]
+        told: Float = np.where(distance < density.tree.query(x)[0], np.sign(value) * distance, signed)
+        return told
+
+
+def _joined(points: Float, near: Mask, reach: float) -> Mask:
+    """Return which points, of shape (N, 3), lead to a near one in leaps of at most `reach`."""
+    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    labels = connected_components(graph, directed=False)[1]
+    joined: Mask = np.isin(labels, np.unique(labels[near]))
+    return joined
+
+
+def _level_set(sdf: NeuralSDF) -> LevelSet:
+    """Return the field's zero level in unit coordinates."""
+
+    def both(x: Tensor) -> tuple[Tensor, Tensor]:
+        value, gradient = sdf.sdf_and_gradient(sdf.frame.to_world(x.cpu().numpy()))
+        return torch.as_tensor(value / sdf.frame.scale), torch.as_tensor(gradient)
+
+    def value(x: Tensor) -> Tensor:
+        return torch.as_tensor(sdf.sdf(sdf.frame.to_world(x.cpu().numpy())) / sdf.frame.scale)
+
+    return LevelSet(value, both, sdf.box)

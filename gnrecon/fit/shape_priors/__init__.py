@@ -1,0 +1,1 @@
+"""What a shape of planes, cylinders and spheres lets one know where points are noisy, few or missing."""

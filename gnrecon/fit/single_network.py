@@ -1,0 +1,184 @@
+"""Several layers: a spectral start, then Gauss-Newton from coarse to fine.
+
+The start decides. From small weights the network is nearly linear, and Gauss-Newton spends 50 to 90 steps on a plateau
+(the paper's start); from random frequencies and an exact solve of the last layer (`start.spectral_start`) it has none.
+
+The stages raise, one after the other, the number of rows (a step far from the minimum needs to see only a part of the
+data), the weight of the data against the volume, and the precision of J: single precision costs nothing while the
+damping is well above its rounding. Of 1,000 points or more one in twenty is held out; the fit ends when the residuals
+there have stopped falling, and returns the parameters for which they were least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.field.networks import Siren
+from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.initialisation import COARSE, Spectrum, spectral_start, wide_start
+from gnrecon.fit.objective import FieldProblem, Scene, data_terms, start_terms, step_terms
+from gnrecon.least_squares import SOLVERS, layer_scaled
+from gnrecon.optim import (
+    LBFGS,
+    Adam,
+    Callback,
+    GainRatioDamping,
+    GaussNewton,
+    LogLineSearch,
+    Optimiser,
+    Search,
+    Solution,
+    StopRule,
+)
+from gnrecon.optim.problem import loss_of
+from gnrecon.runtime.progress import Advance, unheard
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of the steps.
+
+    Parameters
+    ----------
+    until : share of the steps at which it ends
+    rows : most data points of a step
+    data_weight : of interface and normals
+    precision : of the Jacobian's factors
+    """
+
+    until: float
+    rows: int
+    data_weight: float
+    precision: torch.dtype
+
+
+STAGES = (
+    Stage(0.1, 2000, 1.0, torch.float32),
+    Stage(0.3, 6000, 1.0, torch.float32),
+    Stage(0.6, 15000, 30.0, torch.float32),
+    Stage(1.0, 15000, 1000.0, torch.float64),
+)
+
+POOL = 30000
+
+LEAST_POINTS_TO_HOLD_OUT, HELD_OUT = 1000, 20
+
+HELD_OUT_PATIENCE = 20
+
+
+def fit_deep(
+    field: Siren,
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    callback: Callback | None,
+    advance: Advance = unheard,
+) -> Solution:
+    """Fit a network of several hidden layers; `advance` is told when the start is made."""
+    steps = options.steps_for(len(scene.points))
+    fitted, held = hold_out(scene, rng)
+    theta = spectral_start(field, fitted, lambda x, d, n: start_terms(fitted, options, rng, x, d, n), rng)
+    advance(1.0)
+    # Signing volume samples takes as long as a step, so that one pool serves for all of them.
+    pool = tuple(scene.tensor(values) for values in fitted.volume(POOL, rng))
+
+    def problem_at(number: int, theta: Tensor) -> FieldProblem:
+        stage = next(stage for stage in STAGES if number <= stage.until * steps or stage is STAGES[-1])
+        rows = torch.as_tensor(np.sort(rng.permutation(len(pool[0]))[: min(stage.rows, scene.volume_count)]))
+        x, distance = (values[rows.to(values.device)] for values in pool)
+        terms = step_terms(fitted, options, rng, (x, distance), stage.rows, stage.data_weight)
+        return FieldProblem(field, terms, theta, precision=stage.precision)
+
+    optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True))
+    # No stage may end early, because each one looks converged before the next raises the weight of the data.
+    stop = StopRule(steps, tolerance=0.0, patience=steps + 1, held_out_patience=HELD_OUT_PATIENCE)
+    check = None if held is None else _held_out_loss(field, held, options, rng)
+    return optimiser.run(problem_at, theta, stop, callback, check)
+
+
+def hold_out(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Scene | None]:
+    """Return the scene with the points to fit, and that with those to check on, or None where there are too few."""
+    count = len(scene.points)
+    if count < LEAST_POINTS_TO_HOLD_OUT:
+        return scene, None
+    order = torch.as_tensor(rng.permutation(count)).to(scene.points.device)
+    held, fitted = (rows.sort().values for rows in order.tensor_split([count // HELD_OUT]))
+    return _only(scene, fitted), _only(scene, held)
+
+
+def _only(scene: Scene, rows: Tensor) -> Scene:
+    return replace(scene, points=scene.points[rows], normals=scene.normals[rows])
+
+
+def _held_out_loss(
+    field: Siren, held: Scene, options: FitOptions, rng: np.random.Generator
+) -> Callable[[Tensor], float]:
+    """Return the loss of interface and normals at the held-out points, as a function of theta."""
+    terms = data_terms(held, options, rng, len(held.points))
+
+    def loss(theta: Tensor) -> float:
+        return loss_of(FieldProblem(field, terms, theta), theta)
+
+    return loss
+
+
+ENERGY = 0.3
+"""Error at which conjugate gradients stop: steps that the search shortens or bends anyway need no better ones."""
+
+
+# From the options' names to an optimiser.
+
+
+def optimiser_for(options: FitOptions, auto: Search) -> Optimiser:
+    """Return the optimiser that the options name; `auto` is the search that suits the network's start."""
+    if options.optimiser == "adam":
+        return Adam()
+    if options.optimiser == "lbfgs":
+        return LBFGS()
+    searches: dict[str, Search] = {
+        "auto": auto,
+        "damping": GainRatioDamping(initial_damping=auto.initial_damping, metric=auto.metric),
+        "geodesic": GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True),
+        "line": LogLineSearch(),
+    }
+    return GaussNewton(searches[options.search], SOLVERS[options.solver](ENERGY))
+
+
+SUBSPACE_UNITS = 400
+
+MAX_STEP_POINTS = 4000
+
+
+# One wide layer: a linear start, then steps in random subspaces.
+#
+# A step frees all output weights and the frequencies of some hundreds of units, drawn afresh each time, so that J^T J
+# stays small. Adam and L-BFGS, which need no J^T J, free all parameters.
+
+
+def fit_wide(
+    field: Siren,
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    callback: Callback | None,
+    advance: Advance = unheard,
+    spectrum: Spectrum = COARSE,
+) -> Solution:
+    """Fit a network of one hidden layer; `advance` is told of the share of the start that is done."""
+    theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng, spectrum, advance)
+    whole = options.optimiser != "gn"
+
+    def problem_at(number: int, theta: Tensor) -> FieldProblem:
+        del number
+        units = torch.as_tensor(np.sort(rng.permutation(field.widths[0])[:SUBSPACE_UNITS])).to(theta.device)
+        x, distance = (scene.tensor(values) for values in scene.volume(scene.volume_count, rng))
+        terms = step_terms(scene, options, rng, (x, distance), MAX_STEP_POINTS)
+        return FieldProblem(field, terms, theta, None if whole else (units, None))
+
+    optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1.0))
+    return optimiser.run(problem_at, theta, StopRule(options.steps_for(len(scene.points))), callback)

@@ -1,0 +1,362 @@
+"""PLY, the Stanford polygon format: ASCII and binary of either byte order, any scalar types, polygons of any size.
+
+A header names elements (vertex, face, ...) with their properties; rows of values follow. ASCII words are first turned
+into an array of float64, which is then walked exactly as a binary file whose every property is a double. One walker
+thus serves all three encodings. Common libraries either round doubles, drop scalar properties, reject polygons of
+differing size, or accept a file that ends too early; that is why the walker is written here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from gnrecon.geometry.arrays import Int, Values
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.io.contents import Contents, fan, from_columns, not_triangles
+from gnrecon.io.parse import numbers
+from gnrecon.runtime.errors import InputError
+
+
+@dataclass
+class _Rows:
+    """Values of one element: scalar columns of shape (count,), lists as (lengths, values in a row)."""
+
+    scalars: dict[str, Values]
+    lists: dict[str, tuple[Int, Int]]
+
+
+def read_ply(path: Path) -> Contents:
+    """Read vertices with all their scalar properties, and the faces where there are some.
+
+    Raises
+    ------
+    InputError
+        When the header is malformed, the file ends before the declared rows, or a word is no number.
+    """
+    data = path.read_bytes()
+    encoding, elements, start = parse_header(data)
+    if encoding == "ascii":
+        buffer = numbers(data[start:].decode("ascii", errors="replace").split()).tobytes()
+    else:
+        buffer = data[start:]
+    rows: dict[str, _Rows] = {}
+    offset = 0
+    for element in elements:
+        rows[element.name], offset = _walk(buffer, offset, element, ORDERS[encoding])
+        if "vertex" in rows and ("face" in rows or not any(later.name == "face" for later in elements)):
+            break  # what follows (range grids, edges, materials) is not used
+    if "vertex" not in rows:
+        raise InputError("the PLY header declares no vertex element.")
+    polygons = rows["face"].lists if "face" in rows else {}
+    corners = polygons.get("vertex_indices", polygons.get("vertex_index"))
+    contents = from_columns(rows["vertex"].scalars, None if corners is None else fan(*corners))
+    return replace(contents, unread=_unread(elements) + (() if corners is None else not_triangles(corners[0])))
+
+
+def _unread(elements: list[Element]) -> tuple[str, ...]:
+    """Name all that the header declares and this reader leaves out."""
+    found = [f"the element {one.name}" for one in elements if one.name not in ("vertex", "face") and one.count]
+    for element in elements:
+        names = {prop.name for prop in element.properties if element.name == "face" or prop.count_type}
+        if element.count and element.name in ("vertex", "face"):
+            found += [f"{name} of each {element.name}" for name in sorted(names - {"vertex_indices", "vertex_index"})]
+    return tuple(found)
+
+
+def _walk(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
+    """Return the element's rows and the offset behind them; `order` is empty for words turned into doubles."""
+    lists = [prop for prop in element.properties if prop.count_type]
+    if lists and element.count:
+        lengths = _first_lengths(buffer, offset, element, order)
+        layout = _layout(element, order, lengths)
+        end = offset + element.count * layout.itemsize
+        table = np.frombuffer(buffer[offset:end], layout) if end <= len(buffer) else None
+        if table is None or any((table[f"#{prop.name}"] != lengths[prop.name]).any() for prop in lists):
+            return _walk_slowly(buffer, offset, element, order)
+    else:
+        layout = _layout(element, order, {prop.name: 0 for prop in lists})
+        end = offset + element.count * layout.itemsize
+        if end > len(buffer):
+            raise too_short(element, (len(buffer) - offset) // layout.itemsize)
+        table = np.frombuffer(buffer[offset:end], layout)
+    scalars = {p.name: _native(table[p.name], p, order) for p in element.properties if not p.count_type}
+    found: dict[str, tuple[Int, Int]] = {
+        p.name: (table[f"#{p.name}"].astype(np.int64), _indices(table[p.name]).ravel()) for p in lists
+    }
+    return _Rows(scalars, found), end
+
+
+def _walk_slowly(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
+    """Walk row by row, for lists of differing lengths."""
+    scalars: dict[str, list[Values]] = {p.name: [] for p in element.properties if not p.count_type}
+    counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
+    items: dict[str, list[Values]] = {name: [] for name in counts}
+    for row in range(element.count):
+        try:
+            for prop in element.properties:
+                kind = np.dtype(order + prop.type if order else "f8")
+                if not prop.count_type:
+                    scalars[prop.name].append(np.frombuffer(buffer, kind, 1, offset)[0])
+                    offset += kind.itemsize
+                    continue
+                length, offset = _length(buffer, offset, prop, order)
+                counts[prop.name].append(length)
+                items[prop.name].append(np.frombuffer(buffer, kind, length, offset))
+                offset += length * kind.itemsize
+        except ValueError:  # numpy's word for a buffer that is too short
+            raise too_short(element, row) from None
+    by_name = {prop.name: prop for prop in element.properties}
+    columns = {name: _native(np.array(values), by_name[name], order) for name, values in scalars.items()}
+    lists: dict[str, tuple[Int, Int]] = {
+        name: (np.array(counts[name], np.int64), _indices(np.concatenate(items[name]))) for name in counts
+    }
+    return _Rows(columns, lists), offset
+
+
+def _length(buffer: bytes, offset: int, prop: Property, order: str) -> tuple[int, int]:
+    """Return the length of the list that begins at `offset`, and the offset of its first item."""
+    kind = np.dtype(order + (prop.count_type or "") if order else "f8")
+    value = float(np.frombuffer(buffer, kind, 1, offset)[0])
+    if not (value >= 0 and value.is_integer()):
+        raise InputError(f"a list of {prop.name} has the length {value:g}, but a count was expected.")
+    return int(value), offset + kind.itemsize
+
+
+def _first_lengths(buffer: bytes, offset: int, element: Element, order: str) -> dict[str, int]:
+    """Return the list lengths of the element's first row, which most often are those of all rows."""
+    lengths: dict[str, int] = {}
+    try:
+        for prop in element.properties:
+            kind = np.dtype(order + prop.type if order else "f8")
+            length = 1
+            if prop.count_type:
+                length, offset = _length(buffer, offset, prop, order)
+                lengths[prop.name] = length
+            offset += length * kind.itemsize
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise too_short(element, 0) from None
+    if offset > len(buffer):
+        raise too_short(element, 0)
+    return lengths
+
+
+def _layout(element: Element, order: str, lengths: dict[str, int]) -> np.dtype[np.void]:
+    """Return the record type of a row whose lists have the given lengths; ``#name`` is a list's count."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
+    for prop in element.properties:
+        kind = order + prop.type if order else "f8"
+        if prop.count_type:
+            fields.append((f"#{prop.name}", order + prop.count_type if order else "f8"))
+            fields.append((prop.name, kind, (lengths[prop.name],)))
+        else:
+            fields.append((prop.name, kind))
+    return np.dtype(fields)
+
+
+def _native(values: Values, prop: Property, order: str) -> Values:
+    """Return a column in this machine's byte order; text keeps all digits even where the header says float."""
+    if not order and prop.type.startswith("f"):
+        return values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # text may hold nan where the header declares an integer
+        return values.astype(prop.type)
+
+
+def _indices(values: Values) -> Int:
+    with np.errstate(invalid="ignore"):  # an index that is no number becomes one out of range, refused by Mesh
+        return values.astype(np.int64)
+
+
+def write_ply(mesh: Mesh, path: Path) -> None:
+    """Write binary little-endian PLY: double positions, float normals, all attributes, and int faces if any."""
+    columns = vertex_columns(mesh)
+    vertices = np.empty(len(mesh.vertices), np.dtype([(name, f"<{PLY_TYPES[kind]}") for name, kind, _ in columns]))
+    for name, _, values in columns:
+        vertices[name] = values
+    faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
+    faces["count"] = 3
+    faces["corners"] = mesh.faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines += [f"property {kind} {name}" for name, kind, _ in columns]
+    if len(faces):  # a file without the element is a cloud to every reader
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    lines += ["end_header", ""]
+    with path.open("wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        vertices.tofile(file)
+        faces.tofile(file)
+
+
+PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
+}
+
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+# The header of a PLY file: its encoding, its elements and their properties.
+
+
+@dataclass(frozen=True)
+class Property:
+    """One property of an element: a scalar, or a list with the type of its length (types as numpy names them)."""
+
+    name: str
+    type: str
+    count_type: str | None
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element: `count` rows of the same properties."""
+
+    name: str
+    count: int
+    properties: list[Property] = field(default_factory=list)
+
+
+def parse_header(data: bytes) -> tuple[str, list[Element], int]:
+    """Return the encoding, the elements, and where the rows begin in `data`.
+
+    Raises
+    ------
+    InputError
+        When the header does not begin, end, or read as PLY prescribes.
+    """
+    if not data.startswith(b"ply"):
+        raise InputError("the file does not begin with 'ply', so it is no PLY file.")
+    end = data.find(b"end_header")
+    if end < 0:
+        raise InputError("the PLY header does not end with 'end_header'.")
+    start = data.find(b"\n", end) + 1 or len(data)
+    encoding = ""
+    elements: list[Element] = []
+    for line in data[:end].decode("ascii", errors="replace").splitlines()[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", name, _] if name in ORDERS:
+                encoding = name
+            case ["element", name, count] if count.isdecimal():
+                elements.append(Element(name, int(count)))
+            case ["property", "list", count_type, kind, name] if elements and {count_type, kind} <= PLY_TYPES.keys():
+                elements[-1].properties.append(Property(name, PLY_TYPES[kind], PLY_TYPES[count_type]))
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1].properties.append(Property(name, PLY_TYPES[kind], None))
+            case _:
+                raise InputError(f"the PLY header line {line.strip()[:80]!r} is not understood.")
+    if not encoding:
+        raise InputError("the PLY header has no format line.")
+    return encoding, elements, start
+
+
+def too_short(element: Element, rows: int) -> InputError:
+    """Return the failure of a file that ends within the rows of `element`."""
+    return InputError(f"the header declares {element.count} {element.name} rows, but the file ends after {rows}.")
+
+
+Column = tuple[str, str, Values]
+"""Name, PLY's name of the type, and values of shape (V,)."""
+
+_COLORS = ("red", "green", "blue", "alpha")
+
+_RESERVED = ("x", "y", "z", "nx", "ny", "nz", *_COLORS)
+
+_KINDS = {
+    **{"b1": "uchar", "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
+    **{"f2": "float", "f4": "float", "f8": "double"},
+}
+
+_NARROWER = ("int", np.iinfo(np.int32)), ("uint", np.iinfo(np.uint32))
+
+
+# The columns of a PLY file's vertices: positions, normals, colours by their customary names, and other attributes.
+
+
+def vertex_columns(mesh: Mesh) -> list[Column]:
+    """Return all columns of a mesh; an attribute of several columns becomes NAME_0, NAME_1, and so on."""
+    columns: list[Column] = [(name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")]
+    if mesh.normals is not None:
+        columns += [(f"n{name}", "float", mesh.normals[:, axis]) for axis, name in enumerate("xyz")]
+    if "colors" in mesh.attributes:
+        bytes_ = as_bytes(mesh.attributes["colors"])
+        columns += [(name, "uchar", values) for name, values in zip(_COLORS, bytes_.T, strict=False)]
+    taken = set(_RESERVED)
+    for name, values in mesh.attributes.items():
+        if name != "colors":
+            rows = values.reshape(len(values), -1).T
+            names = [name] if values.ndim == 1 else [f"{name}_{number}" for number in range(len(rows))]
+            columns += [(_free(one, taken), _kind(row), row) for one, row in zip(names, rows, strict=True)]
+    return columns
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Return the name as one ASCII word that no other column has, and add it to those taken."""
+    word = re.sub(r"[^!-~]", "_", name) or "_"
+    while word.lower() in taken:
+        word += "_"
+    taken.add(word.lower())
+    return word
+
+
+def _kind(values: Values) -> str:
+    """PLY's type for a column; 64-bit integers become 32-bit ones where they fit, else doubles."""
+    kind = _KINDS.get(values.dtype.str[1:])
+    if kind is not None:
+        return kind
+    if values.dtype.kind in "iu" and len(values):
+        for name, limits in _NARROWER:
+            if limits.min <= values.min() and values.max() <= limits.max:
+                return name
+    return "double"
+
+
+_HEADER = 1 << 16
+"""Bytes in which a header that names some hundred properties ends."""
+
+
+# Binary PLY by chunks: the vertices of a cloud are records of one size, so that any stretch of them can be read.
+
+
+def ply_chunks(path: Path, rows: int) -> Iterator[Contents]:
+    """Yield the vertices, at most `rows` at a time; files in text, with faces, or with lists are read as a whole.
+
+    Raises
+    ------
+    InputError
+        As `read_ply` does.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEADER)
+        encoding, elements, start = parse_header(head if b"end_header" in head else head + file.read())
+        order = ORDERS[encoding]
+        if not order or not _is_cloud(elements):
+            yield read_ply(path)
+            return
+        vertex = elements[0]
+        layout = np.dtype([(prop.name, order + prop.type) for prop in vertex.properties])
+        held = (path.stat().st_size - start) // max(layout.itemsize, 1)
+        if held < vertex.count:
+            raise too_short(vertex, held)
+        file.seek(start)
+        for first in range(0, vertex.count, rows):
+            table = np.fromfile(file, layout, min(rows, vertex.count - first))
+            yield from_columns({p.name: table[p.name].astype(p.type) for p in vertex.properties})
+
+
+def _is_cloud(elements: list[Element]) -> bool:
+    """Whether the vertices come first, have single values only, and no face follows."""
+    first = elements[0] if elements else Element("", 0)
+    names = [prop.name for prop in first.properties]
+    plain = all(prop.count_type is None for prop in first.properties) and len(set(names)) == len(names)
+    faces = any(element.name == "face" and element.count for element in elements)
+    return first.name == "vertex" and plain and not faces

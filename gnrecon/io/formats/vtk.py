@@ -1,0 +1,310 @@
+"""VTK's legacy format (``# vtk DataFile Version``), data sets of the kind POLYDATA, as text or big-endian binary.
+
+A file is a sequence of sections: a line of words that names a section and its size, then its numbers, in VTK's manual
+"VTK File Formats", up to version 5.1 with its offsets and connectivity. VTK itself weighs 140 MB and ends the process
+on some damaged files, and meshio reads no polydata, so the sections are walked here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+
+from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.io.contents import Contents, fan, no_faces
+from gnrecon.io.parse import numbers
+from gnrecon.runtime.errors import InputError
+
+_TYPES = {
+    **{"unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4"},
+    **{"unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtkidtype": "i4"},
+    **{"vtktypeint64": "i8", "vtktypeuint64": "u8", "vtktypeint32": "i4"},
+}
+"""Names of number types in lower case, as numpy names them; ids are written with 32 bits."""
+
+_CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
+
+
+@dataclass
+class _Data:
+    """What has been read so far."""
+
+    points: Float | None = None
+    faces: list[Int] = field(default_factory=list)
+    arrays: dict[str, Values] = field(default_factory=dict)
+    normals: str | None = None
+    of_points: bool = False
+    count: int = 0
+    unread: list[str] = field(default_factory=list)
+
+
+def read_vtk(path: Path) -> Contents:
+    """Read points with their arrays, and polygons and strips where there are some.
+
+    Raises
+    ------
+    InputError
+        When the file is malformed, ends too early, or holds another kind of data set.
+    """
+    source = _Source(path.read_bytes())
+    data = _Data()
+    while words := source.words():
+        _section(source, words, data)
+    if data.points is None:
+        raise InputError("the file declares no points.")
+    faces = np.concatenate(data.faces) if data.faces else no_faces()
+    return assemble(data.points, faces, data.arrays, data.normals, data.unread)
+
+
+class _Source:
+    """A file's bytes and how far they are read."""
+
+    def __init__(self, data: bytes) -> None:
+        lines = data.split(b"\n", 3)
+        if not data.startswith(b"# vtk DataFile") or len(lines) < 4:
+            raise InputError("the file does not begin as a legacy VTK file does.")
+        kind = lines[2].strip().upper()
+        if kind not in (b"ASCII", b"BINARY"):
+            raise InputError(f"expected ASCII or BINARY, but found {kind[:20].decode('ascii', 'replace')!r}.")
+        self.data, self.binary = data, kind == b"BINARY"
+        self.place = len(data) - len(lines[3])
+
+    def words(self) -> list[str]:
+        """The words of the next line that is not blank; none at the end."""
+        while self.place < len(self.data):
+            end = self.data.find(b"\n", self.place) + 1 or len(self.data)
+            line, self.place = self.data[self.place : end], end
+            if line.strip():
+                return line.decode("ascii", errors="replace").split()
+        return []
+
+    def numbers(self, count: int, kind: str) -> Values:
+        """The next `count` numbers of a VTK type."""
+        if kind.lower() not in _TYPES:
+            raise InputError(f"the number type {kind[:40]!r} is unknown or not read.")
+        dtype = np.dtype(_TYPES[kind.lower()])
+        if self.binary:
+            end = self.place + count * dtype.itemsize
+            if end > len(self.data):
+                raise InputError(f"the file ends within {count} numbers of the type {kind}.")
+            block, self.place = self.data[self.place : end], end
+            return np.frombuffer(block, dtype.newbyteorder(">")).astype(dtype)
+        if count > len(self.data) - self.place:
+            raise InputError(f"the file ends within {count} numbers of the type {kind}.")
+        words = self.data[self.place :].split(None, count)
+        self.place = len(self.data) - (len(words.pop()) if len(words) > count else 0)
+        if len(words) < count:
+            raise InputError(f"the file ends after {len(words)} of {count} numbers of the type {kind}.")
+        found = [word.decode("ascii", errors="replace") for word in words]
+        if dtype.kind in "iu":
+            return np.array([int(word) for word in found], dtype)
+        return numbers(found)
+
+
+def _section(source: _Source, words: list[str], data: _Data) -> None:
+    name = words[0].upper()
+    match name:
+        case "DATASET":
+            if words[1:2] != ["POLYDATA"]:
+                raise InputError(f"the data set is {' '.join(words[1:2]) or 'unnamed'}, but POLYDATA was expected.")
+        case "POINTS":
+            data.points = source.numbers(3 * _count(words, 1), _word(words, 2)).astype(np.float64).reshape(-1, 3)
+        case "POINT_DATA" | "CELL_DATA":
+            data.of_points, data.count = name == "POINT_DATA", _count(words, 1)
+        case "METADATA":
+            _skip_metadata(source)
+        case _ if name in _CELLS:
+            _cells(source, words, data)
+        case "FIELD":
+            _fields(source, words, data)
+        case _:
+            _array(source, words, data)
+
+
+def _count(words: list[str], place: int) -> int:
+    text = _word(words, place)
+    if not text.isdecimal():
+        raise InputError(f"the line {' '.join(words)[:60]!r} holds {text[:20]!r} where a count was expected.")
+    return int(text)
+
+
+def _word(words: list[str], place: int) -> str:
+    if len(words) <= place:
+        raise InputError(f"the line {' '.join(words)[:60]!r} ends too early.")
+    return words[place]
+
+
+def _skip_metadata(source: _Source) -> None:
+    """Names of components and the like follow, up to a blank line."""
+    while source.place < len(source.data):
+        end = source.data.find(b"\n", source.place) + 1 or len(source.data)
+        line, source.place = source.data[source.place : end], end
+        if not line.strip():
+            return
+
+
+def _cells(source: _Source, words: list[str], data: _Data) -> None:
+    """Polygons with their counts in between or, since version 5, with offsets beside them."""
+    rows, size, start = _count(words, 1), _count(words, 2), source.place
+    following = source.words()
+    if following[:1] == ["OFFSETS"]:
+        offsets = source.numbers(rows, _word(following, 1)).astype(np.int64)
+        following = source.words()
+        if following[:1] != ["CONNECTIVITY"]:
+            raise InputError("expected the line CONNECTIVITY behind the offsets.")
+        corners: Int = source.numbers(size, _word(following, 1)).astype(np.int64)
+        counts = split_counts(offsets, corners)
+    else:
+        source.place = start
+        counts, corners = _counted(source.numbers(size, "int").astype(np.int64), rows)
+    name = words[0].upper()
+    if name in ("POLYGONS", "TRIANGLE_STRIPS"):
+        data.faces.append(triangles(counts, corners, strips=name == "TRIANGLE_STRIPS"))
+    elif name == "LINES":
+        data.unread.append("lines")
+
+
+def _counted(values: Int, rows: int) -> tuple[Int, Int]:
+    """Split ``n i0 ... i(n-1)``, repeated `rows` times, into counts and corners."""
+    if rows > len(values):
+        raise InputError("the polygons do not have the size that their section declares.")
+    counts, mask, place = np.zeros(rows, np.int64), np.ones(len(values), bool), 0
+    for row in range(rows):
+        if place >= len(values) or values[place] < 0:
+            raise InputError("the polygons do not have the size that their section declares.")
+        mask[place] = False
+        counts[row] = values[place]
+        place += int(values[place]) + 1
+    if place != len(values):
+        raise InputError("the polygons do not have the size that their section declares.")
+    return counts, values[mask]
+
+
+def _fields(source: _Source, words: list[str], data: _Data) -> None:
+    for _ in range(_count(words, 2)):
+        head = source.words()
+        while head[:1] == ["METADATA"]:
+            _skip_metadata(source)
+            head = source.words()
+        columns, rows = _count(head, 1), _count(head, 2)
+        values = source.numbers(columns * rows, _word(head, 3))
+        _keep(data, _word(head, 0), values, columns)
+
+
+def _array(source: _Source, words: list[str], data: _Data) -> None:
+    """One of the classic attributes of points or of polygons."""
+    name, title = words[0].upper(), _word(words, 1) if len(words) > 1 else ""
+    match name:
+        case "SCALARS":
+            columns = _count(words, 3) if len(words) > 3 else 1
+            start = source.place
+            if source.words()[:1] != ["LOOKUP_TABLE"]:
+                source.place = start
+            _keep(data, title, source.numbers(columns * data.count, _word(words, 2)), columns)
+        case "COLOR_SCALARS":
+            columns = _count(words, 2)
+            values = source.numbers(columns * data.count, "unsigned_char" if source.binary else "float")
+            # Text holds shares of full brightness.
+            shares = values if source.binary else np.rint(255 * np.clip(values.astype(np.float64), 0, 1))
+            _keep(data, title, shares.astype(np.uint8), columns)
+        case "LOOKUP_TABLE":
+            source.numbers(4 * _count(words, 2), "unsigned_char" if source.binary else "float")
+        case "VECTORS" | "NORMALS":
+            _keep(data, title, source.numbers(3 * data.count, _word(words, 2)), 3)
+            data.normals = unquote(title) if name == "NORMALS" and data.of_points else data.normals
+        case "TEXTURE_COORDINATES":
+            source.numbers(_count(words, 2) * data.count, _word(words, 3))
+            data.unread.append("texture coordinates")
+        case "TENSORS":
+            _keep(data, title, source.numbers(9 * data.count, _word(words, 2)), 9)
+        case _:
+            raise InputError(f"the line {' '.join(words)[:60]!r} begins no section that is known.")
+
+
+def _keep(data: _Data, name: str, values: Values, columns: int) -> None:
+    if data.of_points:
+        data.arrays[unquote(name)] = values if columns == 1 else values.reshape(-1, max(columns, 1))
+    elif "values of polygons or of the whole" not in data.unread:
+        data.unread.append("values of polygons or of the whole")
+
+
+# What the two forms of VTK's polydata have in common: names of number types, strips, and what an array means.
+
+
+def assemble(
+    points: Float, faces: Int, arrays: Mapping[str, Values], normals: str | None, unread: list[str]
+) -> Contents:
+    """Return the contents of a data set.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3)
+    faces : integer array of shape (F, 3)
+    arrays : the points' arrays by name, of shape (N,) or (N, C)
+    normals : name of the array that holds the normals, if any; else one called ``Normals`` does
+    unread : what else the file holds
+
+    Raises
+    ------
+    InputError
+        When an array has another number of rows.
+    """
+    attributes = dict(arrays)
+    for name, values in attributes.items():
+        if len(values) != len(points):
+            raise InputError(f"{name!r} has {len(values)} values, but there are {len(points)} points.")
+    chosen = next((name for name in (normals, "Normals") if name in attributes), None)
+    directions = None if chosen is None or attributes[chosen].shape[1:] != (3,) else attributes.pop(chosen)
+    # VTK draws an array of bytes as the colours that it holds.
+    colors = next((name for name, one in attributes.items() if one.dtype == np.uint8 and _is_color(one)), None)
+    if colors is not None:
+        attributes = {"colors": attributes.pop(colors), **attributes}
+    return Contents(
+        points.astype(np.float64),
+        None if directions is None else directions.astype(np.float64),
+        faces,
+        attributes,
+        tuple(unread),
+    )
+
+
+def _is_color(values: Values) -> bool:
+    return values.ndim == 2 and values.shape[1] in (3, 4)
+
+
+def triangles(counts: Int, corners: Int, strips: bool) -> Int:
+    """Return the triangles, of shape (F, 3), of polygons or of triangle strips.
+
+    Parameters
+    ----------
+    counts : integer array of shape (P,), corners of each
+    corners : integer array of shape (counts.sum(),)
+    strips : whether each is a strip, in which every other triangle is turned
+    """
+    if not strips or not len(counts):
+        return fan(counts, corners) if len(counts) else no_faces()
+    starts = np.cumsum(counts) - counts
+    found = []
+    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
+        strip = np.stack([corners[start + k : start + count - 2 + k] for k in range(3)], axis=1)
+        strip[1::2] = strip[1::2, [1, 0, 2]]
+        found.append(strip)
+    return np.concatenate(found)
+
+
+def split_counts(offsets: Int, corners: Int) -> Int:
+    """Return how many corners each polygon has, of shape (P,), from offsets of shape (P + 1,) that begin with 0.
+
+    Raises
+    ------
+    InputError
+        When the offsets do not grow from 0 to the number of corners.
+    """
+    counts = np.diff(offsets)
+    if len(offsets) and (offsets[0] != 0 or offsets[-1] != len(corners) or (counts < 0).any()):
+        raise InputError("the offsets of the polygons do not grow from 0 to the number of their corners.")
+    return counts
