@@ -19,19 +19,18 @@ from gnrecon.runtime.errors import Cancelled, FitError, GnreconError, InputError
 from gnrecon.version import __version__
 
 if TYPE_CHECKING:
+    from gnrecon.export import marching_cubes as extract
     from gnrecon.export import (
-        examine,
-        extract,
         measure,
         project,
         remove_handles,
         remove_stray,
-        render,
         repair,
         require_sound,
         trim,
         verify,
     )
+    from gnrecon.export import verify as examine
     from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
     from gnrecon.ingest import prepare, survey
     from gnrecon.io import (
@@ -48,9 +47,10 @@ if TYPE_CHECKING:
         write_mesh,
     )
     from gnrecon.options import Options
-    from gnrecon.page import write_page
     from gnrecon.pipeline import Progress, Reconstruction, reconstruct
-    from gnrecon.schema import report_schema
+    from gnrecon.rendering import render
+    from gnrecon.report.html import write_page
+    from gnrecon.report.report import report_schema
     from gnrecon.shaping import Shape, shaped
 
 _ROOMS = {
@@ -61,7 +61,6 @@ _ROOMS = {
         "project",
         "remove_handles",
         "remove_stray",
-        "render",
         "repair",
         "require_sound",
         "trim",
@@ -83,9 +82,10 @@ _ROOMS = {
         "write_mesh",
     ),
     "gnrecon.options": ("Options",),
-    "gnrecon.page": ("write_page",),
+    "gnrecon.rendering": ("render",),
+    "gnrecon.report.html": ("write_page",),
     "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
-    "gnrecon.schema": ("report_schema",),
+    "gnrecon.report.report": ("report_schema",),
     "gnrecon.shaping": ("Shape", "shaped"),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}

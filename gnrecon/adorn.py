@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
+from gnrecon.export import Attribute, Neighbourhood, curvatures
+from gnrecon.export import attributes as carry
+from gnrecon.export import curvature as sparsely
 from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh

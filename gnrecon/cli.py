@@ -664,7 +664,7 @@ def doctor_command() -> None:
 @app.command("schema")
 def schema_command() -> None:
     """Print the JSON schema of the report: every field with its meaning and unit."""
-    from gnrecon.schema import schema_text
+    from gnrecon.report.report import schema_text
 
     print(schema_text(), end="")
 

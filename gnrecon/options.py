@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.export import RefineOptions
-from gnrecon.export.fineness import LEAST_CELLS, cells_for_edges
+from gnrecon.export.resolution import LEAST_CELLS, cells_for_edges
 from gnrecon.fit.blocks.solve import LARGE
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float

@@ -24,15 +24,16 @@ from gnrecon.export import (
     Metrics,
     Neighbourhood,
     Trimming,
-    invented,
     measure,
-    quality,
     require_bordered,
     require_sound,
     trim,
     verify_file,
     vertex_error,
 )
+from gnrecon.export import mesh_statistics as quality
+from gnrecon.export import trim as invented
+from gnrecon.export.mesh_field import fine_enough, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
@@ -50,14 +51,12 @@ from gnrecon.io import (
     to_trimesh,
     write_mesh,
 )
-from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
-from gnrecon.report import Stages, plain, versions
+from gnrecon.report.report import SCHEMA_VERSION, Stages, plain, versions
 from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.runtime.logs import TOLD
 from gnrecon.runtime.parallel import having_threads
-from gnrecon.schema import SCHEMA_VERSION
 from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)

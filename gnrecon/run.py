@@ -12,12 +12,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gnrecon.export import render, render_sheet
 from gnrecon.io import all_members, check_writable, written_origin
 from gnrecon.optim import Record
-from gnrecon.page import page_text
 from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
+from gnrecon.rendering import render, render_sheet
+from gnrecon.report.html import page_text
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
 from gnrecon.runtime.logs import logged

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.export.cut import crop, subtract
-from gnrecon.export.nearest import nearest_on_surface
+from gnrecon.export.boolean import crop, subtract
+from gnrecon.export.mesh_field import StageTimer, mesh_field, untimed
+from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.meshing import StageTimer, mesh_field, untimed
 from gnrecon.options import Options
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.progress import Advance, unheard
@@ -78,7 +78,7 @@ def shaped(
         The resolution is that of the crop where there is one, else of the field's box.
     shape : Shape
     stages, advance : callables
-        Of `gnrecon.meshing.mesh_field`; the further stages are ``offset`` and ``cut``.
+        Of `gnrecon.export.mesh_field.mesh_field`; the further stages are ``offset`` and ``cut``.
 
     Returns
     -------

@@ -35,7 +35,7 @@ from benchmarks.samples_apart import between_samples
 from benchmarks.trial import Job, run_trial
 
 from gnrecon.export import require_sound, verify
-from gnrecon.export.nearest import Surface
+from gnrecon.export.metrics import Surface
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import UsageError

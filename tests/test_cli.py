@@ -341,9 +341,9 @@ def test_a_kill_leaves_nothing_under_the_targets_name(out: Path, scan: Path, pla
 
 
 TORN_BY_REPAIR = """
-import gnrecon.meshing
+import gnrecon.export.mesh_field
 from gnrecon.geometry.mesh import Mesh
-gnrecon.meshing.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
+gnrecon.export.mesh_field.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
 """
 TORN_BY_WRITING = """
 import gnrecon.io.format_registry

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gnrecon.estimate import Estimate, estimate
 from gnrecon.options import Options
+from gnrecon.report.estimate import Estimate, estimate
 
 BOX = np.array([[0.0, 0, 0], [1.0, 1, 1]])
 

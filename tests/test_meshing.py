@@ -15,11 +15,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent / "export"))
 
 from analytic_fields import UTM, Field, torus
 
-from gnrecon import meshing
 from gnrecon.export import SignedDistance
-from gnrecon.export.fineness import chord_error
+from gnrecon.export import mesh_field as meshing
+from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.resolution import chord_error
 from gnrecon.ingest.noise import neighbour_spacing
-from gnrecon.meshing import fine_enough, mesh_field
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError

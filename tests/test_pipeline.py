@@ -19,8 +19,8 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.report.report import SCHEMA_VERSION
 from gnrecon.runtime.errors import InputError, MemoryLimitError, MeshError, UsageError
-from gnrecon.schema import SCHEMA_VERSION
 
 RADIUS = 1 + TUBE
 # Enough to reach every stage, where the mesh itself does not matter.
@@ -313,6 +313,6 @@ def test_an_unsound_mesh_is_neither_returned_nor_saved(
     with pytest.raises(MeshError, match="open: 3 edges"):
         replace(result, mesh=torn(result.mesh)[0]).save(tmp_path / "mesh.ply")
     assert not list(tmp_path.iterdir())
-    monkeypatch.setattr("gnrecon.meshing.repair", torn)
+    monkeypatch.setattr("gnrecon.export.mesh_field.repair", torn)
     with pytest.raises(MeshError, match="open: 3 edges"):
         reconstruct(*scan, **TINY)

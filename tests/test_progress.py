@@ -17,10 +17,10 @@ from gnrecon.cli import main
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
+from gnrecon.report.report import report_schema
 from gnrecon.run import STAGES, Shown
 from gnrecon.runtime.errors import Cancelled, ExitCode
 from gnrecon.runtime.progress import part
-from gnrecon.schema import report_schema
 
 SMALL: dict[str, Any] = {"widths": (100,), "steps": 2, "resolution": 32}
 SMALLEST = ("--widths", "80", "--steps", "0", "--resolution", "24")

@@ -11,7 +11,7 @@ import pytest
 import torch
 from held_memory import resident, use
 
-from gnrecon.report import Stages, plain
+from gnrecon.report.report import Stages, plain
 
 
 def ignored(name: str) -> None:

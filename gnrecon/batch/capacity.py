@@ -11,8 +11,8 @@ import numpy as np
 import psutil
 
 from gnrecon.batch.job import Job
-from gnrecon.estimate import estimate
 from gnrecon.options import Options
+from gnrecon.report.estimate import estimate
 
 _CGROUP = Path("/sys/fs/cgroup")
 _UNKNOWN_MB = 2000.0

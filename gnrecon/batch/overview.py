@@ -14,7 +14,8 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from gnrecon.batch.outcome import FILES, Cause
-from gnrecon.page import numbers, style_text
+from gnrecon.report.html import style_text
+from gnrecon.report.report.html import scales as numbers
 
 COLORS = 64
 """Of a thumbnail on the page."""

@@ -6,7 +6,7 @@ import json
 import math
 from pathlib import Path
 
-from gnrecon.export import examine
+from gnrecon.export import verify as examine
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode, MeshError
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gnrecon.estimate import estimate
 from gnrecon.fit import bounds_of
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare, survey
 from gnrecon.io import Reading
 from gnrecon.options import Options
 from gnrecon.pipeline import described, read_source
+from gnrecon.report.estimate import estimate
 from gnrecon.runtime.errors import ExitCode, InputError
 
 _NORMALS = {

@@ -19,7 +19,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import all_members, check_writable, write_mesh
 from gnrecon.pipeline import limited
-from gnrecon.report import plain, versions
+from gnrecon.report.report import plain, versions
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
 from gnrecon.shapes import (

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.design import Design, read_design
-from gnrecon.export import curvatures, extract, project, remove_stray, repair
+from gnrecon.export import curvatures, project, remove_stray, repair
+from gnrecon.export import marching_cubes as extract
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import InputError, UsageError

@@ -14,7 +14,7 @@ import numpy as np
 
 from gnrecon.design.interfaces import Interfaces
 from gnrecon.design.region import DesignRegion
-from gnrecon.export.solid import from_solid, to_solid
+from gnrecon.export.boolean import from_solid, to_solid
 from gnrecon.export.verify import failures, verify
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame

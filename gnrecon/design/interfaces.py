@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gnrecon.export.mesh_statistics import face_components, submesh
 from gnrecon.export.metrics import sample_surface
-from gnrecon.export.topology import face_components, submesh
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 

@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from gnrecon.design.design import Design
-from gnrecon.export.metrics import sample_surface
-from gnrecon.export.nearest import nearest_on_surface
-from gnrecon.export.topology import face_components, submesh
+from gnrecon.export.mesh_statistics import face_components, submesh
+from gnrecon.export.metrics import nearest_on_surface, sample_surface
 from gnrecon.geometry.mesh import Mesh
 
 TOLERANCE = 1e-3

@@ -6,8 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gnrecon.export.metrics import sample_surface
-from gnrecon.export.nearest import Surface
+from gnrecon.export.metrics import Surface, sample_surface
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.signed_distance import Box

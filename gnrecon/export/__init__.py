@@ -1,32 +1,19 @@
 """From a field to a verified mesh: extract, project, refine, repair, cut, verify, measure, draw, and attributes."""
 
-from gnrecon.export.ambient import vertex_sky
-from gnrecon.export.attribute import Attribute
-from gnrecon.export.carry import carry
-from gnrecon.export.curvature import curvatures
-from gnrecon.export.decimate import decimate, simplify
-from gnrecon.export.definitions import DISTANCES, Metrics
-from gnrecon.export.error import vertex_error
-from gnrecon.export.examine import Findings, examine
-from gnrecon.export.extract import extract
+from gnrecon.export.attributes import Attribute, Neighbourhood, carry
+from gnrecon.export.curvature import curvatures, sparsely
 from gnrecon.export.handles import remove_handles
-from gnrecon.export.invented import Invented, invented
-from gnrecon.export.lighten import lighten
-from gnrecon.export.metrics import measure
-from gnrecon.export.neighbours import Neighbourhood
-from gnrecon.export.picture import render
-from gnrecon.export.project import project
-from gnrecon.export.protocol import SignedDistance
-from gnrecon.export.quality import MeshQuality, quality
-from gnrecon.export.refine import RefineOptions, refine
-from gnrecon.export.remesh import remesh
-from gnrecon.export.repair import repair
-from gnrecon.export.sharpen import sharpen
-from gnrecon.export.sheet import render_sheet
-from gnrecon.export.sparsely import sparsely
-from gnrecon.export.stray import drop_stray, remove_stray
-from gnrecon.export.trim import Trimming, trim
-from gnrecon.export.verify import MeshFacts, require_bordered, require_sound, verify, verify_file
+from gnrecon.export.marching_cubes import extract
+from gnrecon.export.mesh_statistics import MeshQuality, quality
+from gnrecon.export.metrics import DISTANCES, Metrics, measure, vertex_error
+from gnrecon.export.project import SignedDistance, project
+from gnrecon.export.remeshing.decimate import decimate, lighten, simplify
+from gnrecon.export.remeshing.refine import RefineOptions, refine
+from gnrecon.export.remeshing.remesh import remesh
+from gnrecon.export.remeshing.sharpen import sharpen
+from gnrecon.export.repair import drop_stray, remove_stray, repair
+from gnrecon.export.trim import Invented, Trimming, invented, trim
+from gnrecon.export.verify import Findings, MeshFacts, examine, require_bordered, require_sound, verify, verify_file
 
 __all__ = [
     "DISTANCES",
@@ -55,8 +42,6 @@ __all__ = [
     "remesh",
     "remove_handles",
     "remove_stray",
-    "render",
-    "render_sheet",
     "repair",
     "require_bordered",
     "require_sound",
@@ -67,5 +52,4 @@ __all__ = [
     "verify",
     "verify_file",
     "vertex_error",
-    "vertex_sky",
 ]

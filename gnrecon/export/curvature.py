@@ -13,9 +13,16 @@ Source: Goldman, Curvature formulas for implicit curves and surfaces, Computer A
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import LinearOperator, cg
+from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.mesh import Mesh
 
 
 def curvatures(gradient: Float, hessian: Float) -> tuple[Float, Float]:
@@ -39,3 +46,94 @@ def curvatures(gradient: Float, hessian: Float) -> tuple[Float, Float]:
     np.divide(length**2 * spread - bend, 2 * length**3, out=mean, where=defined)
     np.divide(twist, length**4, out=gauss, where=defined)
     return mean, gauss
+
+
+TOLERANCE, MOST_STEPS = 1e-6, 500
+"""Of conjugate gradients: relative residual, and most steps."""
+
+
+# Smooth values over a surface by diffusion.
+#
+# One implicit step of the heat equation, (M + t L) u = M u_0, with the cotangent Laplacian L and the vertices' areas M.
+# Unlike means over neighbours it does not depend on how the surface is cut into triangles: on a plane it leaves linear
+# values as they are. A step of t averages over about a Gaussian with the variance 2 t along each direction.
+#
+# Source: Desbrun, Meyer, Schroeder and Barr, Implicit fairing of irregular meshes (SIGGRAPH 1999).
+
+
+def diffused(mesh: Mesh, values: Float, width: float) -> Float:
+    """Return values, of shape (V,), averaged over a width, in units of the vertices, along the surface."""
+    areas = vertex_areas(mesh)
+    # A vertex without area would be tied to nothing.
+    mass = np.maximum(areas, 1e-9 * areas.mean())
+    matrix = diags_array(mass) + 0.5 * width**2 * _cotangent_laplacian(mesh)
+    scale = 1 / matrix.diagonal()
+    scaling: Any = LinearOperator(matrix.shape, matvec=lambda residual: scale * residual.reshape(-1))
+    smooth = cg(matrix, mass * values, x0=values, rtol=TOLERANCE, maxiter=MOST_STEPS, M=scaling)[0]
+    return np.asarray(smooth, dtype=np.float64)
+
+
+def vertex_areas(mesh: Mesh) -> Float:
+    """A third of the area of the faces around each vertex, of shape (V,)."""
+    shares = np.repeat(np.linalg.norm(mesh.face_vectors, axis=1) / 3, 3)
+    return np.asarray(np.bincount(mesh.faces.reshape(-1), shares, minlength=len(mesh.vertices)))
+
+
+def _cotangent_laplacian(mesh: Mesh) -> Any:
+    """The positive semidefinite matrix, of shape (V, V), whose quadratic form is the Dirichlet energy."""
+    rows, columns, weights = [], [], []
+    corners = mesh.corners
+    double_areas = 2 * np.linalg.norm(mesh.face_vectors, axis=1)
+    for corner in range(3):
+        one, other = (corner + 1) % 3, (corner + 2) % 3
+        product = np.einsum("ij,ij->i", corners[:, one] - corners[:, corner], corners[:, other] - corners[:, corner])
+        # Half the cotangent of the angle at this corner belongs to the edge that faces it; collapsed faces to none.
+        half = np.divide(product, 2 * double_areas, out=np.zeros_like(product), where=double_areas > 0)
+        i, j = mesh.faces[:, one], mesh.faces[:, other]
+        rows += [i, j, i, j]
+        columns += [j, i, i, j]
+        weights += [-half, -half, half, half]
+    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    size = len(mesh.vertices)
+    return coo_array(entries, shape=(size, size)).tocsr()
+
+
+MOST = 20_000
+"""Vertices at which the quantity is computed."""
+
+NEAREST = 4
+
+TURN = 4.0
+"""Normals a radian apart are as far from each other as so many spacings of the chosen vertices."""
+
+
+# A costly quantity that varies smoothly over a surface, computed at some vertices and interpolated at the others.
+#
+# Near means near in position and in normal, so that the two sides of a thin sheet do not mix. Interpolation is the
+# inverse-distance mean of the four nearest, of logarithms, because the quantity is positive and may span decades.
+# Source: Shepard, A two-dimensional interpolation function for irregularly-spaced data (1968).
+
+
+def sparsely(quantity: Callable[[Float], Float], mesh: Mesh, most: int = MOST, seed: int = 0) -> Float:
+    """Return a positive quantity at all vertices of a mesh, of shape (V,).
+
+    Parameters
+    ----------
+    quantity : function of points, of shape (N, 3), to positive values, of shape (N,)
+    mesh : Mesh
+    most : int
+        Vertices at which it is called; all where the mesh has no more.
+    seed : int
+        Of their choice.
+    """
+    if len(mesh.vertices) <= most:
+        return quantity(mesh.vertices)
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(mesh.vertices))[:most])
+    known = np.log(np.maximum(quantity(mesh.vertices[chosen]), np.finfo(np.float64).tiny))
+    centred = mesh.vertices - mesh.vertices.mean(axis=0)
+    spacing = np.median(cKDTree(centred[chosen]).query(centred[chosen], 2)[0][:, 1])
+    places = np.concatenate([centred, TURN * spacing * mesh.vertex_normals()], axis=1)
+    distances, near = cKDTree(places[chosen]).query(places, NEAREST)
+    weights = 1 / np.maximum(distances, 1e-6 * max(spacing, np.finfo(np.float64).tiny)) ** 2
+    values: Float = np.exp((weights * known[near]).sum(axis=1) / weights.sum(axis=1))
+    return values

@@ -25,8 +25,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from gnrecon.export.loops import Loop, short_loops
-from gnrecon.export.topology import Edges, corner_fans
+from gnrecon.export.cycles import Loop, short_loops
+from gnrecon.export.mesh_statistics import Edges, corner_fans
 from gnrecon.export.verify import require_sound
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh

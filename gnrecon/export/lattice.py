@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export.protocol import SignedDistance, knows_blocks, sdf_around
+from gnrecon.export.project import SignedDistance, knows_blocks, sdf_around
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.parallel import slices

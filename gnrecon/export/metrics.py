@@ -7,17 +7,18 @@ back goes to its nearest point, which on average cannot be smaller than a share 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.export.definitions import Metrics
-from gnrecon.export.nearest import nearest_on_surface
-from gnrecon.geometry.arrays import Float
+from gnrecon.export.boolean import centre_and_size
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import Advance, unheard
 
 F_SCORE_SHARE = 0.005
@@ -164,3 +165,184 @@ def _summary(there: _Gap, back: _Gap, radius: float, samples: int, is_cloud: boo
         samples=samples,
         reference_is_cloud=is_cloud,
     )
+
+
+# The numbers that say how far two surfaces lie apart, each with its definition.
+#
+# The definitions are printed with the numbers, because the literature calls several of them "Chamfer": the mean or the
+# root mean square, one way or both, squared or not.
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Distances between a mesh and its reference, in file units unless said otherwise.
+
+    Parameters
+    ----------
+    reference_to_mesh_mean, mesh_to_reference_mean : float
+        Mean distance of the samples of one surface to the other surface.
+    chamfer_mean : float
+        Half the sum of the two means.
+    reference_to_mesh_rms, mesh_to_reference_rms : float
+        Root mean square distances.
+    chamfer_rms_paper : float
+        CD_1 of the paper's appendix "Chamfer Divergence": the root mean square distance from the reference to the mesh.
+    hausdorff : float
+        Largest distance of any sample to the other surface, both ways.
+    normal_consistency : float or None
+        Mean absolute cosine between a sample's normal and that of the nearest face, mean of both ways; None where the
+        reference has neither faces nor normals.
+    precision, recall, f_score : float
+        Share of the mesh's samples within `threshold` of the reference, of the reference's within it of the mesh, and
+        their harmonic mean.
+    threshold : float
+        Of the F-score.
+    radius : float
+        Largest distance of the reference's vertices from their mean, or the scale that was given instead.
+    samples : int
+        Samples on each surface that has faces.
+    reference_is_cloud : bool
+        Whether the reference has no faces, so that it is represented by its points.
+    """
+
+    reference_to_mesh_mean: float
+    mesh_to_reference_mean: float
+    chamfer_mean: float
+    reference_to_mesh_rms: float
+    mesh_to_reference_rms: float
+    chamfer_rms_paper: float
+    hausdorff: float
+    normal_consistency: float | None
+    precision: float
+    recall: float
+    f_score: float
+    threshold: float
+    radius: float
+    samples: int
+    reference_is_cloud: bool
+
+    def as_dict(self) -> dict[str, object]:
+        """All numbers by name, with the distances relative to the radius under ``relative``; ready for JSON."""
+        return {**asdict(self), "relative": {name: getattr(self, name) / self.radius for name in DISTANCES}}
+
+    def describe(self) -> list[str]:
+        """One line a number: its value, the value relative to the radius, and its definition."""
+        target = "nearest point" if self.reference_is_cloud else "surface"
+        lines = [
+            f"{name:24}{getattr(self, name):12.6g}{getattr(self, name) / self.radius:12.4e} of the radius  "
+            f"{meaning.format(target=target)}"
+            for name, meaning in DISTANCES.items()
+        ]
+        if self.normal_consistency is not None:
+            meaning = "mean |cosine| of a sample's normal and the nearest one's, mean of both ways"
+            lines.append(f"{'normal_consistency':24}{self.normal_consistency:12.6g}{'':26}{meaning}")
+        meaning = f"harmonic mean of precision {self.precision:.4g} and recall {self.recall:.4g}"
+        lines.append(f"{'f_score':24}{self.f_score:12.6g}{'':26}{meaning} within {self.threshold:.4g}")
+        lines.append(f"{'radius':24}{self.radius:12.6g}{'':26}largest distance of a reference vertex from their mean")
+        return lines
+
+
+DISTANCES = {
+    "reference_to_mesh_mean": "mean distance of the reference's samples to the mesh",
+    "mesh_to_reference_mean": "mean distance of the mesh's samples to the reference's {target}",
+    "chamfer_mean": "half the sum of the two means",
+    "reference_to_mesh_rms": "root mean square distance of the reference's samples to the mesh",
+    "mesh_to_reference_rms": "root mean square distance of the mesh's samples to the reference's {target}",
+    "chamfer_rms_paper": "the paper's Chamfer divergence CD_1: the reference's root mean square distance to the mesh",
+    "hausdorff": "largest of all distances, both ways",
+}
+
+
+# The error map: how far each vertex of a mesh lies from the reference, and on which side.
+#
+# The sign is told by the mesh's own normal n at the vertex p with foot q on the reference: it is that of (p - q) . n.
+# So it is positive where the mesh lies outside of the reference, whichever way the reference's faces look, whether it
+# is closed or not, and for references that are points.
+
+
+def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:
+    """Return the signed distance of each vertex to the nearest place of the reference, of shape (V,), in file units.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    reference : Mesh or PointCloud
+        In the same frame and units; a cloud is represented by its points, so that the distance to it is at least a
+        share of its spacing.
+    """
+    if isinstance(reference, Mesh):
+        feet = Surface(reference).nearest(mesh.vertices)[0]
+    else:
+        feet = reference.points[cKDTree(reference.points).query(mesh.vertices)[1]]
+    away = mesh.vertices - feet
+    outside = np.einsum("ij,ij->i", away, mesh.vertex_normals()) >= 0
+    signed: Float = np.linalg.norm(away, axis=1) * np.where(outside, 1.0, -1.0)
+    return signed
+
+
+RAYS = 5
+"""Rays that vote on whether a point lies inside: one alone may graze an edge and count it twice, or not at all."""
+
+
+# The nearest points of a surface, found by open3d's ray-casting tree, and which points lie inside of it.
+#
+# The tree works in float32. Positions are therefore centred and scaled to one first, and the foot point is computed
+# again in float64 from the nearest triangle and its barycentric coordinates: a rounding of 1e-7 then shifts the foot
+# along the triangle only, and changes the distance to second order.
+
+
+def ray_scene(vertices: Float, faces: Int) -> Any:
+    """open3d's tree over triangles, whose vertices of shape (V, 3) should be about one in size."""
+    import open3d
+
+    scene: Any = open3d.t.geometry.RaycastingScene()
+    tensor = open3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
+    return scene
+
+
+class Surface:
+    """A mesh with faces, ready for many queries.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    batch : int
+        Most points that the tree is asked for at once.
+    """
+
+    def __init__(self, mesh: Mesh, batch: int = 1_000_000) -> None:
+        self._centre, self._size = centre_and_size(mesh)
+        self._scene = ray_scene((mesh.vertices - self._centre) / self._size, mesh.faces)
+        self._corners, self._batch = mesh.corners, batch
+
+    def nearest(self, points: Float) -> tuple[Float, Int]:
+        """Return the nearest points of the surface, of shape (N, 3), and their faces, for points of shape (N, 3)."""
+        feet = np.empty((len(points), 3))
+        faces = np.empty(len(points), dtype=np.int64)
+        for rows in slices(len(points), self._batch):
+            answer = self._scene.compute_closest_points(self._queries(points[rows]))
+            faces[rows] = answer["primitive_ids"].numpy()
+            u, v = np.moveaxis(answer["primitive_uvs"].numpy().astype(np.float64), 1, 0)
+            weights = np.stack([1 - u - v, u, v], axis=1)
+            feet[rows] = np.einsum("ij,ijk->ik", weights, self._corners[faces[rows]])
+        return feet, faces
+
+    def inside(self, points: Float) -> Mask:
+        """Return which points, of shape (N, 3), a closed surface encloses, to about 1e-7 of its size."""
+        inside = np.empty(len(points), dtype=bool)
+        for rows in slices(len(points), self._batch):
+            answer = self._scene.compute_occupancy(self._queries(points[rows]), nsamples=RAYS)
+            inside[rows] = answer.numpy() > 0
+        return inside
+
+    def _queries(self, points: Float) -> Any:
+        from open3d import core
+
+        return core.Tensor.from_numpy(((points - self._centre) / self._size).astype(np.float32))
+
+
+def nearest_on_surface(mesh: Mesh, points: Float, batch: int = 1_000_000) -> tuple[Float, Int]:
+    """Distance to a surface, in its units, and the nearest face, for points of shape (N, 3)."""
+    feet, faces = Surface(mesh, batch).nearest(points)
+    return np.linalg.norm(points - feet, axis=1), faces

@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from gnrecon.export.nearest import Surface
-from gnrecon.export.solid import centre_and_size
+from gnrecon.export.boolean import centre_and_size
+from gnrecon.export.metrics import Surface
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame

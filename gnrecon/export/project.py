@@ -8,12 +8,14 @@ faces that have turned over or collapsed go back, until none is left.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export.protocol import SignedDistance, sdf_and_gradient
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh, area_vectors
+from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import Advance, unheard
@@ -166,3 +168,66 @@ def _spoilt(old: Float, new: Float) -> Mask:
     along = np.einsum("ij,ij->i", old, new)
     before, after = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return np.asarray((along < TURN * after * before) | (after < COLLAPSE * before))
+
+
+# What the exporter needs to know of a field: a signed distance with its gradient, in the file's coordinates.
+
+
+class SignedDistance(Protocol):
+    """A scalar field whose zero level is the surface; a fitted network, or any function with these four members."""
+
+    @property
+    def frame(self) -> Frame:
+        """The similarity between file coordinates and the unit ball around the shape."""
+        ...
+
+    @property
+    def bounds(self) -> Float:
+        """Lower and upper corner, of shape (2, 3) and in file units, of the box within which the field is trusted."""
+        ...
+
+    def sdf(self, points: Float) -> Float:
+        """Signed distance in file units, of shape (N,), negative inside, at file coordinates of shape (N, 3)."""
+        ...
+
+    def gradient(self, points: Float) -> Float:
+        """Gradient of the distance, of shape (N, 3) and without unit, at file coordinates of shape (N, 3)."""
+        ...
+
+
+def sdf_and_gradient(field: SignedDistance, points: Float) -> tuple[Float, Float]:
+    """Return the distance, of shape (N,), and its gradient, of shape (N, 3), at points, of shape (N, 3).
+
+    A field that can make both at once, by a method of this name, does: it costs about half.
+    """
+    both = getattr(field, "sdf_and_gradient", None)
+    if both is None:
+        return field.sdf(points), field.gradient(points)
+    value, gradient = both(points)
+    return value, gradient
+
+
+def knows_blocks(field: SignedDistance) -> bool:
+    """Return whether a field makes distances around centres faster than one by one, by a method ``sdf_around``."""
+    return hasattr(field, "sdf_around")
+
+
+def sdf_around(field: SignedDistance, centers: Float, offsets: Float) -> Float:
+    """Return the distance, of shape (N, K), at K offsets, of shape (K, 3), from each of the centres, of shape (N, 3).
+
+    A field that knows blocks, see `knows_blocks`, is asked for them.
+    """
+    around = getattr(field, "sdf_around", None)
+    if around is None:
+        return field.sdf((centers[:, None] + offsets).reshape(-1, 3)).reshape(len(centers), len(offsets))
+    values: Float = around(centers, offsets)
+    return values
+
+
+# Where a mesh of vertices on a surface is farthest from it: at the centres of its faces and the midpoints of edges.
+
+
+def between(corners: Float) -> Float:
+    """Return the centres and then the sides' midpoints, of shape (4 F, 3), of faces given by corners of (F, 3, 3)."""
+    midpoints = (corners + np.roll(corners, -1, axis=1)) / 2
+    return np.concatenate([corners.mean(axis=1), midpoints.reshape(-1, 3)])

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.export.solid import refusal, to_solid
-from gnrecon.export.topology import Edges, face_components, split_vertices
+from gnrecon.export.boolean import refusal, to_meshlab, to_solid
+from gnrecon.export.mesh_statistics import Edges, face_components, split_vertices
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
@@ -166,3 +166,152 @@ def failures(facts: MeshFacts, bordered: bool = False) -> list[str]:
         (solid and facts.volume <= 0, f"is inside out: its volume is {facts.volume:.6g}"),
     )
     return [sentence for failed, sentence in sentences if failed]
+
+
+ROUNDING = 4 * np.finfo(np.float64).eps
+"""A face is flat when its height is not more than this share of the largest coordinate."""
+
+
+# A close look at any mesh: whether it bounds a solid, and all that is unusual about it; nothing is changed.
+#
+# What a closed, oriented 2-manifold must have is counted by `verify`. Beside it stands what does no harm to that but to
+# some uses: faces that pass through each other, lie on each other or have no area, vertices that lie on each other or
+# that no face uses.
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found in a mesh.
+
+    Parameters
+    ----------
+    facts : MeshFacts
+    failures : tuple of str
+        All that keeps it from bounding a solid, as ends of a sentence that begins with "The mesh"; empty if it does.
+    broken_vertices : int
+        With coordinates that are not finite.
+    unused_vertices : int
+        That no face names.
+    coincident_vertices : int
+        At exactly the place of an earlier one.
+    repeated_faces : int
+        With the same three vertices as an earlier one, in whatever order.
+    flat_faces : int
+        Of three different vertices whose triangle has no area beyond rounding.
+    self_intersecting_faces : int or None
+        That pass through another face; None where vertices are not finite.
+    """
+
+    facts: MeshFacts
+    failures: tuple[str, ...]
+    broken_vertices: int
+    unused_vertices: int
+    coincident_vertices: int
+    repeated_faces: int
+    flat_faces: int
+    self_intersecting_faces: int | None
+
+    @property
+    def sound(self) -> bool:
+        """Whether the mesh is a non-empty, closed, oriented 2-manifold around a positive volume."""
+        return not self.failures
+
+    def as_dict(self) -> dict[str, object]:
+        """All findings by name, ready for JSON."""
+        counts = {name: getattr(self, name) for name in _COUNTS}
+        return {"sound": self.sound, "failures": list(self.failures), **self.facts.as_dict(), **counts}
+
+    def describe(self) -> list[str]:
+        """One line for each finding: its name, its value, and what it means."""
+        values = self.as_dict()
+        return [
+            f"{name:24}{_shown(values[name]):>14}  {meaning}".rstrip()
+            for name, meaning in {"sound": _SOUND, **_FACTS, **_COUNTS}.items()
+        ]
+
+
+def examine(mesh: Mesh) -> Findings:
+    """Look at a mesh closely; nothing is required of it."""
+    broken = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    with np.errstate(invalid="ignore", over="ignore"):
+        facts = verify(mesh)
+        flat = _flat_faces(mesh)
+    failed = failures(facts)
+    if broken:
+        failed = [f"has {broken} vertices that are not finite", *failed]
+    if not failed and (error := refusal(to_solid(mesh, merge=False))):
+        failed = [f"is refused by manifold3d ({error})"]
+    return Findings(
+        facts=facts,
+        failures=tuple(failed),
+        broken_vertices=broken,
+        unused_vertices=len(mesh.vertices) - facts.vertices,
+        coincident_vertices=len(mesh.vertices) - len(np.unique(mesh.vertices, axis=0)),
+        repeated_faces=facts.faces - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)),
+        flat_faces=flat,
+        self_intersecting_faces=None if broken else self_intersecting_faces(mesh),
+    )
+
+
+def self_intersecting_faces(mesh: Mesh) -> int:
+    """Count the faces that pass through another one, by pymeshlab; neighbours that share a vertex do not count.
+
+    Coordinates must be finite. Time grows with the number of faces: about 3 s for a million.
+    """
+    proper = mesh.faces[~_names_twice(mesh)]
+    if not len(proper):
+        return 0
+    work = to_meshlab(Mesh(mesh.vertices, proper))
+    work.compute_selection_by_self_intersections_per_face()
+    return int(work.current_mesh().selected_face_number())
+
+
+def _names_twice(mesh: Mesh) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which faces name a vertex twice, of shape (F,)."""
+    return np.asarray((mesh.faces == np.roll(mesh.faces, 1, axis=1)).any(axis=1))
+
+
+def _flat_faces(mesh: Mesh) -> int:
+    corners = mesh.corners
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
+    heights = 2 * np.linalg.norm(mesh.face_vectors, axis=1)
+    largest = np.abs(mesh.vertices).max(initial=0.0)
+    return int(((heights <= ROUNDING * largest * sides) & ~_names_twice(mesh)).sum())
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+_SOUND = "non-empty, closed, oriented 2-manifold around a positive volume"
+
+_FACTS = {
+    "vertices": "that faces use",
+    "faces": "",
+    "components": "parts that share no vertex",
+    "genus": "handles of all components together",
+    "euler_characteristic": "vertices - edges + faces",
+    "area": "in squared units of the file",
+    "volume": "in cubed units of the file; positive when the faces look outward",
+    "closed": "no edge has a single face",
+    "manifold": "no edge has more than two faces, no vertex several fans of them, no face a vertex twice",
+    "oriented": "the two faces of each edge walk it in opposite directions",
+    "boundary_edges": "with one face",
+    "crowded_edges": "with more than two faces",
+    "turned_edges": "that both faces walk the same way",
+    "split_vertices": "where several fans of faces touch",
+    "degenerate_faces": "that name a vertex twice",
+}
+
+_COUNTS = {
+    "repeated_faces": "with the three vertices of an earlier one",
+    "flat_faces": "of three different vertices, without area",
+    "self_intersecting_faces": "that pass through another face",
+    "unused_vertices": "that no face names",
+    "coincident_vertices": "at the place of an earlier one",
+    "broken_vertices": "with coordinates that are not finite",
+}

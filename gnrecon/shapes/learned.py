@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.export import extract, project
-from gnrecon.export.clip import clip
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export import project
+from gnrecon.export.trim import clip
 from gnrecon.field import Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh

@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from gnrecon.report import versions
+from gnrecon.report.report import versions
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

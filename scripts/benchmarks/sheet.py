@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gnrecon.export import render
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.rendering import render
 from gnrecon.runtime.errors import GnreconError
 from gnrecon.runtime.files import atomic_write
 

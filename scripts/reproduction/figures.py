@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from benchmarks.sheet import PANEL, Row, draw_row, write_sheet
 
-from gnrecon.export import render
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh
+from gnrecon.rendering import render
 from reproduction.experiments import Experiment
 
 NAMES = {"gn": "Gauss-Newton", "lbfgs": "L-BFGS", "adam": "Adam"}

@@ -28,8 +28,8 @@ from gnrecon.batch.request import Request
 from gnrecon.batch.runner import run_batch
 from gnrecon.cli import main
 from gnrecon.export import verify_file
+from gnrecon.report.report import report_schema
 from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
-from gnrecon.schema import report_schema
 from gnrecon.settings import Settings, read_settings
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}

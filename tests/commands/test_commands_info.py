@@ -11,7 +11,7 @@ import pytest
 from scan_files import sphere, write_scan
 
 from gnrecon.cli import main
-from gnrecon.schema import report_schema
+from gnrecon.report.report import report_schema
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: object) -> str:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gnrecon.export import require_bordered
-from gnrecon.export.clip import clip
+from gnrecon.export.trim import clip
 from gnrecon.geometry.mesh import Mesh
 
 

@@ -8,8 +8,9 @@ from analytic_fields import UNIT, UTM, Field, sphere
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gnrecon.export import extract, project, require_sound
-from gnrecon.export.cut import crop, subtract
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export import project, require_sound
+from gnrecon.export.boolean import crop, subtract
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import MeshError

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from analytic_fields import Field, sphere
 
-from gnrecon.export import extract
-from gnrecon.export.diffuse import diffused, vertex_areas
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export.curvature import diffused, vertex_areas
 from gnrecon.geometry.mesh import Mesh
 
 RADIUS = 0.8

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, torus, union
 
-from gnrecon.export import extract, project, remove_handles, require_sound
-from gnrecon.export.loops import short_loops
-from gnrecon.export.nearest import nearest_on_surface
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export import project, remove_handles, require_sound
+from gnrecon.export.cycles import short_loops
+from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, union
 
-from gnrecon.export import extract, lighten, project, vertex_sky
-from gnrecon.export.lighten import barycentric
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export import project
+from gnrecon.export.remeshing import decimate as lighten
+from gnrecon.export.remeshing.decimate import barycentric
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.rendering import vertex_sky
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from analytic_fields import UNIT, UTM, Field, shells, sphere, torus
 
-from gnrecon.export import extract, project, require_sound
-from gnrecon.export.nearest import Surface, nearest_on_surface
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export import project, require_sound
+from gnrecon.export.metrics import Surface, nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame

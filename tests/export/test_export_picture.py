@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, union
 
-from gnrecon.export import extract, project, render, render_sheet
-from gnrecon.export.camera import VIEWS, Camera
+from gnrecon.export import marching_cubes as extract
+from gnrecon.export import project
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.rendering import render, render_sheet
+from gnrecon.rendering.rays import VIEWS, Camera
 from gnrecon.runtime.errors import OutputError, UsageError
 
 SIZE = (120, 90)
@@ -137,7 +139,7 @@ def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(
     from PIL import Image
 
     for name, value in (("WIDTH", 600), ("TALL", 240), ("LOW", 180)):
-        monkeypatch.setattr(f"gnrecon.export.sheet.{name}", value)
+        monkeypatch.setattr(f"gnrecon.rendering.picture.{name}", value)
     field = Field(union(box((0.8, 0.2, 0.15)), box((0.12, 0.2, 0.5), (0.68, 0, 0.4))), frame=UTM)
     mesh = extract(field, resolution=32)
     image = render_sheet(mesh, tmp_path / "sheet.png", points=PointCloud(mesh.vertices))

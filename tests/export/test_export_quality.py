@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.export.quality import corner_angles, edge_lengths, quality
+from gnrecon.export.mesh_statistics import corner_angles, edge_lengths, quality
 from gnrecon.geometry.mesh import Mesh
 
 TETRAHEDRON = Mesh(

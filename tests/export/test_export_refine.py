@@ -10,7 +10,9 @@ import pytest
 from analytic_fields import Field, sphere, torus, union
 from sharp_fields import box, cylinder, extracted
 
-from gnrecon.export import RefineOptions, quality, refine, require_sound
+from gnrecon.export import RefineOptions, require_sound
+from gnrecon.export import mesh_statistics as quality
+from gnrecon.export.remeshing import refine
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
@@ -101,7 +103,7 @@ def test_a_step_that_fails_is_tried_more_gently(monkeypatch: pytest.MonkeyPatch)
             raise MeshError("Too strong.")
         return Mesh(mesh.vertices[:, [1, 2, 0]], mesh.faces)
 
-    monkeypatch.setattr(sys.modules["gnrecon.export.refine"], "simplify", fails_when_strong)
+    monkeypatch.setattr(sys.modules["gnrecon.export.remeshing.refine"], "simplify", fails_when_strong)
     _, actions = refine(extracted(field, 16), field, RefineOptions(simplify=0.02))
     assert tried == [0.02, 0.01]
     assert (
@@ -112,7 +114,7 @@ def test_a_step_that_fails_is_tried_more_gently(monkeypatch: pytest.MonkeyPatch)
 def test_a_step_that_changes_the_topology_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
     field = Field(sphere())
     mesh, ring = extracted(field, 16), extracted(Field(torus()), 24)
-    monkeypatch.setattr(sys.modules["gnrecon.export.refine"], "decimate", lambda *_, **__: ring)
+    monkeypatch.setattr(sys.modules["gnrecon.export.remeshing.refine"], "decimate", lambda *_, **__: ring)
     result, actions = refine(mesh, field, RefineOptions(faces=10))
     assert result is mesh
     assert "genus would have changed from 1 and 0 to 1 and 1" in actions[-1]

@@ -19,8 +19,9 @@ from sharp_fields import (
     to_lens_edge,
 )
 
-from gnrecon.export import project, require_sound, sharpen
-from gnrecon.export.crease import meeting_points
+from gnrecon.export import project, require_sound
+from gnrecon.export.remeshing import sharpen
+from gnrecon.export.remeshing.sharpen import meeting_points
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from browser import Browser, browser, find_browser
 from pages import CENTRE, adorned, report, scan, torus
 
-from gnrecon.page import write_page
+from gnrecon.report.html import write_page
 
 MODES = ["colors", "error", "sigma", "distance", "mean_curvature", "gauss_curvature", "intensity"]
 

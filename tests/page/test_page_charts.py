@@ -7,18 +7,15 @@ import re
 
 import numpy as np
 import pytest
+from gnrecon.report.report.html import scales as ticks
 from hypothesis import given
 from hypothesis import strategies as st
 from pages import torus
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.statistics import Histogram
-from gnrecon.page import ticks
-from gnrecon.page.charts import Curve, bars, curves
-from gnrecon.page.convergence import convergence
-from gnrecon.page.numbers import count, figure, memory, seconds, share
-from gnrecon.page.quality import corner_angles, edge_lengths, quality
-from gnrecon.page.ramps import STOPS, css, ramp
+from gnrecon.report.html.charts import Curve, bars, convergence, corner_angles, curves, edge_lengths, quality
+from gnrecon.report.html.scales import STOPS, count, css, figure, memory, ramp, seconds, share
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gnrecon.page.facts import ingest, remarks
+from gnrecon.report.html.facts import ingest, remarks
 
 
 def test_every_reason_has_its_bar() -> None:

@@ -14,7 +14,7 @@ from pages import CENTRE, Elements, adorned, buffer, report, scan, scene, torus
 from gnrecon.export import verify
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.page import page_text, write_page
+from gnrecon.report.html import page_text, write_page
 from gnrecon.runtime.errors import MeshError, OutputError
 
 ALL_MODES = ["plain", "colors", "error", "sigma", "distance", "mean_curvature", "gauss_curvature", "intensity"]
@@ -138,8 +138,8 @@ def test_an_open_surface_is_called_one() -> None:
 
 
 def test_heavy_meshes_and_clouds_are_drawn_lightly_and_said_to_be(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gnrecon.page.model.MOST_FACES", 1000)
-    monkeypatch.setattr("gnrecon.page.model.MOST_POINTS", 500)
+    monkeypatch.setattr("gnrecon.report.html.viewer.MOST_FACES", 1000)
+    monkeypatch.setattr("gnrecon.report.html.viewer.MOST_POINTS", 500)
     text = page_text(report(mesh), mesh, scan(mesh))
     model = scene(text)
     assert 500 < model["faces"] <= 1000 < model["all_faces"] == len(mesh.faces)
@@ -205,8 +205,8 @@ def test_files_are_written_whole_or_not_at_all(mesh: Mesh, text: str, tmp_path: 
 def test_everything_that_the_page_is_made_of_is_data_of_the_package(repository: Path) -> None:
     config = configparser.ConfigParser()
     config.read(repository / "setup.cfg")
-    patterns = config["options.package_data"]["gnrecon.page"].split()
-    folder = repository / "gnrecon" / "page"
+    patterns = config["options.package_data"]["gnrecon.report.html"].split()
+    folder = repository / "gnrecon" / "report" / "html" / "assets"
     for path in folder.iterdir():
         if path.is_file() and path.suffix != ".py":
             assert any(path.match(pattern) for pattern in patterns), path.name

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.export import SignedDistance, extract
-from gnrecon.export.band import narrow_band
+from gnrecon.export import SignedDistance
+from gnrecon.export import marching_cubes as extract
 from gnrecon.export.lattice import Lattice
+from gnrecon.export.sparse_grid import narrow_band
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from benchmarks.learn.step import step_figures
 from benchmarks.provenance import provenance
-from gnrecon.report import plain
+from gnrecon.report.report import plain
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import write_text
 from gnrecon.shapes import OPTIMISERS, PROBLEMS, learn

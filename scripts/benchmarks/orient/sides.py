@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.peers import oriented
 from benchmarks.problem import Problem
-from gnrecon.export.nearest import Surface
+from gnrecon.export.metrics import Surface
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.ingest import oriented_normals

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.uncertainty.check import Check
-from gnrecon.export import render
 from gnrecon.geometry.arrays import Float
+from gnrecon.rendering import render
 from gnrecon.runtime.files import atomic_write
 
 PANEL = (420, 400)

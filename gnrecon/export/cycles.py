@@ -1,0 +1,219 @@
+"""Short closed paths on a surface that do not take it apart: one around each handle, one through each tunnel.
+
+A closed path takes a surface apart if and only if it crosses every other closed path an even number of times (homology
+with coefficients in Z/2). A spanning tree of the edges and a spanning tree of the faces that crosses none of them leave
+2 g edges over, of which each closes one path over faces. Each of these paths gets a random word of 64 bits, and each
+edge the exclusive or of the words of those that cross it. Then the exclusive or along any closed path of edges is its
+class: zero where it takes the surface apart, and for any other with a chance of 2^-64. The words of all edges come in
+one pass from the leaves of the faces' tree to its root, whatever the genus.
+
+A path that does not take the surface apart crosses one of those over faces. So the shortest ones are looked for from
+vertices along these alone, by Dijkstra's algorithm within half the longest length, many at once.
+Sources: Eppstein, Dynamic generators of topologically embedded graphs (2003); Erickson and Whittlesey, Greedy optimal
+homotopy and homology generators (2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from gnrecon.export.mesh_statistics import Edges, face_components
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.runtime.parallel import slices
+
+Words = npt.NDArray[np.uint64]
+
+APART = 1 / 5
+"""How far apart paths are looked for, as a share of the longest length: a shorter one is not far from one of them."""
+
+TOGETHER = 200
+"""Vertices from which paths are looked for at once."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A simple closed path of edges.
+
+    Parameters
+    ----------
+    vertices : integer array of shape (L,)
+        In order.
+    length : float
+    word : int
+        Its class: loops are independent where no exclusive or of some of their words is zero.
+    """
+
+    vertices: Int
+    length: float
+    word: int
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """Vertices and edges of a closed mesh.
+
+    Parameters
+    ----------
+    vertices : of shape (V, 3)
+    ends : of shape (E, 2), lower and higher vertex of each edge
+    lengths : of shape (E,)
+    words : of shape (E,)
+    """
+
+    vertices: Float
+    ends: Int
+    lengths: Float
+    words: Words
+
+    @classmethod
+    def of(cls, mesh: Mesh, rng: np.random.Generator) -> _Graph:
+        """Return the graph of a closed, oriented 2-manifold."""
+        edges = Edges.of(mesh)
+        ends = edges.ends[edges.first]
+        faces = np.stack([edges.corner[edges.first], edges.corner[edges.first + 1]], axis=1) // 3
+        lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
+        return cls(mesh.vertices, ends, lengths, _words(mesh, ends, faces, rng))
+
+    @cached_property
+    def _around(self) -> csr_array:
+        return _links(self.ends, len(self.vertices))
+
+    def neighbours(self, vertices: Int) -> tuple[Int, Int, Int]:
+        """Return the position in `vertices`, of shape (N,), the neighbour and the edge of each pair of neighbours."""
+        table = self._around
+        count = np.diff(table.indptr)[vertices]
+        position = np.repeat(np.arange(len(vertices)), count)
+        slot = np.repeat(table.indptr[vertices] - np.cumsum(count) + count, count) + np.arange(count.sum())
+        return position, table.indices[slot].astype(np.int64), table.data[slot].astype(np.int64) - 1
+
+
+def short_loops(mesh: Mesh, longest: Float, sought: Mask, rng: np.random.Generator) -> list[Loop]:
+    """Return loops that do not take the surface apart, shortest first.
+
+    Each is what is left of the shortest one through some vertex without the way there and back.
+
+    Parameters
+    ----------
+    mesh : a closed, oriented 2-manifold
+    longest : of shape (V,), the length up to which a loop through each vertex is looked for
+    sought : mask of shape (V,), of the vertices through which they are looked for
+    rng : source of the words
+    """
+    graph = _Graph.of(mesh, rng)
+    crossed = np.unique(graph.ends[graph.words != 0])
+    sources = _thinned(graph.vertices, crossed[sought[crossed]], longest)
+    tree = cKDTree(graph.vertices)
+    found = [loop for some in slices(len(sources), TOGETHER) for loop in _from(graph, tree, sources[some], longest)]
+    return sorted(found, key=lambda loop: loop.length)
+
+
+def _words(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator) -> Words:
+    """Return each edge's word, of shape (E,), from its ends and its two faces, each of shape (E, 2)."""
+    count, size = len(mesh.vertices), len(mesh.faces)
+    left: Mask = np.ones(len(ends), dtype=bool)
+    left[minimum_spanning_tree(_links(ends, count)).tocoo().data.astype(np.int64) - 1] = False
+    across = _links(np.where(left[:, None], faces, 0), size)
+    walks = []
+    for root in np.unique(face_components(mesh), return_index=True)[1]:
+        order, parent = breadth_first_order(across, root, directed=False)
+        edge = np.zeros(len(order), dtype=np.int64)
+        edge[1:] = np.asarray(across[order[1:], parent[order[1:]]]).reshape(-1) - 1
+        left[edge[1:]] = False
+        walks.append((order, parent[order], edge))
+    rows = np.flatnonzero(left)
+    words = np.zeros(len(ends), dtype=np.uint64)
+    words[rows] = rng.integers(1, 2**64, len(rows), dtype=np.uint64)
+    gathered = np.zeros(size, dtype=np.uint64)
+    np.bitwise_xor.at(gathered, faces[rows].reshape(-1), np.repeat(words[rows], 2))
+    # From the leaves on: a face hands on to its parent what its own children have handed to it.
+    hand = gathered.tolist()
+    for order, parent, edge in walks:
+        for face, above in zip(order[:0:-1].tolist(), parent[:0:-1].tolist(), strict=True):
+            hand[above] ^= hand[face]
+        words[edge[1:]] = np.array(hand, dtype=np.uint64)[order[1:]]
+    return words
+
+
+def _links(pairs: Int, count: int) -> csr_array:
+    """Return the symmetric matrix of `count` rows that holds each pair's number, from 1, but no pair of one row."""
+    kept = np.flatnonzero(pairs[:, 0] != pairs[:, 1])
+    low, high = pairs[kept].T
+    numbers = np.concatenate([kept, kept]) + 1.0
+    return csr_array((numbers, (np.concatenate([low, high]), np.concatenate([high, low]))), shape=(count, count))
+
+
+def _thinned(places: Float, rows: Int, longest: Float) -> Int:
+    """Return some of the rows, one in each cube, whose edge goes with the longest length."""
+    octave = np.floor(np.log2(APART * longest[rows]))
+    cube = np.floor(places[rows] / np.exp2(octave)[:, None])
+    return rows[np.unique(np.column_stack([octave, cube]), axis=0, return_index=True)[1]]
+
+
+def _from(graph: _Graph, tree: cKDTree, sources: Int, longest: Float) -> list[Loop]:
+    """Return the shortest loop through each source that does not take the surface apart, where there is one."""
+    near = tree.query_ball_point(graph.vertices[sources], longest[sources] / 2)
+    block = np.repeat(np.arange(len(sources)), [len(rows) for rows in near])
+    vertex = np.concatenate([np.sort(rows) for rows in near]).astype(np.int64)
+    # Each source has a copy of what is near it, so that one search serves all.
+    names = block * len(graph.vertices) + vertex
+    copy, end, edge = graph.neighbours(vertex)
+    wanted = block[copy] * len(graph.vertices) + end
+    other = np.minimum(np.searchsorted(names, wanted), len(names) - 1)
+    kept = names[other] == wanted
+    copy, other, edge = copy[kept], other[kept], edge[kept]
+    links = csr_array((graph.lengths[edge], (copy, other)), shape=(len(names), len(names)))
+    starts = np.searchsorted(names, np.arange(len(sources)) * len(graph.vertices) + sources)
+    far, before, _ = dijkstra(links, indices=starts, min_only=True, return_predecessors=True)
+    reached = np.isfinite(far)
+    words = _along(copy, other, graph.words[edge], before)
+    length = far[copy] + far[other] + graph.lengths[edge]
+    closes = (
+        reached[copy] & (words[copy] ^ words[other] != graph.words[edge]) & (length <= longest[sources[block[copy]]])
+    )
+    rows = np.flatnonzero(closes)
+    rows = rows[np.lexsort([length[rows], block[copy[rows]]])]
+    rows = rows[np.unique(block[copy[rows]], return_index=True)[1]]
+    crossed = words[copy[rows]] ^ words[other[rows]] ^ graph.words[edge[rows]]
+    found = []
+    for row, word in zip(rows, crossed, strict=True):
+        ring = vertex[_closed(before, int(copy[row]), int(other[row]))]
+        steps = graph.vertices[ring] - graph.vertices[np.roll(ring, -1)]
+        found.append(Loop(ring, float(np.linalg.norm(steps, axis=1).sum()), int(word)))
+    return found
+
+
+def _along(copy: Int, other: Int, words: Words, before: Int) -> Words:
+    """Return the exclusive or of the words along the way from each node's start; a start has itself before it."""
+    found = np.zeros(len(before), dtype=np.uint64)
+    last = before[other] == copy
+    found[other[last]] = words[last]
+    jump = np.where(before < 0, np.arange(len(before)), before)
+    while True:
+        further = jump[jump]
+        if (further == jump).all():
+            return found
+        found, jump = found ^ found[jump], further
+
+
+def _closed(before: Int, one: int, other: int) -> list[int]:
+    """Return the nodes of the closed path by the ways from one start to two neighbours, without what both share."""
+    first, second = _way(before, one), _way(before, other)
+    while len(first) > 1 and len(second) > 1 and first[-2] == second[-2]:
+        first.pop()
+        second.pop()
+    return first + second[-2::-1]
+
+
+def _way(before: Int, node: int) -> list[int]:
+    way = [node]
+    while before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    return way

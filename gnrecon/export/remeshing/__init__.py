@@ -1,0 +1,1 @@
+"""Edge-based changes of a mesh that is there: remeshing, refinement, decimation, sharpening."""

@@ -1,0 +1,214 @@
+"""Fewer faces: to a number of faces, or as few as a tolerance allows.
+
+Both put faces where the surface bends, and both keep edges: quadric edge collapse (Garland and Heckbert, 1997; by
+pymeshlab) removes what costs the least squared distance to the planes of the faces, and manifold3d's simplification
+removes vertices as long as the surface stays within a distance. The former's new vertices are then brought onto the
+field; the latter's are some of the old ones, and are there already.
+
+manifold3d holds its distance collapse by collapse, so that several in a row may add up to more. What became of the
+surface is therefore measured, and the simplification repeated with a smaller distance until all is within the wanted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from gnrecon.export.boolean import centre_and_size, from_meshlab, from_solid, refusal, to_meshlab, to_solid
+from gnrecon.export.metrics import Surface, nearest_on_surface
+from gnrecon.export.project import SignedDistance, between, project
+from gnrecon.export.remeshing.edge_table import unit
+from gnrecon.export.remeshing.remesh import creased, settled
+from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.runtime.errors import MeshError, UsageError
+
+FEWEST = 4
+"""Faces of a tetrahedron."""
+
+SMALLER = 0.9
+"""Margin below the distance that the last attempt suggests for the next one."""
+
+ATTEMPTS = 4
+
+
+def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30.0) -> Mesh:
+    """Reduce a mesh to a number of faces by quadric edge collapse.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Sound, in file units; from `sharpen` where the field has edges.
+    field : SignedDistance
+        Whose zero level the mesh is near.
+    faces : int
+        Wanted number; more are left where fewer would change the surface's topology.
+    angle : float
+        Degrees between the field's normals on neighbouring faces from which on vertices are put onto their crease.
+
+    Returns
+    -------
+    Mesh
+        On the zero level, with the field's normals; the mesh itself where it has no more faces than wanted.
+
+    Raises
+    ------
+    UsageError
+        When fewer than four faces are wanted.
+    """
+    if faces < FEWEST:
+        raise UsageError(f"The number of faces is {faces}, but a closed mesh has at least {FEWEST}.")
+    if len(mesh.faces) <= faces:
+        return mesh
+    work = to_meshlab(mesh)
+    work.meshing_decimation_quadric_edge_collapse(
+        targetfacenum=faces,
+        qualitythr=0.5,
+        preservenormal=True,
+        preservetopology=True,
+        planarquadric=True,
+        autoclean=False,
+    )
+    fewer = from_meshlab(work, mesh)
+    return project(settled(creased(fewer, field, angle), fewer.vertices, field, angle).mesh(), field)
+
+
+def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
+    """Remove vertices as long as the surface moves by no more than a tolerance.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Sound, in file units; from `sharpen` where the field has edges.
+    field : SignedDistance
+        Whose zero level the vertices lie on.
+    tolerance : float, file units
+        Greatest distance, either way, between one surface and the other's vertices, edge midpoints and face centres.
+
+    Returns
+    -------
+    Mesh
+        With some of the old vertices where they were, and the field's normals.
+
+    Raises
+    ------
+    UsageError
+        When the tolerance is not positive.
+    MeshError
+        When nothing is left of the mesh, or no attempt keeps within the tolerance.
+    """
+    if not 0 < tolerance < np.inf:
+        raise UsageError(f"The tolerance is {tolerance} file units, but must be positive.")
+    distance = tolerance
+    for _ in range(ATTEMPTS):
+        simple = collapsed(mesh, distance)
+        moved = max(_farthest(mesh, simple), _farthest(simple, mesh))
+        if moved <= tolerance:
+            return Mesh(simple.vertices, simple.faces, unit(field.gradient(simple.vertices)))
+        distance *= SMALLER * tolerance / moved
+    raise MeshError(f"The surface would have moved by {moved:.3g}.")
+
+
+def collapsed(mesh: Mesh, tolerance: float) -> Mesh:
+    """Return a mesh as manifold3d simplifies it, by collapses of a tolerance each, in the unit of the vertices.
+
+    Raises
+    ------
+    MeshError
+        When nothing is left of it.
+    """
+    _, size = centre_and_size(mesh)
+    solid = to_solid(mesh, merge=False).simplify(tolerance / size)
+    error = refusal(solid)
+    if error is not None or solid.is_empty():
+        raise MeshError(f"manifold3d left nothing of the mesh ({error or 'within the tolerance it is flat'}).")
+    return from_solid(solid, mesh)
+
+
+def _farthest(one: Mesh, other: Mesh) -> float:
+    """Greatest distance to a mesh from another one's vertices, edge midpoints and face centres."""
+    points = np.concatenate([other.vertices, between(other.corners)])
+    return float(nearest_on_surface(one, points)[0].max())
+
+
+DENSITY = 2.3
+"""Faces that clustering leaves for each square of the surface that is as wide as a cube, about."""
+
+
+# A lighter copy of a mesh, for looking at: fewer faces by clustering vertices, attributes included.
+#
+# All vertices within a cube of a regular grid become one (Rossignac and Borrel 1993), at the place of the surface that
+# is nearest to their mean, with the attributes of that place. Unlike collapsing edges by their error, this keeps as
+# many vertices where a surface is flat as where it is curved, and so the detail of its attributes; and it takes seconds
+# for millions of faces. Nothing is promised of the copy's topology.
+
+
+def lighten(mesh: Mesh, faces: int) -> Mesh:
+    """Return the mesh with at most `faces` faces, its normals and attributes interpolated.
+
+    A mesh that has so few is returned as it is.
+    """
+    if len(mesh.faces) <= faces:
+        return mesh
+    means, triangles = _clustered(mesh, faces)
+    vertices, nearest = Surface(mesh).nearest(means)
+    corners, weights = mesh.faces[nearest], barycentric(mesh.corners[nearest], vertices)
+    normals = interpolate(mesh.vertex_normals(), corners, weights)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return Mesh(vertices, triangles, normals, _carried(mesh.attributes, corners, weights))
+
+
+def _clustered(mesh: Mesh, faces: int) -> tuple[Float, Int]:
+    """Means of clustered vertices, of shape (N, 3), and the faces between them, at most so many."""
+    import open3d
+
+    centre, size = centre_and_size(mesh)
+    places = open3d.utility.Vector3dVector((mesh.vertices - centre) / size)
+    heavy = open3d.geometry.TriangleMesh(places, open3d.utility.Vector3iVector(mesh.faces))
+    cube = np.sqrt(DENSITY * mesh.area / faces) / size
+    light = heavy.simplify_vertex_clustering(cube)
+    while len(light.triangles) > faces:
+        cube *= 1.1
+        light = heavy.simplify_vertex_clustering(cube)
+    return centre + size * np.asarray(light.vertices), np.asarray(light.triangles, dtype=np.int64)
+
+
+def barycentric(corners: Float, places: Float) -> Float:
+    """Return the shares of triangles' corners in places within them, of shape (N, 3); a third each without an area.
+
+    Parameters
+    ----------
+    corners : array of shape (N, 3, 3)
+    places : array of shape (N, 3)
+    """
+    to = corners - places[:, None]
+    areas = np.stack([np.cross(to[:, (k + 1) % 3], to[:, (k + 2) % 3]) for k in range(3)], axis=1)
+    sizes = np.linalg.norm(areas, axis=2) + np.finfo(np.float64).tiny
+    weights: Float = sizes / sizes.sum(axis=1, keepdims=True)
+    return weights
+
+
+def interpolate(values: Values, corners: Int, weights: Float) -> Float:
+    """Return values of shape (N, ...) at places in faces, from the values of vertices, of shape (V, ...).
+
+    Parameters
+    ----------
+    values : array of shape (V,) or (V, C)
+    corners : integer array of shape (N, 3)
+        Vertices of the face that each place lies in.
+    weights : array of shape (N, 3)
+        Barycentric coordinates.
+    """
+    mixed: Float = np.einsum("nk,nk...->n...", weights, values[corners].astype(np.float64))
+    return mixed
+
+
+def _carried(attributes: Mapping[str, Values], corners: Int, weights: Float) -> dict[str, Values]:
+    """Interpolated attributes in their own types; whole numbers are rounded."""
+    carried: dict[str, Values] = {}
+    for name, values in attributes.items():
+        mixed = interpolate(values, corners, weights)
+        whole = np.issubdtype(values.dtype, np.integer)
+        carried[name] = (np.round(mixed) if whole else mixed).astype(values.dtype)
+    return carried

@@ -1,0 +1,329 @@
+"""Where the zero level may pass: blocks of cells, searched from coarse to fine.
+
+A function whose slope is at most L has no zero in a block of half diagonal d around c when |f(c)| > L d. The coarse
+blocks divide the box into some 50 to 100 along its longest side, whatever the resolution is; those that may hold a
+zero are halved until they are leaves. L is measured close by: the length of the gradient at the centre, and by how much
+the gradients of the neighbouring centres say that it varies up to the corners, with a quarter more. A place where the
+field is steep or bends costs evaluations there, then, and not everywhere. All other blocks keep nothing but the sign of
+their centre, and what a field still hides between the centres is found by propagation, see `band`.
+
+Where the data is known, only coarse blocks near it are searched; what lies farther off is found by propagation, which
+follows the surface from there: sheets in free space, where a field is steep, cost little then.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gnrecon.export.lattice import Lattice
+from gnrecon.export.marching_cubes import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.progress import Advance, part, unheard
+
+MOST_BLOCKS = 96
+"""Most coarse blocks along the longest side."""
+
+MARGIN = 1.25
+"""Bound on the slope, as a multiple of what was measured."""
+
+REACH = 2.0
+"""How far beyond a data point the surface is searched, in cells."""
+
+BATCH = 4096
+"""Blocks that are split at once: memory does not grow with the resolution then."""
+
+_SAMPLES = 2048
+
+_CHILDREN = np.stack(np.meshgrid(*3 * [np.arange(2)], indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Cubes of `size` cells a side.
+
+    Parameters
+    ----------
+    size : int
+    places : integer array of shape (N, 3)
+        In units of the size: block (i, j, k) begins at node ``size * (i, j, k)``.
+    """
+
+    size: int
+    places: Int
+
+    @property
+    def centers(self) -> Float:
+        """Lattice coordinates of the centres, of shape (N, 3)."""
+        return np.asarray((self.places + 0.5) * self.size, dtype=np.float64)
+
+    @property
+    def half_diagonal(self) -> float:
+        """In cells."""
+        return float(self.size * np.sqrt(3) / 2)
+
+    def may_vanish(self, values: Float, slopes: Float | float) -> Mask:
+        """Which may hold a zero, of shape (N,), from values at the centres, in cells, and measured slopes."""
+        # The closing of the field at its box has slope one.
+        return np.asarray(np.abs(values) <= np.maximum(MARGIN * slopes, 1.0) * self.half_diagonal)
+
+    def within(self, lattice: Lattice) -> Mask:
+        """Which have a node of the lattice, of shape (N,)."""
+        return np.asarray((self.places * self.size <= lattice.cells).all(axis=1))
+
+    def split(self) -> Blocks:
+        """The eight children of each, one parent's after the other's."""
+        return Blocks(self.size // 2, (self.places[:, None] * 2 + _CHILDREN).reshape(-1, 3))
+
+    def __getitem__(self, rows: slice | Mask) -> Blocks:
+        return Blocks(self.size, self.places[rows])
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """The coarse blocks of a whole box.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        In the order of a grid of shape `grid`.
+    grid : tuple of three int
+    values : array of shape (N,)
+        The field at the centres, in cells.
+    steepest : float
+        A high percentile of the gradient's length: half of the samples nearest to the surface, half all over the box.
+    typical : float
+        The median of the gradient's length where the surface may pass.
+    """
+
+    blocks: Blocks
+    grid: tuple[int, ...]
+    values: Float
+    steepest: float
+    typical: float
+
+    @classmethod
+    def of(cls, lattice: Lattice) -> Coarse:
+        """Evaluate the field at the centres of coarse blocks, and its gradient at some of them.
+
+        Raises
+        ------
+        MeshError
+            When the field is not finite somewhere.
+        """
+        size = LEAF
+        while lattice.cells.max() > MOST_BLOCKS * size:
+            size *= 2
+        grid = lattice.cells // size + 1
+        places = np.stack(np.meshgrid(*map(np.arange, grid), indexing="ij"), axis=-1).reshape(-1, 3)
+        blocks = Blocks(size, places)
+        values = lattice.values(blocks.centers, 1.0)
+        nearest = np.argsort(np.abs(values), kind="stable")[:_SAMPLES]
+        spread = np.arange(0, len(values), -(-len(values) // _SAMPLES))
+        samples = np.union1d(nearest, spread)
+        slopes = np.linalg.norm(lattice.gradients(blocks.centers[samples]), axis=1)
+        crossed = np.abs(values[samples]) <= slopes * blocks.half_diagonal
+        typical = float(np.median(slopes[crossed] if crossed.any() else slopes))
+        return cls(blocks, tuple(grid), values, float(np.percentile(slopes, 99.5)), typical)
+
+
+def search(lattice: Lattice, coarse: Coarse, leaves: Leaves, data: Float | None) -> Iterator[tuple[float, Int]]:
+    """Yield the leaves, of shape (N, 3), that may hold a zero, by parts, each with the share of the work done after it.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    coarse : Coarse
+        Of the same lattice.
+    leaves : Leaves
+        Receives the blocks without a zero whose centres are inside.
+    data : array of shape (N, 3), lattice coordinates, optional
+        Points near which the surface is searched; everywhere when None.
+
+    Raises
+    ------
+    MeshError
+        When the field is not finite somewhere.
+    """
+    blocks, values = coarse.blocks, coarse.values
+    kept = blocks.may_vanish(values, coarse.steepest)
+    if data is not None:
+        kept[kept] = _near(data, blocks[kept], lattice)
+    slopes = _slopes(lattice, blocks, kept, (1, *coarse.grid))
+    kept &= blocks.may_vanish(values, slopes)
+    leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
+    blocks, slopes = blocks[kept], slopes[kept]
+    for rows in slices(len(slopes), BATCH):
+        yield rows.stop / len(slopes), _descend(lattice, leaves, blocks[rows], slopes[rows])
+
+
+def _descend(lattice: Lattice, leaves: Leaves, blocks: Blocks, slopes: Float) -> Int:
+    """Leaves within the given blocks, in which slopes of shape (N,) were measured."""
+    while blocks.size > LEAF:
+        blocks = blocks.split()
+        values = lattice.values(blocks.centers, 1.0)
+        kept = blocks.may_vanish(values, slopes.repeat(8)) & blocks.within(lattice)
+        if blocks.size > LEAF:
+            slopes = _slopes(lattice, blocks, kept, (-1, 2, 2, 2))
+            kept &= blocks.may_vanish(values, slopes)
+            slopes = slopes[kept]
+        else:
+            kept &= np.abs(values) <= MARGIN * _variation(values)
+        leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
+        blocks = blocks[kept]
+    return blocks.places
+
+
+def _slopes(lattice: Lattice, blocks: Blocks, chosen: Mask, shape: tuple[int, ...]) -> Float:
+    """Greatest slopes in the chosen blocks, of shape (N,), by the gradients at their centres and at neighbouring ones.
+
+    `shape` arranges the blocks as grids of neighbours, of shape (G, A, B, C). From a centre to a corner the gradient
+    changes by half of its differences between neighbours along the three axes. It is 0 for blocks that are not chosen.
+    """
+    gradients = np.full((len(chosen), 3), np.nan)
+    gradients[chosen] = lattice.gradients(blocks.centers[chosen])
+    grid = gradients.reshape(*shape, 3)
+    slopes = np.linalg.norm(grid, axis=-1)
+    for axis in (1, 2, 3):
+        steps = np.linalg.norm(np.diff(grid, axis=axis), axis=-1)
+        none = np.full_like(slopes.take([0], axis=axis), np.nan)
+        before, after = (np.concatenate(pair, axis=axis) for pair in ((none, steps), (steps, none)))
+        slopes += 0.5 * np.nan_to_num(np.fmax(before, after))
+    return np.asarray(np.nan_to_num(slopes).reshape(-1), dtype=np.float64)
+
+
+def _variation(values: Float) -> Float:
+    """By how much the field varies from the centre of a block to its corners, from the centres of eight siblings.
+
+    Along each axis that is half of the greatest difference between siblings, whose centres lie a block's length apart.
+    """
+    siblings = values.reshape(-1, 2, 2, 2)
+    steps = sum(np.abs(np.diff(siblings, axis=axis)).reshape(-1, 4).max(axis=1) for axis in (1, 2, 3))
+    return np.asarray(0.5 * steps).repeat(8)
+
+
+def _near(data: Float, blocks: Blocks, lattice: Lattice) -> Mask:
+    """Which blocks, of shape (N,), have data within their reach, or lie at the border of the box."""
+    from scipy.spatial import cKDTree
+
+    # A block at the border also holds nodes beyond it, which are outside whatever its centre is.
+    outer = ((blocks.places == 0) | ((blocks.places + 1) * blocks.size >= lattice.cells)).any(axis=1)
+    distance = cKDTree(data).query(blocks.centers, distance_upper_bound=blocks.half_diagonal + REACH)[0]
+    return np.asarray(outer | np.isfinite(distance))
+
+
+NUDGE = 1e-4
+"""Least magnitude of a node's value, in cells over the slope: no vertex falls on a node and makes faces degenerate."""
+
+LIMIT = 8.0
+"""Greatest magnitude, likewise; together they keep crossings clear of nodes in scikit-image's float32."""
+
+_NODES = np.stack(np.meshgrid(*3 * [np.arange(LEAF)], indexing="ij"), axis=-1).reshape(-1, 3)
+
+_CORNERS = tuple(itertools.product((0, 1), repeat=3))
+
+LOCATED = 0.1
+"""About which share of the time has passed when the leaves to evaluate are known."""
+
+
+# The narrow band: only the lattice nodes near the zero level are evaluated.
+#
+# `search` names the leaves through which the zero level may pass; those are evaluated node by node, all others have but
+# a sign. What the search misses is found by propagation: as long as a cell with a sign change has a corner that was not
+# evaluated, the leaves of its corners are. Every node thus has exactly one sign, evaluated or not, and marching cubes
+# over all of them cannot leave a hole. Memory grows with the surface: about 6 nodes for each vertex.
+
+
+@dataclass(frozen=True)
+class Band:
+    """Node values around the zero level, in cells divided by the typical slope.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    slope : float
+        Slope by which values are divided.
+    leaves : Leaves
+    """
+
+    lattice: Lattice
+    slope: float
+    leaves: Leaves
+
+    def values(self, leaves: Int) -> Values:
+        """The field at the nodes of leaves, of shape (N, 3): clear, of shape (N, K)."""
+        return self.clear(self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope))
+
+    def clear(self, values: Float) -> Values:
+        """Return values over the slope, of any shape, clear of zero and of bounded magnitude."""
+        clear = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
+        return np.clip(clear, -LIMIT, LIMIT).astype(np.float32)
+
+    def evaluate(self, leaves: Int, advance: Advance = unheard) -> None:
+        """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
+        for rows in slices(len(leaves), self.lattice.together(len(_NODES))):
+            advance(rows.start / len(leaves))
+            some = leaves[rows]
+            self.leaves.keep(some, self.values(some).reshape(-1, LEAF, LEAF, LEAF))
+
+    def missing(self, chunk: Int) -> Int:
+        """Leaves, of shape (N, 3), that hold an unevaluated corner of a cell with a sign change in this chunk."""
+        rows = self.leaves.rows(chunk)
+        if (rows >= FIRST).all() or (rows == OUTSIDE).all() or (rows == INSIDE).all():
+            return np.empty((0, 3), dtype=np.int64)
+        negative = self.leaves.nodes(rows) < 0
+        unknown = (rows < FIRST).repeat(LEAF, 0).repeat(LEAF, 1).repeat(LEAF, 2)
+        unknown = unknown[: CHUNK + 1, : CHUNK + 1, : CHUNK + 1]
+        corners = [tuple(slice(o, o + CHUNK) for o in corner) for corner in _CORNERS]
+        crossed = np.logical_or.reduce([negative[c] for c in corners])
+        crossed &= ~np.logical_and.reduce([negative[c] for c in corners])
+        wanted = np.zeros_like(negative)
+        for corner in corners:
+            wanted[corner] |= crossed & unknown[corner]
+        return np.unique(np.argwhere(wanted) // LEAF, axis=0) + chunk * SIDE
+
+
+def narrow_band(lattice: Lattice, data: Float | None = None, advance: Advance = unheard) -> Band:
+    """Evaluate the field where its zero level may pass.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    data : array of shape (N, 3), lattice coordinates, optional
+        Points near which the surface is searched; everywhere when None.
+    advance : callable
+        Told of the share that is done after each batch of points.
+
+    Raises
+    ------
+    MeshError
+        When the field is not finite somewhere.
+    """
+    coarse = Coarse.of(lattice)
+    advance(LOCATED)
+    # A field that is constant at all samples has no slope there; any positive number keeps the division defined.
+    band = Band(lattice, max(coarse.typical, 1e-6), Leaves(-(-(lattice.cells + 1) // CHUNK), LIMIT))
+    done = LOCATED
+    for share, leaves in search(lattice, coarse, band.leaves, data):
+        begin, done = done, LOCATED + (1.0 - LOCATED) * share
+        band.evaluate(leaves, part(advance, begin, done))
+    _propagate(band)
+    return band
+
+
+def _propagate(band: Band) -> None:
+    """Evaluate further leaves until every corner of every cell with a sign change has its own value."""
+    queue = band.leaves.mixed_chunks()
+    while len(queue):
+        found = [band.missing(chunk) for chunk in queue]
+        leaves = np.unique(np.concatenate(found), axis=0)
+        if not len(leaves):
+            return
+        band.evaluate(leaves)
+        # A new value also changes cells of the lower neighbours, whose upper corners it is.
+        touched = ((leaves[:, None] - np.array(_CORNERS)) // SIDE).reshape(-1, 3)
+        queue = np.unique(touched[(touched >= 0).all(axis=1)], axis=0)

@@ -1,5 +1,0 @@
-"""A run as a page to look at: one HTML file with the model, its figures, and the command that makes it again."""
-
-from gnrecon.page.write import page_text, style_text, write_page
-
-__all__ = ["page_text", "style_text", "write_page"]

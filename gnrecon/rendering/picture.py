@@ -1,0 +1,229 @@
+"""Pictures of meshes and scans, drawn by casting rays, so that no display and no graphics card is needed.
+
+Every pixel is the mean of nine samples. Surfaces are shaded by interpolated vertex normals, points as small balls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from gnrecon.export.metrics import ray_scene
+from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.colors import to_linear as to_light
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.rendering.rays import Camera, View, draw_points, shade, sky_share, to_bytes, to_linear
+from gnrecon.runtime.errors import UsageError
+
+CLAY, SLATE = (230, 208, 180), (86, 120, 164)
+"""Colours of meshes and of points."""
+
+PAPER_TOP, PAPER_BOTTOM = 1.0, 0.86
+"""Linear light of the background."""
+
+SUPERSAMPLING = 3
+"""Samples along each side of a pixel."""
+
+Image = npt.NDArray[np.uint8]
+
+
+def render(
+    mesh: Mesh | None,
+    path: str | Path | None = None,
+    *,
+    size: tuple[int, int] = (900, 600),
+    views: Sequence[View] = ("three-quarter",),
+    color: tuple[int, int, int] = CLAY,
+    points: PointCloud | None = None,
+    point_color: tuple[int, int, int] = SLATE,
+    up: str = "z",
+) -> Image:
+    """Draw a mesh, a scan, or both side by side.
+
+    Parameters
+    ----------
+    mesh : Mesh, optional
+    path : path, optional
+        PNG file to write; an older one is replaced.
+    size : pair of int
+        Width and height of the whole picture in pixels.
+    views : sequence of names or (azimuth, elevation) in degrees
+        Each is a panel; see `camera.VIEWS` for the names.
+    color, point_color : sRGB from 0 to 255
+        Of a mesh without the attribute ``colors``, which is drawn where there is one, and of points.
+    points : PointCloud, optional
+        Drawn in a panel of its own left of the mesh's, from the same place.
+    up : str
+        The axis that points upward, ``"y"`` or ``"z"``.
+
+    Returns
+    -------
+    array of shape (height, width, 3), uint8
+
+    Raises
+    ------
+    UsageError
+        When there is nothing to draw, or a view or the size is senseless.
+    OutputError
+        When the file cannot be written.
+    """
+    shown = [part for part in (points, mesh) if part is not None and len(_places(part))]
+    panels = len(shown) * len(views)
+    if not panels:
+        raise UsageError("There is nothing to draw: give a mesh or points, and a view.")
+    if size[0] < panels or size[1] < 1:
+        raise UsageError(f"A picture of {size[0]} x {size[1]} pixels has no room for {panels} panels.")
+    # Everything is drawn about the origin and about one in size, because the ray caster works in float32.
+    places = np.concatenate([_places(part) for part in shown])
+    centre = (places.min(axis=0) + places.max(axis=0)) / 2
+    scale = float(np.linalg.norm(places - centre, axis=1).max()) or 1.0
+    edges = np.linspace(0, size[0], panels + 1).astype(int) * SUPERSAMPLING
+    height = size[1] * SUPERSAMPLING
+    strips = []
+    for index, width in enumerate(np.diff(edges)):
+        view, part = views[index // len(shown)], shown[index % len(shown)]
+        camera = Camera.framing((places - centre) / scale, view, up, int(width), height)
+        unit = (_places(part) - centre) / scale
+        if isinstance(part, Mesh):
+            strips.append(_draw_mesh(part.with_vertices(unit), camera, to_linear(color)))
+        else:
+            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, to_linear(point_color)))
+    light = np.concatenate(strips, axis=1)
+    image: Image = to_bytes(light.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3).mean(axis=(1, 3)))
+    if path is not None:
+        write_image(image, Path(path))
+    return image
+
+
+def _places(part: Mesh | PointCloud) -> Float:
+    return part.vertices if isinstance(part, Mesh) else part.points
+
+
+def _background(camera: Camera) -> Float:
+    """Light paper, a little darker towards the bottom, of shape (H, W, 3)."""
+    rows = np.linspace(PAPER_TOP, PAPER_BOTTOM, camera.height)
+    return np.broadcast_to(rows[:, None, None], (camera.height, camera.width, 3)).copy()
+
+
+def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
+    from open3d import core
+
+    scene = ray_scene(mesh.vertices, mesh.faces)
+    rays = camera.rays()
+    answer = scene.cast_rays(core.Tensor.from_numpy(rays.astype(np.float32)))
+    distance = answer["t_hit"].numpy()
+    hit = np.isfinite(distance)
+    corners = mesh.faces[answer["primitive_ids"].numpy()[hit]]
+    # In single precision, which is more than a picture has: there are millions of samples.
+    u, v = answer["primitive_uvs"].numpy()[hit].T
+    shares = np.stack([1 - u - v, u, v], axis=1)
+    normals = np.einsum("ij,ijk->ik", shares, mesh.vertex_normals().astype(np.float32)[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-9))
+    if "colors" in mesh.attributes:
+        light = to_light(as_bytes(mesh.attributes["colors"])[:, :3])
+        color = np.einsum("ij,ijk->ik", shares, light.astype(np.float32)[corners])
+    # The sky is looked for once a pixel of the picture, not once a sample: it varies slowly, and costs most.
+    coarse = np.zeros_like(hit)
+    coarse[::SUPERSAMPLING, ::SUPERSAMPLING] = hit[::SUPERSAMPLING, ::SUPERSAMPLING]
+    places = rays[coarse][:, :3] + distance[coarse][:, None] * rays[coarse][:, 3:]
+    small = sky_share(scene, places, normals[coarse[hit]], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
+    sky = small.repeat(SUPERSAMPLING, 0).repeat(SUPERSAMPLING, 1)[: hit.shape[0], : hit.shape[1]]
+    image = _background(camera)
+    image[hit] = shade(normals, color, camera.axes, sky[hit])
+    return image
+
+
+def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
+    spacing = 0.02
+    if len(cloud) > 1:
+        # Two thousand points tell the spacing well enough.
+        some = cloud.points[:: -(-len(cloud) // 2000)]
+        spacing = float(np.median(cKDTree(cloud.points).query(some, k=2)[0][:, 1]))
+    normals = cloud.normals
+    if normals is not None:
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    return draw_points(cloud.points, normals, min(0.55 * spacing, 0.02), camera, color, _background(camera))
+
+
+def write_image(image: Image, path: Path) -> None:
+    """Write an image of shape (H, W, 3) as PNG, atomically; an older file is replaced.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+    from PIL import Image as Pillow
+
+    from gnrecon.runtime.files import atomic_write
+
+    with atomic_write(path, overwrite=True) as temporary:
+        Pillow.fromarray(image).save(temporary, format="PNG")
+
+
+SIDES: tuple[View, ...] = ("front", "right", "top")
+"""The smaller pictures, from the left."""
+
+WIDTH, TALL, LOW, FOOT = 1200, 524, 364, 36
+"""Width of the sheet, heights of its rows of pictures, and of the foot below each row, in pixels."""
+
+INK = (96, 96, 100)
+
+
+# A sheet of pictures: the scan and the mesh large, and the mesh from its sides, each with its name.
+
+
+def render_sheet(
+    mesh: Mesh, path: str | Path | None = None, *, points: PointCloud | None = None, up: str = "z"
+) -> Image:
+    """Draw a mesh from four sides, and the scan that it was made from.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    path : path, optional
+        PNG file to write; an older one is replaced.
+    points : PointCloud, optional
+        Left of the mesh, from the same place.
+    up : str
+        The axis that points upward, ``"y"`` or ``"z"``.
+
+    Returns
+    -------
+    array of shape (960, 1200, 3), uint8
+
+    Raises
+    ------
+    UsageError
+        When there is nothing to draw.
+    OutputError
+        When the file cannot be written.
+    """
+    top = render(mesh, size=(WIDTH, TALL), points=points, up=up)
+    bottom = render(mesh, size=(WIDTH, LOW), views=SIDES, up=up)
+    above = [f"{len(points):,} points"] if points is not None and len(points) else []
+    above.append(f"{len(mesh.faces):,} triangles")
+    sheet = np.concatenate([_labelled(top, above), _labelled(bottom, [str(side) for side in SIDES])])
+    if path is not None:
+        write_image(sheet, Path(path))
+    return sheet
+
+
+def _labelled(image: Image, labels: list[str]) -> Image:
+    """Write a label below each of a row's panels."""
+    from PIL import Image as Pillow
+    from PIL import ImageDraw, ImageFont
+
+    # The last line of a picture is paper: no shape comes so near to the edge.
+    picture = Pillow.fromarray(np.concatenate([image, image[-1:].repeat(FOOT, axis=0)]))
+    pen = ImageDraw.Draw(picture)
+    for index, label in enumerate(labels):
+        place = ((2 * index + 1) * image.shape[1] // (2 * len(labels)), image.shape[0] + FOOT / 2 - 4)
+        pen.text(place, label, fill=INK, font=ImageFont.load_default(17), anchor="mm")
+    return np.asarray(picture)

@@ -1,0 +1,120 @@
+"""What a run says of itself: stages with their times and peak memory, its resources, and the versions that made it.
+
+The JSON schema in this folder gives the meaning and unit of each number.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata, resources
+from typing import Any
+
+import torch
+
+from gnrecon.runtime.memory import PeakMemory, process_peak_mb
+from gnrecon.version import __version__
+
+_log = logging.getLogger(__name__)
+
+_NAMED = ("numpy", "scipy", "torch", "open3d", "scikit-image", "manifold3d", "trimesh")
+
+
+class Stages:
+    """A record of stages, in order, and of what all of them together took.
+
+    Parameters
+    ----------
+    announce : called with a stage's name when it begins
+    device : where the fit runs, ``"cpu"`` or ``"cuda"``
+    """
+
+    def __init__(self, announce: Callable[[str], None], device: str = "cpu") -> None:
+        self._announce, self._device = announce, device
+        self._done: list[dict[str, Any]] = []
+        self._sampled = False
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
+        if self._on_cuda:
+            torch.cuda.current_device()  # makes torch's context, without which there is nothing to reset
+            torch.cuda.reset_peak_memory_stats(device)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Time a block and watch its memory."""
+        self._announce(name)
+        _log.debug("Stage %s begins.", name)
+        with PeakMemory() as peak:
+            start, cpu_start = time.perf_counter(), time.process_time()
+            yield
+            seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
+        self._sampled |= peak.sampled
+        times = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu_seconds, 3)}
+        self._done.append({"name": name, **times, "peak_memory_mb": peak.mb})
+        _log.info("Stage %s: %.1f s (%.1f s of processors), %.0f MB at most.", name, seconds, cpu_seconds, peak.mb)
+
+    @property
+    def _on_cuda(self) -> bool:
+        return self._device.startswith("cuda")
+
+    def as_list(self) -> list[dict[str, Any]]:
+        """Return the stages as plain values."""
+        return list(self._done)
+
+    def resources(self) -> dict[str, Any]:
+        """Return what the run has taken until now, as plain values."""
+        cuda_peak = round(torch.cuda.max_memory_allocated(self._device) / 1e6, 1) if self._on_cuda else None
+        return {
+            "seconds": round(time.perf_counter() - self._start, 3),
+            "cpu_seconds": round(time.process_time() - self._cpu_start, 3),
+            "threads": torch.get_num_threads(),
+            "device": self._device,
+            "device_name": torch.cuda.get_device_name(self._device) if self._on_cuda else None,
+            "peak_memory_mb": process_peak_mb(),
+            "stage_peaks_sampled": self._sampled,
+            "cuda_peak_memory_mb": cuda_peak,
+        }
+
+
+def plain(value: Any) -> Any:
+    """Return nested values as JSON can hold them: tuples as lists, and None for a number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of gnrecon, Python and the libraries that shape the result."""
+    found = {"gnrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    for name in _NAMED:
+        found[name] = metadata.version(name)
+    return found
+
+
+SCHEMA_VERSION = "1.0"
+
+
+# The JSON schema of the report: what each field means, and in which unit.
+#
+# It is data of the package, `report.schema.json`, in the dialect of JSON Schema's draft 2020-12. Reports name the
+# version that they follow: the first number grows when a field goes or changes its meaning, the second when one is
+# added.
+
+
+def schema_text() -> str:
+    """Return the schema as the text of a JSON file."""
+    return (resources.files("gnrecon.report") / "report.schema.json").read_text(encoding="utf-8")
+
+
+def report_schema() -> dict[str, Any]:
+    """Return the JSON schema of `Reconstruction.report`, which ``--report`` writes."""
+    schema: dict[str, Any] = json.loads(schema_text())
+    return schema
