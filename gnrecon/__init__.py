@@ -19,8 +19,9 @@ from gnrecon.runtime.errors import Cancelled, FitError, GnreconError, InputError
 from gnrecon.version import __version__
 
 if TYPE_CHECKING:
-    from gnrecon.export import marching_cubes as extract
     from gnrecon.export import (
+        examine,
+        extract,
         measure,
         project,
         remove_handles,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
         trim,
         verify,
     )
-    from gnrecon.export import verify as examine
     from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
     from gnrecon.ingest import prepare, survey
     from gnrecon.io import (
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from gnrecon.rendering import render
     from gnrecon.report.html import write_page
     from gnrecon.report.report import report_schema
-    from gnrecon.shaping import Shape, shaped
+    from gnrecon.solid import Shape, shaped
 
 _ROOMS = {
     "gnrecon.export": (
@@ -86,7 +86,7 @@ _ROOMS = {
     "gnrecon.report.html": ("write_page",),
     "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
     "gnrecon.report.report": ("report_schema",),
-    "gnrecon.shaping": ("Shape", "shaped"),
+    "gnrecon.solid": ("Shape", "shaped"),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

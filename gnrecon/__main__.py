@@ -1,6 +1,6 @@
 """``python -m gnrecon`` is the command line."""
 
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 
 if __name__ == "__main__":
     main()

@@ -16,7 +16,6 @@ from typing import Any
 import numpy.typing as npt
 import torch
 
-from gnrecon.adorn import Sources, adorn, fitting, wanted
 from gnrecon.export import (
     Attribute,
     Invented,
@@ -24,15 +23,15 @@ from gnrecon.export import (
     Metrics,
     Neighbourhood,
     Trimming,
+    invented,
     measure,
+    quality,
     require_bordered,
     require_sound,
     trim,
     verify_file,
     vertex_error,
 )
-from gnrecon.export import mesh_statistics as quality
-from gnrecon.export import trim as invented
 from gnrecon.export.mesh_field import fine_enough, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
@@ -58,6 +57,7 @@ from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
 from gnrecon.runtime.logs import TOLD
 from gnrecon.runtime.parallel import having_threads
 from gnrecon.version import __version__
+from gnrecon.vertex_attributes import Sources, adorn, fitting, wanted
 
 _log = logging.getLogger(__name__)
 

@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from gnrecon.config import settings_text
 from gnrecon.io import all_members, check_writable, written_origin
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress as PipelineProgress
@@ -21,7 +22,6 @@ from gnrecon.report.html import page_text
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
 from gnrecon.runtime.logs import logged
-from gnrecon.settings import settings_text
 
 STAGES = {
     "read": "Reading",

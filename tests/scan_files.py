@@ -26,7 +26,7 @@ _LAUNCH = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
 {before}
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 main()
 """
 

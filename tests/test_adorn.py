@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scan_files import TUBE, torus
 
-from gnrecon.adorn import wanted
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import read_mesh
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.errors import FitError, UsageError
+from gnrecon.vertex_attributes import wanted
 
 FAST = {"widths": (300,), "steps": 0, "resolution": 32}
 
@@ -153,7 +153,7 @@ def test_a_sigma_that_cannot_be_had_is_a_sentence(scan: PointCloud, monkeypatch:
     def refuse(*_: Any) -> None:
         raise FitError("No factor.")
 
-    monkeypatch.setattr("gnrecon.adorn.Uncertainty.of", refuse)
+    monkeypatch.setattr("gnrecon.vertex_attributes.Uncertainty.of", refuse)
     told = Told()
     found = reconstruct(scan, progress=told, uncertainty=True, **FAST)
     assert "sigma" not in found.mesh.attributes

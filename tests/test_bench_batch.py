@@ -14,11 +14,11 @@ from benchmarks.batch.main import sound, table
 from benchmarks.batch.scans import BROKEN, CONFIG, make_scans
 from benchmarks.batch.witness import Witness
 
-from gnrecon.batch.find import Search, find_scans
 from gnrecon.batch.job import PROGRESS, running_folder
+from gnrecon.batch.scan_search import Search, find_scans
+from gnrecon.config import read_settings
 from gnrecon.io import read_cloud
 from gnrecon.runtime.errors import ExitCode, InputError
-from gnrecon.settings import read_settings
 
 GOOD = {"exit_code": 8, "meshes": 4, "causes": BROKEN, "twice": [], "same_bytes": True, "seconds": 60.0}
 SPEED = {"scans": 4, "ratio": 2.0, "cpu_ratio": 3.0, "overhead_seconds": 0.1}

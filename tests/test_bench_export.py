@@ -20,7 +20,7 @@ from benchmarks.export.main import main as export
 from benchmarks.export.main import sentences
 from benchmarks.export.whole_grid import compare, same_surface
 
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import extract
 from gnrecon.field import Siren
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.mesh import Mesh

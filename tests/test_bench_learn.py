@@ -18,7 +18,7 @@ from gnrecon.field import Network
 from gnrecon.least_squares import Cholesky
 from gnrecon.residuals import eikonal, interface, mean_curvature
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
+from gnrecon.shape_learning.frozen_points import FrozenProblem, FrozenTerm
 
 
 def test_nested_differentiation_takes_the_same_step() -> None:

@@ -11,8 +11,7 @@ from benchmarks.__main__ import main as bench
 from benchmarks.refine import main as refine_bench
 from benchmarks.refine.shapes import SHAPES
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import verify
+from gnrecon.export import extract, verify
 from gnrecon.runtime.errors import ExitCode
 
 

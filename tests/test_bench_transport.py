@@ -11,7 +11,8 @@ from benchmarks.__main__ import main as bench
 
 from gnrecon.field import TANH, Network
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.shapes import PROBLEMS, catenoid, pretrain
+from gnrecon.shape_learning import PROBLEMS, catenoid
+from gnrecon.shape_learning import learn as pretrain
 
 
 def test_figures_of_a_small_network(

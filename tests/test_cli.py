@@ -17,7 +17,7 @@ import torch
 from markupsafe import escape
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, sphere, start, torus, wait_for, write_scan
 
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 from gnrecon.export import verify_file
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode

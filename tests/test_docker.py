@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gnrecon.system_packages import LIBRARIES
+from gnrecon.cli.system_packages import LIBRARIES
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 TEXT = re.sub(r"\\\n\s*", "", (REPOSITORY / "Dockerfile").read_text())

@@ -16,8 +16,8 @@ from other_packages import install, packages
 from rich.console import Console
 
 import gnrecon
-from gnrecon import doctor, system_packages
-from gnrecon.doctor import Check
+from gnrecon.cli.app import doctor, system_packages
+from gnrecon.cli.doctor import Check
 
 
 def shown(checks: list[Check], width: int = 100) -> str:

@@ -139,7 +139,7 @@ def test_numerics_import_torch_alone(source: Path) -> None:
 def test_the_doctor_needs_little_and_serves_the_command_line_alone() -> None:
     for module, lazy in imports(PACKAGE / "doctor.py"):
         known = {"rich", *sys.stdlib_module_names}
-        assert lazy or module.split(".")[0] in known or module == "gnrecon.system_packages", module
+        assert lazy or module.split(".")[0] in known or module == "gnrecon.cli.system_packages", module
     users = {room(source) for source in SOURCES for module, _ in imports(source) if room_of(module) == "doctor"}
     assert users <= {"cli"}
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scan_files import torus, write_scan
 
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import Cancelled, ExitCode
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gnrecon.cli import batch_command, parse_widths, reconstruct_command
+from gnrecon.cli.app import batch_command, parse_widths, reconstruct_command
 from gnrecon.export import RefineOptions
 from gnrecon.fit import FitOptions
 from gnrecon.ingest import prepare

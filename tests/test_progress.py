@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 from scan_files import torus, write_scan
 
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scan_files import gnrecon, sphere, write_scan
 
 from gnrecon.batch.request import Request
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.geometry.units import parse_plane
 from gnrecon.io import cropped, read_scans

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gnrecon.config import Settings, read_settings, settings_text, typed
 from gnrecon.options import Options
 from gnrecon.runtime.errors import InputError, UsageError
-from gnrecon.settings import Settings, read_settings, settings_text
-from gnrecon.values import typed
 
 
 def config(folder: Path, text: str) -> Path:

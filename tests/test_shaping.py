@@ -14,7 +14,7 @@ from gnrecon.fit import NeuralSDF
 from gnrecon.options import Options
 from gnrecon.pipeline import reconstruct
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.shaping import Shape, shaped
+from gnrecon.solid import Shape, shaped
 
 OPTIONS = Options(resolution=32)
 BIG = 1000.0

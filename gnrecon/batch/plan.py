@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from gnrecon.batch.find import Search, find_scans
 from gnrecon.batch.job import Job, Limits
-from gnrecon.batch.naming import Found, named
-from gnrecon.batch.pair import reference_of
-from gnrecon.batch.quantity import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
+from gnrecon.batch.scan_search import Found, Search, find_scans, named, reference_of
+from gnrecon.config import settings_text
 from gnrecon.io import all_members
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
-from gnrecon.settings import settings_text
 
 THREADS = 1
 """Of a job that is not told otherwise: several scans at a time use the cores better than several threads for one do."""
@@ -77,3 +75,41 @@ def _require_harmless(jobs: Sequence[Job], others: Sequence[Path]) -> None:
         for name in job.file_names().values():
             if (job.output / name).resolve() in inputs:
                 raise UsageError(f"{job.output / name} is an input of the batch; choose another folder for the meshes.")
+
+
+SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+
+MEGABYTES = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6, "kib": 2**10 / 1e6, "mib": 2**20 / 1e6, "gib": 2**30 / 1e6}
+
+_QUANTITY = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
+
+
+# Times and amounts of memory as people write them.
+def parse_seconds(text: str) -> float:
+    """Return a positive time in seconds, from text such as ``90``, ``30s``, ``10m`` or ``1.5h``.
+
+    Raises
+    ------
+    UsageError
+        When it is none.
+    """
+    return _parsed(text, SECONDS, "time such as 90, 30s, 10m or 2h")
+
+
+def parse_megabytes(text: str) -> float:
+    """Return a positive amount of memory in MB of 10^6 bytes, from text such as ``800MB`` or ``4GB``.
+
+    Raises
+    ------
+    UsageError
+        When it is none.
+    """
+    return _parsed(text, MEGABYTES, "amount of memory such as 800MB, 4GB or 2GiB")
+
+
+def _parsed(text: str, units: dict[str, float], expected: str) -> float:
+    match = _QUANTITY.fullmatch(text)
+    unit = None if match is None else units.get(match[2].lower())
+    if match is None or unit is None or float(match[1]) <= 0:
+        raise UsageError(f"{text!r} is no {expected}.")
+    return float(match[1]) * unit

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gnrecon.config import Settings
 from gnrecon.io import writable
 from gnrecon.runtime.errors import UsageError
-from gnrecon.settings import Settings
 
 
+# What a batch is asked for.
 @dataclass(frozen=True)
 class Request:
     """A batch as the command line asks for it.
@@ -21,9 +22,9 @@ class Request:
     lists : files with a source on each line
     patterns : of the files that are taken from folders; empty: all that can be read
     recursive : whether subfolders are entered
-    name : template of the outputs' names, see `gnrecon.batch.naming`
+    name : template of the outputs' names, see `gnrecon.batch.scan_search`
     mesh_format : extension of the meshes, without the dot
-    kinds : of files that are wanted beside each mesh, of `gnrecon.batch.outcome.FILES`
+    kinds : of files that are wanted beside each mesh, of `gnrecon.batch.job.FILES`
     settings : options, references and limits, for all scans or for some
     references : folder of references
     reference_name : template of a reference's path in there, with its extension or without

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import fcntl
+import shutil
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console, RenderableType
 from rich.table import Table
 
-from gnrecon.batch.capacity import fitting_jobs
-from gnrecon.batch.cluster import run_on_cluster
-from gnrecon.batch.devices import cuda_devices
-from gnrecon.batch.live import Board
-from gnrecon.batch.local import run_locally
-from gnrecon.batch.outcome import Outcome, Status
+from gnrecon.batch.executors import cuda_devices, fitting_jobs, run_locally, run_on_cluster
+from gnrecon.batch.job import STATE, Outcome, Status, all_records, running_folder
 from gnrecon.batch.plan import plan
+from gnrecon.batch.progress_board import Board
 from gnrecon.batch.request import Request
 from gnrecon.batch.summary import NAME, Account, write_summary
-from gnrecon.batch.workplace import workplace
-from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 
 
 def run_batch(request: Request) -> int:
@@ -89,3 +90,37 @@ def _closing(account: Account) -> list[RenderableType]:
         if outcome.failed:
             table.add_row(outcome.scan, str(outcome.cause), f"{outcome.seconds:.1f}", outcome.message)
     return [table, f"{line}; failed: {causes}."]
+
+
+# The output folder of a batch: made, held by one batch at a time, and freed of what an earlier one left half done.
+
+
+@contextmanager
+def workplace(output: Path) -> Iterator[None]:
+    """Hold an output folder while the block runs; the system lets go of it even when this process is killed.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be made or written to.
+    UsageError
+        When another batch is at work there.
+    """
+    try:
+        (output / STATE).mkdir(parents=True, exist_ok=True)
+        lock = (output / STATE / "lock").open("w", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"The folder {output} cannot be made: {error.strerror or error}.") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(
+                f"Another batch is at work in {output}; wait for its end, or choose another folder."
+            ) from None
+        for record in all_records(output / STATE / "records"):
+            record.place(output)
+        shutil.rmtree(running_folder(output), ignore_errors=True)
+        for left in (output / STATE / "records").rglob(".*.json"):
+            left.unlink(missing_ok=True)
+        yield

@@ -13,10 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from gnrecon.export import SignedDistance, curvatures, project, remove_handles, remove_stray, repair
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.project import sdf_and_gradient
-from gnrecon.export.remeshing import refine
 from gnrecon.export.resolution import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float

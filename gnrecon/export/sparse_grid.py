@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.export.lattice import Lattice
-from gnrecon.export.marching_cubes import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
+from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import Advance, part, unheard

@@ -3,7 +3,7 @@
 from gnrecon.ingest.clean import clean, isolated_clusters, require_mode
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.noise import Noise, estimate_noise, mean_spacing
-from gnrecon.ingest.normals import flip_if_inward, oriented_normals
+from gnrecon.ingest.orientation import flip_if_inward, oriented_normals
 from gnrecon.ingest.outliers import find_outliers, parse_outliers
 from gnrecon.ingest.prepare import prepare
 from gnrecon.ingest.subsample import subsample

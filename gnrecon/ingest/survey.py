@@ -17,7 +17,7 @@ from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import PointCloud, Samples
 from gnrecon.ingest.clean import isolated_clusters, repeated_points
 from gnrecon.ingest.noise import estimate_noise, local_frames, neighbour_spacing
-from gnrecon.ingest.normals import flip_if_inward
+from gnrecon.ingest.orientation import flip_if_inward
 from gnrecon.ingest.outliers import find_outliers
 
 _MOST = 10_000

@@ -9,7 +9,8 @@ from gnrecon.level_set.known_surfaces import (
     cone,
     enneper,
 )
-from gnrecon.level_set.sampling import LevelSet, SurfaceSample, Value, ValueAndGradient, sample_surface
+from gnrecon.level_set.level_set import LevelSet, Value, ValueAndGradient
+from gnrecon.level_set.sampling import SurfaceSample, sample_surface
 from gnrecon.level_set.surface_search import Beside, Crossings, Projection, find_crossings, nearest, project
 from gnrecon.level_set.topology import Joints, Region, Separate, joints, refined, separate_components
 from gnrecon.level_set.transport import derivative_along, transported

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.level_set.sampling import LevelSet, SurfaceSample, sample_surface
+from gnrecon.level_set.level_set import LevelSet
+from gnrecon.level_set.sampling import SurfaceSample, sample_surface
 from gnrecon.level_set.surface_search import nearest
 
 ENNEPER_RADIUS = 0.9

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gnrecon.level_set.sampling import LevelSet
+from gnrecon.level_set.level_set import LevelSet
 from gnrecon.runtime.parallel import set_threads
 
 _TRIES = 4

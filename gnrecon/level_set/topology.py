@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Box
-from gnrecon.level_set.sampling import LevelSet
+from gnrecon.level_set.level_set import LevelSet
 
 CELLS = 64
 

@@ -29,9 +29,9 @@ from gnrecon.optim import Problem, StopRule
 from gnrecon.residuals import Linearised, SecondOrder, mean_curvature
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import write_text
-from gnrecon.shapes import OPTIMISERS, PROBLEMS, Drawn, Moment, ShapeProblem, Term
-from gnrecon.shapes.measure import measure
-from gnrecon.shapes.pretrain import pretrained
+from gnrecon.shape_learning import OPTIMISERS, PROBLEMS, Drawn, Moment, ShapeProblem, Term
+from gnrecon.shape_learning.learn import pretrained
+from gnrecon.shape_learning.result import measure
 
 POINTS, ASIDE = 2000, 1e-3
 VARIANTS = {"neither": (0.0, 0.0), "stretch": (1.0, 0.0), "convection": (0.0, 1.0), "both": (1.0, 1.0)}

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gnrecon.commands.learn import LearnOptions, run_learn
-from gnrecon.commands.part import DesignFiles
-from gnrecon.commands.scanned import ScanFiles, is_scan
+from gnrecon.cli.learn_command import LearnOptions, run_learn
+from gnrecon.cli.learn_inputs import DesignFiles, ScanFiles, is_scan
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.shapes import OPTIMISERS
+from gnrecon.shape_learning import OPTIMISERS
 
 PROBLEMS: dict[str, tuple[str, float | None]] = {
     "catenoid": ("catenoid", None),

@@ -13,9 +13,8 @@ import psutil
 import pytest
 from errands import job, notes
 
-from gnrecon.batch.cluster import Abandoned, run_on_cluster
-from gnrecon.batch.job import running_folder
-from gnrecon.batch.outcome import Outcome, Status
+from gnrecon.batch.executors import Abandoned, run_on_cluster
+from gnrecon.batch.job import Outcome, Status, running_folder
 from gnrecon.runtime.errors import UsageError
 
 # Dask's own threads and sockets go when they please.

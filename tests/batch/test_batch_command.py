@@ -20,17 +20,17 @@ import pytest
 from errands import notes
 from scan_files import box, sphere, start, torus, write_scan
 
-from gnrecon.batch import local, runner
+from gnrecon.batch import executors as local
+from gnrecon.batch import runner
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import PROGRESS, running_folder
-from gnrecon.batch.outcome import Outcome
+from gnrecon.batch.job import PROGRESS, Outcome, running_folder
 from gnrecon.batch.request import Request
 from gnrecon.batch.runner import run_batch
-from gnrecon.cli import main
+from gnrecon.cli.app import main
+from gnrecon.config import Settings, read_settings
 from gnrecon.export import verify_file
 from gnrecon.report.report import report_schema
 from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
-from gnrecon.settings import Settings, read_settings
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
 WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")

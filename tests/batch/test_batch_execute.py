@@ -15,12 +15,10 @@ import psutil
 import pytest
 from errands import job, notes
 
-from gnrecon.batch.children import close_forkers
+from gnrecon.batch.child_process import close_forkers
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import Job, Limits, running_folder
-from gnrecon.batch.outcome import Cause, Outcome, Status
-from gnrecon.batch.record import read_record
-from gnrecon.batch.workplace import workplace
+from gnrecon.batch.job import Cause, Job, Limits, Outcome, Status, read_record, running_folder
+from gnrecon.batch.runner import workplace
 from gnrecon.runtime.errors import ExitCode
 
 
@@ -208,7 +206,7 @@ def test_temporary_files_of_the_libraries_are_gone_with_the_attempt(tmp_path: Pa
 
 def test_a_forker_that_was_killed_is_started_again(tmp_path: Path) -> None:
     done(job(tmp_path, "first", "good"))
-    (forker,) = [p for p in psutil.Process().children() if "gnrecon.batch.forker" in p.cmdline()]
+    (forker,) = [p for p in psutil.Process().children() if "gnrecon.batch.fork_server" in p.cmdline()]
     threading.Timer(0.5, lambda: os.kill(forker.pid, signal.SIGKILL)).start()
     assert done(job(tmp_path, "second", "good 1.5")).status == Status.MADE
     assert notes(tmp_path / "scans", "began") == ["first", "second", "second"]

@@ -8,8 +8,7 @@ import errands
 import pytest
 
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.find import Search, find_scans
-from gnrecon.batch.naming import Found, filled, named
+from gnrecon.batch.scan_search import Found, Search, filled, find_scans, named
 from gnrecon.runtime.errors import InputError, UsageError
 
 TREE = ("a.ply", "b.xyz", "b.ply.gz", "notes.md", ".hidden.ply", "left/a.ply", "left/deep/c.e57", ".git/d.ply")

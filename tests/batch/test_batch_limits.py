@@ -7,12 +7,12 @@ from pathlib import Path
 import errands
 import pytest
 
-from gnrecon.batch import capacity
-from gnrecon.batch.capacity import fitting_jobs
+from gnrecon.batch import executors as capacity
+from gnrecon.batch.executors import fitting_jobs
 from gnrecon.batch.job import Job, Limits
-from gnrecon.batch.quantity import parse_megabytes, parse_seconds
+from gnrecon.batch.plan import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
-from gnrecon.batch.workplace import workplace
+from gnrecon.batch.runner import workplace
 from gnrecon.options import Options
 from gnrecon.runtime.errors import OutputError, UsageError
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gnrecon.batch.job import PROGRESS, running_folder
-from gnrecon.batch.live import Board
-from gnrecon.batch.outcome import Cause, Outcome, Status
+from gnrecon.batch.job import PROGRESS, Cause, Outcome, Status, running_folder
+from gnrecon.batch.progress_board import Board
 
 MADE = Outcome("ring", "s/ring.ply", Status.MADE, files={"mesh": "out/ring.obj"}, attempts=1)
 OLD = Outcome("old", "s/old.ply", Status.UNCHANGED, files={"mesh": "out/old.obj"})

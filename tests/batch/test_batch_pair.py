@@ -10,8 +10,8 @@ import pytest
 from gnrecon.batch.job import Limits
 from gnrecon.batch.plan import plan
 from gnrecon.batch.request import Request
+from gnrecon.config import Settings, read_settings
 from gnrecon.runtime.errors import InputError, UsageError
-from gnrecon.settings import Settings, read_settings
 
 
 @pytest.fixture

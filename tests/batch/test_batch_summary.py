@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from gnrecon.batch.outcome import Cause, Outcome, Status
+from gnrecon.batch.job import Cause, Outcome, Status
 from gnrecon.batch.summary import Account, table_text, write_summary
 
 FIGURES = {

@@ -8,7 +8,7 @@ import subprocess
 import pytest
 import trimesh
 
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode
 

@@ -100,7 +100,7 @@ def test_a_check_loads_no_torch_and_no_open3d(tmp_path: Path) -> None:
     write_mesh(cube(), tmp_path / "cube.obj")
     code = (
         "import sys\n"
-        "from gnrecon.cli import main\n"
+        "from gnrecon.cli.app import main\n"
         "try:\n    main(['check', sys.argv[1], '--json'])\n"
         "except SystemExit as end:\n    assert not end.code\n"
         "assert not {'torch', 'open3d', 'skimage'} & set(sys.modules), 'heavy'\n"

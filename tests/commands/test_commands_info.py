@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scan_files import sphere, write_scan
 
-from gnrecon.cli import main
+from gnrecon.cli.app import main
 from gnrecon.report.report import report_schema
 
 

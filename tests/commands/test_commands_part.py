@@ -13,7 +13,7 @@ from gnrecon.field import Network
 from gnrecon.field.layers import WAVELET
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.shapes import pretrain
+from gnrecon.shape_learning import learn as pretrain
 
 
 @pytest.fixture
@@ -23,9 +23,9 @@ def gnrecon(capfd: pytest.CaptureFixture[str]) -> CommandLine:
 
 def test_a_few_steps_of_the_sample(gnrecon: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pretrain, "STEPS", 12)
-    monkeypatch.setattr("gnrecon.shapes.part.POOL", 30_000)
-    monkeypatch.setattr("gnrecon.shapes.part.CELLS", 32)
-    monkeypatch.setattr("gnrecon.shapes.part.NETWORK", Network((8, 8), WAVELET, (6.0, 2.0)))
+    monkeypatch.setattr("gnrecon.shape_learning.part_problem.POOL", 30_000)
+    monkeypatch.setattr("gnrecon.shape_learning.part_problem.CELLS", 32)
+    monkeypatch.setattr("gnrecon.shape_learning.part_problem.NETWORK", Network((8, 8), WAVELET, (6.0, 2.0)))
     mesh, report = tmp_path / "part.ply", tmp_path / "r.json"
     words = ("bracket", "-o", mesh, "--report", report, "--steps", 2, "--resolution", 48, "--curvature", "--clip", 1000)
     done = gnrecon("learn", *words)

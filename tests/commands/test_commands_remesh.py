@@ -13,8 +13,7 @@ from command_line import CommandLine
 from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, torus, write_scan
 from scipy.spatial import cKDTree
 
-from gnrecon.export import mesh_statistics as quality
-from gnrecon.export import verify_file
+from gnrecon.export import quality, verify_file
 from gnrecon.fit import NeuralSDF
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode

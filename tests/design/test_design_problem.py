@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from gnrecon.design import Design, DesignRegion, judge, read_design
-from gnrecon.design.measure import solid_pieces
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import read_mesh, write_mesh
 from gnrecon.runtime.errors import InputError
+from gnrecon.shape_learning.design import Design, DesignRegion, judge, read_design, solid_pieces
 
 
 def box(*sides: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:

@@ -6,8 +6,7 @@ import numpy as np
 from analytic_fields import Field, Function
 from scipy.spatial.transform import Rotation
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project
+from gnrecon.export import extract, project
 from gnrecon.geometry.mesh import Mesh
 
 Float = np.ndarray

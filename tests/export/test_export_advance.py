@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from analytic_fields import Field, torus
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import measure, project
+from gnrecon.export import extract, measure, project
 from gnrecon.runtime.errors import Cancelled
 
 BATCH = 1000

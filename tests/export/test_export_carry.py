@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.export import Neighbourhood
-from gnrecon.export import attributes as carry
+from gnrecon.export import Neighbourhood, carry
 from gnrecon.export.attributes import COUNT
 from gnrecon.geometry.colors import to_linear, to_srgb
 from gnrecon.geometry.point_cloud import PointCloud

@@ -8,8 +8,7 @@ from analytic_fields import UNIT, UTM, Field, sphere
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project, require_sound
+from gnrecon.export import extract, project, require_sound
 from gnrecon.export.boolean import crop, subtract
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame

@@ -8,9 +8,8 @@ from analytic_fields import UTM, Field, Function, sphere, torus
 from scipy.spatial import KDTree
 from sharp_fields import HALF, between, box, cylinder, extracted, notched_box
 
-from gnrecon.export import project, require_sound, simplify
+from gnrecon.export import decimate, project, require_sound, sharpen, simplify
 from gnrecon.export.metrics import nearest_on_surface
-from gnrecon.export.remeshing import decimate, sharpen
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from analytic_fields import Field, sphere
 
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import extract
 from gnrecon.export.curvature import diffused, vertex_areas
 from gnrecon.geometry.mesh import Mesh
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project, vertex_error
+from gnrecon.export import extract, project, vertex_error
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 

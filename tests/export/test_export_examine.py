@@ -7,8 +7,7 @@ import pytest
 from analytic_fields import UTM, Field, sphere
 from planted_defects import touching_in_a_vertex, with_a_fin
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import verify as examine
+from gnrecon.export import examine, extract
 from gnrecon.geometry.mesh import Mesh
 
 

@@ -7,8 +7,7 @@ import pytest
 from analytic_fields import UNIT, UTM, Field, plate, shells, sines, sphere, torus, union
 from skimage.measure import marching_cubes
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project, require_sound, verify
+from gnrecon.export import extract, project, require_sound, verify
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.marching_cubes import Growing, Leaves
 from gnrecon.export.sparse_grid import NUDGE, narrow_band

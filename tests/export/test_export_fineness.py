@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project
+from gnrecon.export import extract, project
 from gnrecon.export.resolution import (
     cells_for_edges,
     chord_error,

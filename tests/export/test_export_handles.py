@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, torus, union
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project, remove_handles, require_sound
+from gnrecon.export import extract, project, remove_handles, require_sound
 from gnrecon.export.cycles import short_loops
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.geometry.mesh import Mesh

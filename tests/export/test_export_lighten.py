@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, union
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project
-from gnrecon.export.remeshing import decimate as lighten
+from gnrecon.export import extract, lighten, project
 from gnrecon.export.remeshing.decimate import barycentric
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.rendering import vertex_sky

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, sphere, torus
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import measure, project
+from gnrecon.export import extract, measure, project
 from gnrecon.export.metrics import nearest_on_surface, sample_surface
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud

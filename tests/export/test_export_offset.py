@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from analytic_fields import UNIT, UTM, Field, shells, sphere, torus
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project, require_sound
+from gnrecon.export import extract, project, require_sound
 from gnrecon.export.metrics import Surface, nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.geometry.mesh import Mesh

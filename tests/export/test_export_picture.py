@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, Function, sphere, union
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project
+from gnrecon.export import extract, project
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.rendering import render, render_sheet

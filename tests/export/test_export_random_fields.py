@@ -12,8 +12,7 @@ import trimesh
 from analytic_fields import UNIT
 from random_fields import random_field
 
-from gnrecon.export import SignedDistance, project, repair, require_sound, verify_file
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import SignedDistance, extract, project, repair, require_sound, verify_file
 from gnrecon.io import write_mesh
 from gnrecon.runtime.errors import ExitCode, MeshError
 

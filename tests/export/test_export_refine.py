@@ -10,9 +10,7 @@ import pytest
 from analytic_fields import Field, sphere, torus, union
 from sharp_fields import box, cylinder, extracted
 
-from gnrecon.export import RefineOptions, require_sound
-from gnrecon.export import mesh_statistics as quality
-from gnrecon.export.remeshing import refine
+from gnrecon.export import RefineOptions, quality, refine, require_sound
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 

@@ -7,9 +7,7 @@ import pytest
 from analytic_fields import UTM, Field, Function, sines, sphere, torus
 from sharp_fields import between, box, cylinder, extracted, lens, to_box_edges, to_cylinder_edges, to_lens_edge
 
-from gnrecon.export import mesh_statistics as quality
-from gnrecon.export import project, require_sound, verify
-from gnrecon.export.remeshing import remesh, sharpen
+from gnrecon.export import project, quality, remesh, require_sound, sharpen, verify
 from gnrecon.export.remeshing.edge_table import CORNER, CREASE
 from gnrecon.export.remeshing.remesh import creased
 from gnrecon.geometry.mesh import Mesh

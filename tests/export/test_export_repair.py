@@ -9,8 +9,7 @@ import pytest
 from analytic_fields import UTM, Field, plate, shells, sines, sphere, union
 from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
 
-from gnrecon.export import drop_stray, project, remove_stray, repair, require_bordered, require_sound, verify
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import drop_stray, extract, project, remove_stray, repair, require_bordered, require_sound, verify
 from gnrecon.export.mesh_statistics import submesh
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError

@@ -19,8 +19,7 @@ from sharp_fields import (
     to_lens_edge,
 )
 
-from gnrecon.export import project, require_sound
-from gnrecon.export.remeshing import sharpen
+from gnrecon.export import project, require_sound, sharpen
 from gnrecon.export.remeshing.sharpen import meeting_points
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scan_files import torus
 
-from gnrecon.export import curvature as sparsely
+from gnrecon.export import sparsely
 from gnrecon.geometry.mesh import Mesh
 
 FACE = np.array([[0, 1, 2]])

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from analytic_fields import Field, sphere, torus, union
 
-from gnrecon.export import Neighbourhood, require_bordered, require_sound, trim, verify_file
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import trim as invented
+from gnrecon.export import Neighbourhood, extract, invented, require_bordered, require_sound, trim, verify_file
 from gnrecon.export.mesh_statistics import Edges, split_vertices
 from gnrecon.export.trim import CLEAR
 from gnrecon.geometry.mesh import Mesh

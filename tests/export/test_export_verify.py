@@ -9,8 +9,7 @@ import pytest
 from analytic_fields import UTM, Field, shells, sphere, torus
 from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import require_sound, verify, verify_file
+from gnrecon.export import extract, require_sound, verify, verify_file
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
 from gnrecon.runtime.errors import MeshError

@@ -8,7 +8,7 @@ from made_shapes import bored_plate, cube
 
 from gnrecon.fit.shape_priors.snapping import laid_bare
 from gnrecon.geometry.arrays import Float
-from gnrecon.ingest.normals import oriented_normals
+from gnrecon.ingest.orientation import oriented_normals
 
 NOISE = 0.002
 

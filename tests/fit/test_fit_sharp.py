@@ -14,7 +14,7 @@ from gnrecon.fit.shape_priors.edge_completion import Faces
 from gnrecon.fit.shape_priors.sharp_shape import AVERAGING, Sharp
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.ingest.normals import oriented_normals
+from gnrecon.ingest.orientation import oriented_normals
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
 SIDE = 0.8

@@ -9,8 +9,14 @@ import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
 from gnrecon.ingest import flip_if_inward, oriented_normals
-from gnrecon.ingest.orientation import agreement as confirmed
-from gnrecon.ingest.orientation import consistent_normals, disorder, gauss_normals, outwardness, winding_on_surface
+from gnrecon.ingest.orientation_methods import agreement as confirmed
+from gnrecon.ingest.orientation_methods import (
+    consistent_normals,
+    disorder,
+    gauss_normals,
+    outwardness,
+    winding_on_surface,
+)
 from gnrecon.runtime.errors import InputError
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]

@@ -10,8 +10,8 @@ from analytic_clouds import Float, sphere, torus
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
-from gnrecon.ingest.normals import oriented_normals
-from gnrecon.ingest.orientation import towards_scanner
+from gnrecon.ingest.orientation import oriented_normals
+from gnrecon.ingest.orientation_methods import towards_scanner
 from gnrecon.io import read_scans
 from gnrecon.runtime.errors import UsageError
 

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gnrecon.least_squares import KrylovResult, conjugate_gradients
-from gnrecon.least_squares import krylov as gmres
-from gnrecon.least_squares import krylov as minres
+from gnrecon.least_squares import KrylovResult, conjugate_gradients, gmres, minres
 from gnrecon.least_squares.krylov import Apply
 
 Method = Callable[[Apply, Tensor, Apply, float, int], KrylovResult]

@@ -7,13 +7,13 @@ import re
 
 import numpy as np
 import pytest
-from gnrecon.report.report.html import scales as ticks
 from hypothesis import given
 from hypothesis import strategies as st
 from pages import torus
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.statistics import Histogram
+from gnrecon.report.html import scales as ticks
 from gnrecon.report.html.charts import Curve, bars, convergence, corner_angles, curves, edge_lengths, quality
 from gnrecon.report.html.scales import STOPS, count, css, figure, memory, ramp, seconds, share
 

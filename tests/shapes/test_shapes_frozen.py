@@ -12,11 +12,10 @@ from torch import Tensor
 
 from gnrecon.field import SINE, WAVELET, Network
 from gnrecon.residuals import eikonal, gauss_curvature, interface, mean_curvature, normal_vector, surface_strain
-from gnrecon.shapes import LearnedField, cube
-from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
-from gnrecon.shapes.pretrain import pretrained
-from gnrecon.shapes.problem import ShapeProblem, z_cylinder
-from gnrecon.shapes.term import Moment, on_surface
+from gnrecon.shape_learning import LearnedField, cube
+from gnrecon.shape_learning.frozen_points import FrozenProblem, FrozenTerm
+from gnrecon.shape_learning.learn import pretrained
+from gnrecon.shape_learning.shape_problem import Moment, ShapeProblem, on_surface, z_cylinder
 
 F64 = torch.float64
 NETWORK = Network((6, 5))

@@ -14,7 +14,7 @@ from gnrecon.field import Network
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import eikonal, interface, mean_curvature
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.shapes import (
+from gnrecon.shape_learning import (
     Measurement,
     ShapeProblem,
     Term,
@@ -27,7 +27,7 @@ from gnrecon.shapes import (
     on_surface,
 )
 
-learning = sys.modules["gnrecon.shapes.learn"]  # the package has a function of that name
+learning = sys.modules["gnrecon.shape_learning.learn"]  # the package has a function of that name
 
 SMALL = Network((10, 10))
 

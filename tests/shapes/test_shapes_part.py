@@ -10,13 +10,14 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from gnrecon.design import Design, read_design
 from gnrecon.field import Network
 from gnrecon.field.layers import WAVELET
 from gnrecon.level_set import LevelSet
-from gnrecon.shapes import ShapeProblem, bracket, learn, part
-from gnrecon.shapes.pretrain import pretrained
-from gnrecon.shapes.term import LAST, Drawn, Moment
+from gnrecon.shape_learning import ShapeProblem, bracket, learn
+from gnrecon.shape_learning import part_problem as part
+from gnrecon.shape_learning.design import Design, read_design
+from gnrecon.shape_learning.learn import pretrained
+from gnrecon.shape_learning.shape_problem import LAST, Drawn, Moment
 
 SMALL = Network((8, 8), WAVELET, (6.0, 2.0))
 

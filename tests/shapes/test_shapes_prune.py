@@ -12,9 +12,9 @@ from gnrecon.field import Network
 from gnrecon.field.layers import SINE, TANH, WAVELET
 from gnrecon.residuals import signed_distance
 from gnrecon.runtime.errors import UsageError
-from gnrecon.shapes import catenoid, learn
-from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
-from gnrecon.shapes.prune import narrower, widened, without_unit
+from gnrecon.shape_learning import catenoid, learn
+from gnrecon.shape_learning.frozen_points import FrozenProblem, FrozenTerm
+from gnrecon.shape_learning.pruning import narrower, widened, without_unit
 
 POINTS = torch.as_tensor(np.random.default_rng(0).uniform(-1, 1, (400, 3)))
 

@@ -10,7 +10,7 @@ from gnrecon.geometry.signed_distance import Box
 from gnrecon.level_set import LevelSet
 from gnrecon.residuals import interface
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.shapes import (
+from gnrecon.shape_learning import (
     PROBLEMS,
     Moment,
     Term,
@@ -25,7 +25,7 @@ from gnrecon.shapes import (
     rising,
     z_cylinder,
 )
-from gnrecon.shapes.term import LAST, falling, growing
+from gnrecon.shape_learning.shape_problem import LAST, falling, growing
 
 
 def moment(value: object, box: Box, step: int = 1) -> Moment:

@@ -13,9 +13,9 @@ from markupsafe import Markup
 from gnrecon.export.mesh_statistics import corner_angles, edge_lengths
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.statistics import Histogram
+from gnrecon.report.html import scales as ticks
 from gnrecon.report.html.facts import Fact
 from gnrecon.report.html.scales import MINUS, figure, share
-from gnrecon.report.report.html import scales as ticks
 
 WIDTH, HEIGHT = 440, 210
 

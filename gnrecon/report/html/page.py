@@ -12,10 +12,10 @@ from markupsafe import Markup
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.geometry.statistics import Histogram
+from gnrecon.report.html import facts
 from gnrecon.report.html.charts import bars, convergence, quality
 from gnrecon.report.html.scales import count, css, figure, ramp
 from gnrecon.report.html.viewer import Layer, layers, model
-from gnrecon.report.report.html import facts
 from gnrecon.runtime.errors import MeshError
 from gnrecon.runtime.files import write_text
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export.remeshing import decimate as lighten
+from gnrecon.export import lighten
 from gnrecon.geometry.arrays import Float, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh

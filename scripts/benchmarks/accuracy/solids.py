@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from sample_shapes import Distance, gradient, project, smooth_cut
 
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import extract
 from gnrecon.export.metrics import sample_surface
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh

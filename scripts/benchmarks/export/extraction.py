@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import project
+from gnrecon.export import extract, project
 from gnrecon.export.lattice import Lattice
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.export import SignedDistance
-from gnrecon.export import marching_cubes as extract
+from gnrecon.export import SignedDistance, extract
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.sparse_grid import narrow_band
 from gnrecon.fit import NeuralSDF

@@ -20,7 +20,7 @@ from benchmarks.provenance import provenance
 from gnrecon.report.report import plain
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import write_text
-from gnrecon.shapes import OPTIMISERS, PROBLEMS, learn
+from gnrecon.shape_learning import OPTIMISERS, PROBLEMS, learn
 
 RATES = {"cone": 1e-4}
 """Adam's learning rate where the paper's is not 1e-3."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.least_squares import Cholesky, DenseJacobian, identity
-from gnrecon.shapes.frozen import FrozenProblem, FrozenTerm
+from gnrecon.shape_learning.frozen_points import FrozenProblem, FrozenTerm
 
 CHUNK = 512
 """Points that are differentiated together: of 64 to 2,000, those with which it is fastest."""

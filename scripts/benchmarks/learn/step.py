@@ -13,8 +13,8 @@ from torch import Tensor
 
 from benchmarks.learn.nested import nested_step, papers_step
 from gnrecon.least_squares import Cholesky, LinearSolver, identity
-from gnrecon.shapes import ShapeProblem, catenoid, learn
-from gnrecon.shapes.frozen import FrozenProblem
+from gnrecon.shape_learning import ShapeProblem, catenoid, learn
+from gnrecon.shape_learning.frozen_points import FrozenProblem
 
 STEPS = 60
 """Of the run, before the step that is timed; the surface has its shape then, and the eikonal term is gone."""

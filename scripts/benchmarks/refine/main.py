@@ -15,12 +15,9 @@ from rich.table import Table
 
 from benchmarks.provenance import provenance
 from benchmarks.refine.shapes import SHAPES
-from gnrecon.export import RefineOptions, SignedDistance, project
-from gnrecon.export import marching_cubes as extract
-from gnrecon.export import mesh_statistics as quality
+from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
 from gnrecon.export.boolean import centre_and_size, from_meshlab, to_meshlab
 from gnrecon.export.project import between
-from gnrecon.export.remeshing import refine
 from gnrecon.export.remeshing.decimate import collapsed
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.mesh import Mesh
