@@ -1,11 +1,11 @@
-# gnrecon in a container; docs/pipelines.md tells how it is built and run, on CPUs and on NVIDIA's GPUs.
+# gnrecon in a container; docs/install.md tells how it is built and run, on CPUs and on NVIDIA's GPUs.
 ARG PYTHON=3.11
 FROM python:${PYTHON}-slim-bookworm
 
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 
 # Which system libraries are needed is known in one place, to the set-up script and to `gnrecon doctor` as well.
-COPY gnrecon/system_packages.py /tmp/
+COPY gnrecon/cli/system_packages.py /tmp/
 RUN apt-get update \
     && python -I /tmp/system_packages.py | xargs --no-run-if-empty apt-get install -y --no-install-recommends \
     && rm -rf /var/lib/apt/lists/* /tmp/system_packages.py

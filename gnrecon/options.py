@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.export import RefineOptions
-from gnrecon.export.resolution import LEAST_CELLS, cells_for_edges
+from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.fit.blocks.solve import LARGE
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
@@ -21,7 +21,7 @@ from gnrecon.ingest.orientation import require_orientation
 from gnrecon.io import MOST_POINTS
 from gnrecon.runtime.errors import UsageError
 
-RESOLUTION, FEWEST_CELLS, MOST_CELLS = 256, 128, 1024
+RESOLUTION, FEWEST_CELLS, MOST_CELLS = MeshOptions.default_cells, 128, 1024
 """Cells where nothing else is known; the fewest that a sparse scan and the most that a large one gets by itself."""
 
 CELL_SPACINGS, SPARSE_CELL_SPACINGS = 1.5, 1 / 3
@@ -162,7 +162,7 @@ class Options:
         self.region()
         parse_outliers(self.outliers, self.units)
         require_mode(self.clusters)
-        self._check_fineness()
+        self.mesh()
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
         if self.read_points < 1:
@@ -187,16 +187,6 @@ class Options:
         if self.block_scheduler is not None and self.work_dir is None:
             raise UsageError("A scheduler's workers need a work folder that all of them see (--work-dir).")
         self.fit()
-        self.refine()
-
-    def _check_fineness(self) -> None:
-        if self.resolution is not None and self.edge_length is not None:
-            raise UsageError("An edge length decides the resolution, so that only one of the two can be given.")
-        if self.resolution is not None and self.resolution < LEAST_CELLS:
-            raise UsageError(f"The resolution must be at least {LEAST_CELLS} cells, not {self.resolution}.")
-        for name, value in (("edge length", self.edge_length), ("greatest error", self.max_error)):
-            if value is not None and not 0 < value < math.inf:
-                raise UsageError(f"The {name} must be a positive length, not {value:g}.")
 
     @classmethod
     def of(cls, **values: Any) -> Options:
@@ -252,18 +242,6 @@ class Options:
             return None
         return parse_reach(str(self.trim), spacing, self.units)
 
-    def cells(self, bounds: Float) -> int:
-        """Return the cells along the longest side of a box, of shape (2, 3) in file units, to begin with.
-
-        Raises
-        ------
-        UsageError
-            When the edge length would need too few or too many.
-        """
-        if self.edge_length is not None:
-            return cells_for_edges(self.edge_length, bounds)
-        return self.resolution or RESOLUTION
-
     def for_scan(self, points: Float, bounds: Float) -> Options:
         """Return the options with the cells that a scan gets where none were asked for.
 
@@ -297,9 +275,15 @@ class Options:
             device=self.device,
         )
 
-    def refine(self) -> RefineOptions:
-        """Return the options of the mesh's refinement."""
-        return RefineOptions(self.remesh, self.adaptive, self.simplify, self.faces, self.feature_angle)
+    def mesh(self) -> MeshOptions:
+        """Return the options of the meshing."""
+        return MeshOptions(
+            resolution=self.resolution,
+            edge_length=self.edge_length,
+            max_error=self.max_error,
+            keep_handles=self.keep_handles,
+            refine=RefineOptions(self.remesh, self.adaptive, self.simplify, self.faces, self.feature_angle),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as plain values."""

@@ -237,7 +237,7 @@ def _run(
         scan, layers = survey(cloud), layers_of(samples, counts.normals)
     free = options.resolution is None and options.edge_length is None and options.max_error is None
     options = options.for_scan(samples.frame.to_world(samples.points), bounds_of(samples))
-    options.cells(bounds_of(samples))  # an impossible edge length is refused before the work
+    options.mesh().cells(bounds_of(samples))  # an impossible edge length is refused before the work
     warnings = [] if layers is None else [layers.describe()]
     for sentence in [*reading.remarks(), *counts.remarks(), *warnings]:
         remark(sentence)
@@ -252,7 +252,7 @@ def _run(
     if free and options.resolution is not None:
         options = replace(options, resolution=fine_enough(sdf, options.resolution))
     # The field's own points, so that a saved field makes the same mesh again.
-    meshed = mesh_field(sdf, options, data=sdf.data, stages=stages, advance=progress.advance)
+    meshed = mesh_field(sdf, options.mesh(), data=sdf.data, stages=stages, advance=progress.advance)
     mesh, actions = meshed.mesh, meshed.actions
     around = Neighbourhood(cloud.points)
     spacing, trimming = around.spacing(), None

@@ -12,6 +12,7 @@ import numpy as np
 
 from gnrecon.export.boolean import crop, subtract
 from gnrecon.export.mesh_field import StageTimer, mesh_field, untimed
+from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.fit import NeuralSDF
@@ -19,7 +20,7 @@ from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.options import Options
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 MARGIN = 3
 """Cells beyond a crop that are meshed too, so that what closes the surface there is cut away."""
@@ -67,7 +68,7 @@ def shaped(
     shape: Shape,
     *,
     stages: StageTimer = untimed,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> tuple[Mesh, list[str]]:
     """Mesh a field in the given shape.
 
@@ -95,7 +96,7 @@ def shaped(
         When there is no zero level, or no sound mesh can be made of it.
     """
     box = sdf.bounds if shape.crop is None else shape.crop
-    cell = float(np.ptp(box, axis=0).max()) / options.cells(box)
+    cell = float(np.ptp(box, axis=0).max()) / options.mesh().cells(box)
     region = sdf.bounds
     if shape.crop is not None:
         # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
@@ -134,10 +135,10 @@ def _corners(box: Float) -> str:
     return ",".join(f"{number:.9g}" for number in box.ravel())
 
 
-def _at(options: Options, region: Float, cell: float) -> Options:
-    """The same options for another box, with cells of the given size."""
+def _at(options: Options, region: Float, cell: float) -> MeshOptions:
+    """The options of the meshing for another box, with cells of the given size."""
     cells = max(16, int(np.ceil(np.ptp(region, axis=0).max() / cell - 1e-9)))
-    return replace(options, resolution=cells, edge_length=None)
+    return replace(options, resolution=cells, edge_length=None).mesh()
 
 
 def _data(sdf: NeuralSDF, region: Float) -> tuple[Float | None, list[str]]:
@@ -151,7 +152,13 @@ def _data(sdf: NeuralSDF, region: Float) -> tuple[Float | None, list[str]]:
 
 
 def _offset(
-    mesh: Mesh, level: float, sdf: NeuralSDF, options: Options, cell: float, box: Float | None, advance: Advance
+    mesh: Mesh,
+    level: float,
+    sdf: NeuralSDF,
+    options: Options,
+    cell: float,
+    box: Float | None,
+    advance: ProgressCallback,
 ) -> tuple[Mesh, list[str]]:
     """The surface at a distance from a mesh, and how far from it its vertices were found to lie."""
     reach = max(level, 0.0) + MARGIN * cell

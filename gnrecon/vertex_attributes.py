@@ -18,7 +18,7 @@ from gnrecon.geometry.point_cloud import PointCloud, Samples
 from gnrecon.io import holds
 from gnrecon.options import Options
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ Made = tuple[list[Attribute], list[str]]
 """Attributes, and sentences about what could not be made."""
 
 
-def adorn(sources: Sources, advance: Advance = unheard) -> tuple[Mesh, list[Attribute], list[str]]:
+def adorn(sources: Sources, advance: ProgressCallback = ignore_progress) -> tuple[Mesh, list[Attribute], list[str]]:
     """Return the mesh with its attributes, the attributes themselves, and sentences for the user."""
     attributes: list[Attribute] = []
     sentences: list[str] = []

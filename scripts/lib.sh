@@ -41,7 +41,7 @@ stamp() {
 is_ready() { [ -x "$venv/bin/python" ] && [ "$(cat -- "$venv/ready.$1" 2>/dev/null)" = "$(stamp "$1")" ]; }
 
 # Prints the Debian packages that the Python $1 finds missing, in one line.
-missing_packages() { "$1" -I "$repository/gnrecon/system_packages.py" | paste -sd ' '; }
+missing_packages() { "$1" -I "$repository/gnrecon/cli/system_packages.py" | paste -sd ' '; }
 
 # Whether apt-get is there and may be used.
 may_install() { command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; }; }
@@ -58,7 +58,7 @@ apt_install() {
 
 install_system_packages() {
     local packages
-    packages=$(missing_packages "$1") || fail "$1 cannot run $repository/gnrecon/system_packages.py."
+    packages=$(missing_packages "$1") || fail "$1 cannot run $repository/gnrecon/cli/system_packages.py."
     [ -n "$packages" ] || return 0
     command -v apt-get >/dev/null ||
         fail "The system packages $packages (named as in Debian) are missing, and there is no apt-get to install them."

@@ -45,7 +45,7 @@ def test_nothing_that_the_installation_reads_is_missing() -> None:
 def test_system_libraries_are_named_in_one_place() -> None:
     (install,) = (rest for rest in arguments("RUN") if "apt-get" in rest)
     assert "python -I /tmp/system_packages.py | xargs" in install
-    assert "gnrecon/system_packages.py /tmp/" in arguments("COPY")
+    assert "gnrecon/cli/system_packages.py /tmp/" in arguments("COPY")
     assert not [package for package in LIBRARIES.values() if package in TEXT]
 
 

@@ -96,9 +96,9 @@ def test_trimming_is_in_file_units_or_spacings() -> None:
 
 def test_the_refinement_receives_its_options() -> None:
     chosen = {"remesh": 2.0, "adaptive": True, "simplify": 0.1, "faces": 500, "feature_angle": 20.0}
-    assert Options(**chosen).refine() == RefineOptions(**chosen)
-    assert Options().refine() == RefineOptions()
-    assert not Options().refine().anything
+    assert Options(**chosen).mesh().refine == RefineOptions(**chosen)
+    assert Options().mesh().refine == RefineOptions()
+    assert not Options().mesh().refine.anything
 
 
 def test_options_are_plain_values() -> None:

@@ -15,7 +15,7 @@ from gnrecon.export.project import SignedDistance, knows_blocks, sdf_around
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.parallel import slices
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 PER_BLOCK = 8
 """Points that a block counts as for a field that knows blocks: the more at once, the more they share."""
@@ -76,7 +76,9 @@ class Lattice:
         coordinates: Float = (self.field.frame.to_unit(points) - self.origin) / self.cell
         return coordinates
 
-    def values(self, nodes: npt.NDArray[np.floating] | Int, slope: float, advance: Advance = unheard) -> Float:
+    def values(
+        self, nodes: npt.NDArray[np.floating] | Int, slope: float, advance: ProgressCallback = ignore_progress
+    ) -> Float:
         """Field in cells over its slope, of shape (N,), at lattice coordinates of shape (N, 3), closed at the box.
 
         Closing is the intersection with the box that ends half a cell before the outermost layer, so that this layer
@@ -120,7 +122,7 @@ class Lattice:
             out[~within] = self._asked(clipped).reshape(-1, len(offsets))
         return self._closed(out, nodes, slope)
 
-    def _asked(self, nodes: npt.NDArray[np.floating] | Int, advance: Advance = unheard) -> Float:
+    def _asked(self, nodes: npt.NDArray[np.floating] | Int, advance: ProgressCallback = ignore_progress) -> Float:
         """Return the field in file units, of shape (N,), at lattice coordinates of shape (N, 3)."""
         out = np.empty(len(nodes))
         for rows in slices(len(nodes), self.batch):

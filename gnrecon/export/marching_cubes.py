@@ -22,7 +22,7 @@ from gnrecon.export.sparse_grid import Band, narrow_band
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 EVALUATED = 0.9
 """About which share of the time has passed when the field is known; marching cubes takes the rest."""
@@ -35,7 +35,7 @@ def extract(
     bounds: Float | None = None,
     data: Float | None = None,
     batch: int = 65536,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> Mesh:
     """Mesh the zero level of a field.
 
@@ -97,7 +97,7 @@ class Piece:
     faces: npt.NDArray[np.int32]
 
 
-def _march_all(band: Band, advance: Advance) -> list[Piece]:
+def _march_all(band: Band, advance: ProgressCallback) -> list[Piece]:
     pieces = []
     chunks = band.leaves.mixed_chunks()
     for number, chunk in enumerate(chunks, 1):

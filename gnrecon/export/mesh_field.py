@@ -14,13 +14,13 @@ from typing import Protocol
 import numpy as np
 
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
+from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.export.project import sdf_and_gradient
 from gnrecon.export.resolution import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.options import Options
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 _log = logging.getLogger(__name__)
 
@@ -93,19 +93,19 @@ class Meshed:
 
 def mesh_field(
     field: MeshedField,
-    options: Options,
+    options: MeshOptions,
     *,
     data: Float | None,
     bounds: Float | None = None,
     stages: StageTimer = untimed,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> Meshed:
     """Mesh the zero level of a field as the options ask.
 
     Parameters
     ----------
     field : MeshedField
-    options : Options
+    options : MeshOptions
     data : array of shape (N, 3), file units, or None
         Points that the field was fitted to, which tell surface from sheets and handles that were invented; with None
         all is kept.
@@ -130,9 +130,9 @@ def mesh_field(
         mesh = project(mesh, field, steps=2, rough=None if fast is field else fast, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []
-    if options.refine().anything:
+    if options.refine.anything:
         with stages("refine"):
-            mesh, refined = refine(mesh, field, options.refine(), advance=advance)
+            mesh, refined = refine(mesh, field, options.refine, advance=advance)
     with stages("repair"):
         mesh, repaired = repair(mesh)
         cut: list[str] = []
@@ -143,7 +143,7 @@ def mesh_field(
 
 
 def _extracted(
-    field: MeshedField, options: Options, data: Float | None, box: Float, advance: Advance
+    field: MeshedField, options: MeshOptions, data: Float | None, box: Float, advance: ProgressCallback
 ) -> tuple[Mesh, SignedDistance, int, list[str]]:
     """Extract, and again with more cells until the error is small enough.
 
@@ -164,7 +164,7 @@ def _extracted(
         cells, begin = min(finer(cells, error, SAFE * options.max_error), MOST_REFINED), end
 
 
-def _said(fineness: Fineness, options: Options) -> list[str]:
+def _said(fineness: Fineness, options: MeshOptions) -> list[str]:
     """Tell what became of an edge length or a greatest error that was asked for."""
     if options.edge_length is None and options.max_error is None:
         return []

@@ -19,7 +19,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.parallel import slices
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 F_SCORE_SHARE = 0.005
 """Threshold of the F-score as a share of the reference's radius."""
@@ -31,7 +31,7 @@ def measure(
     samples: int = 100_000,
     seed: int = 0,
     scale: float | None = None,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> Metrics:
     """Measure a mesh against the surface, or the cloud, that it should be.
 

@@ -18,7 +18,7 @@ from gnrecon.geometry.mesh import Mesh, area_vectors
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.parallel import slices
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 TURN, COLLAPSE = 0.3, 1e-3
 """Least cosine between a face's old and new normal, and least new area as a share of the old."""
@@ -41,7 +41,7 @@ def project(
     limit: float | None = None,
     rough: SignedDistance | None = None,
     batch: int = 65536,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> Mesh:
     """Move vertices onto the zero level and give them normals.
 

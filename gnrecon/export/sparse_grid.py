@@ -23,7 +23,7 @@ from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.parallel import slices
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 MOST_BLOCKS = 96
 """Most coarse blocks along the longest side."""
@@ -263,7 +263,7 @@ class Band:
         clear = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
         return np.clip(clear, -LIMIT, LIMIT).astype(np.float32)
 
-    def evaluate(self, leaves: Int, advance: Advance = unheard) -> None:
+    def evaluate(self, leaves: Int, advance: ProgressCallback = ignore_progress) -> None:
         """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
         for rows in slices(len(leaves), self.lattice.together(len(_NODES))):
             advance(rows.start / len(leaves))
@@ -287,7 +287,7 @@ class Band:
         return np.unique(np.argwhere(wanted) // LEAF, axis=0) + chunk * SIDE
 
 
-def narrow_band(lattice: Lattice, data: Float | None = None, advance: Advance = unheard) -> Band:
+def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCallback = ignore_progress) -> Band:
     """Evaluate the field where its zero level may pass.
 
     Parameters

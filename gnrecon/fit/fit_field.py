@@ -17,7 +17,7 @@ from gnrecon.fit.two_level import fit_adaptive
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 WIDE_STARTED, DEEP_STARTED = 0.4, 0.05
 """About which share of the time has passed when the start is made, where steps follow."""
@@ -30,7 +30,7 @@ def fit(
     samples: Samples,
     options: FitOptions | None = None,
     callback: Callback | None = None,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     folder: str | Path | None = None,
     scheduler: str | None = None,
 ) -> tuple[NeuralSDF, Solution]:
@@ -68,7 +68,11 @@ def fit(
 
 
 def _fit_network(
-    samples: Samples, options: FitOptions, rng: np.random.Generator, callback: Callback | None, advance: Advance
+    samples: Samples,
+    options: FitOptions,
+    rng: np.random.Generator,
+    callback: Callback | None,
+    advance: ProgressCallback,
 ) -> tuple[NeuralSDF, Solution]:
     """Fit the one network that the options ask for."""
     scene = Scene.of(samples, options.device, rng)

@@ -119,7 +119,7 @@ class FitOptions:
         """Return the most steps after the start, for a number of points.
 
         Below 1,000 points frequencies that follow the data fit it better and what lies between it worse (measured, see
-        docs/accuracy.md), so that by default the exact linear solve is left as it is.
+        docs/research/2026-11-21-one-wide-layer.md), so that by default the exact linear solve is left as it is.
         """
         if self.adaptive:
             return 0

@@ -25,7 +25,7 @@ from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import is_certain
 from gnrecon.optim import Solution
-from gnrecon.runtime.progress import Advance, part
+from gnrecon.runtime.progress import ProgressCallback, part
 
 _log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ class GlobalField:
 
 
 def fit_global(
-    samples: Samples, held: Mask, rows: Int, options: FitOptions, rng: np.random.Generator, advance: Advance
+    samples: Samples, held: Mask, rows: Int, options: FitOptions, rng: np.random.Generator, advance: ProgressCallback
 ) -> GlobalField:
     """Fit the smooth field to some of the samples.
 
@@ -71,7 +71,7 @@ def fit_global(
     field = Siren((UNITS,))
     linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
 
-    def fitted(reach: float, advance: Advance) -> tuple[NeuralSDF, Solution, float]:
+    def fitted(reach: float, advance: ProgressCallback) -> tuple[NeuralSDF, Solution, float]:
         solution = fit_wide(field, replace(scene, reach=reach), linear, rng, None, advance, spectrum)
         sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
         return sdf, solution, wrong_sign(sdf, scene, rng.spawn(1)[0])

@@ -31,7 +31,7 @@ from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.least_squares.direct import Cholesky
 from gnrecon.least_squares.system import identity
 from gnrecon.runtime.errors import FitError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 RIDGE = 1e-8
 
@@ -82,7 +82,7 @@ def wide_start(
     terms_of: TermsOf,
     rng: np.random.Generator,
     spectrum: Spectrum = COARSE,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> Tensor:
     """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
 

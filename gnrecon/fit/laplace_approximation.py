@@ -17,7 +17,7 @@ that, because a fit that leaves residuals which the data alone would not ask for
 root mean square: the fit's own ridge is as weak. The output weights have mean zero, all others stay where they are.
 
 The coarse distances of the volume are left out. Their errors are alike over whole regions, and taken as independent
-they make the field look certain in the middle of holes (docs/uncertainty.md).
+they make the field look certain in the middle of holes (docs/research/2026-11-21-uncertainty-models.md).
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ KEPT_BYTES = 200_000_000
 # residuals are positions in radii. Their columns are the free parameters: all of a network of up to `MOST_PARAMETERS`
 # of them; of a larger one the last layer and, where that is narrow, as many evenly spaced units of the layers before it
 # as there is room for. The features of a wide last layer span the field by themselves: the uncertainty is the same with
-# all parameters (docs/uncertainty.md).
+# all parameters (docs/research/2026-11-21-uncertainty-models.md).
 
 
 @dataclass(frozen=True)

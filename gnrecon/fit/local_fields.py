@@ -26,7 +26,7 @@ from gnrecon.fit.regularised import Shaping
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.runtime.parallel import abreast
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def fit_detail(
     features: int,
     rng: np.random.Generator,
     device: str,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     shape: ShapingFor | None = None,
 ) -> Detail:
     """Return what to add to a global field.
@@ -125,7 +125,9 @@ class _Cubes:
         features = Features.draw(count, rng, like)
         return cls(leftover, belief, features, partition, device, shaping)
 
-    def detail(self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: Advance) -> Detail:
+    def detail(
+        self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: ProgressCallback
+    ) -> Detail:
         """Fit all cubes that hold data."""
         keys, _ = self.partition.members(self.leftover.points)
         volumes = self._volumes(sdf, coarse, keys, rng)

@@ -36,7 +36,7 @@ from gnrecon.optim import (
     StopRule,
 )
 from gnrecon.optim.problem import loss_of
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def fit_deep(
     options: FitOptions,
     rng: np.random.Generator,
     callback: Callback | None,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> Solution:
     """Fit a network of several hidden layers; `advance` is told when the start is made."""
     steps = options.steps_for(len(scene.points))
@@ -166,7 +166,7 @@ def fit_wide(
     options: FitOptions,
     rng: np.random.Generator,
     callback: Callback | None,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     spectrum: Spectrum = COARSE,
 ) -> Solution:
     """Fit a network of one hidden layer; `advance` is told of the share of the start that is done."""

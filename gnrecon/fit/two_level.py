@@ -31,7 +31,7 @@ from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.optim import Solution
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 COARSE_POINTS = 5000
 """Most points that the global field sees."""
@@ -109,7 +109,7 @@ def fit_adaptive(
     samples: Samples,
     options: FitOptions,
     rng: np.random.Generator,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     folder: str | Path | None = None,
     scheduler: str | None = None,
 ) -> tuple[NeuralSDF, Solution]:

@@ -1,13 +1,13 @@
-"""Outward normals for clouds that come without, and a check of those that come with some.
+"""Outward normals for clouds that come without, a check of those that come with some, and which of them are kept.
 
-Directions come from neighbourhoods (`gnrecon.ingest.normals`); what is hard is their sign. Where it is known from where the scanner
-saw the points, that decides (`towards_scanner`). Otherwise there are two ways:
+Directions come from neighbourhoods (`gnrecon.ingest.normals`); what is hard is their sign. Where the scanner's position
+is known, the line of sight decides (`towards_scanner`). Otherwise there are two ways:
 
 - *propagation* along a spanning tree (`propagated`): right for dense scans, open ones included, but its overall sign is
-  open and thin walls and sparse regions mislead it;
-- *Gauss's theorem* solved for all normals at once (`gauss_normals`), and normals that agree with the winding number that they
-  make (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by construction; used on up to a
-  few thousand points, from which the others take their sign.
+  open, and thin walls and sparse regions mislead it;
+- *Gauss's theorem* solved for all normals at once (`gauss_normals`), and normals that agree with the winding number
+  that they make (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by
+  construction; used on up to a few thousand points, from which the others take their sign.
 
 The winding number of the result (`winding_on_surface`) decides between them, and says how far it can be trusted.
 """

@@ -16,7 +16,7 @@ from gnrecon.ingest.orientation import require_orientation, with_outward_normals
 from gnrecon.ingest.smooth import smoothed
 from gnrecon.ingest.subsample import subsample as thin
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ def prepare(
     orient: str = "auto",
     units: str | None = None,
     seed: int = 0,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> tuple[Samples, IngestCounts]:
     """Clean a cloud, orient it, smooth it if asked to, thin it, and move it into the unit ball, in this order.
 

@@ -177,7 +177,8 @@ def jacobian_layer_scaled(jacobian: Jacobian) -> Tensor:
     """Damp in units of J^T J's diagonal, to each of which a tenth of its layer's mean is added.
 
     In units of the diagonal alone, parameters that the residuals hardly see yet move beyond where the linear model
-    holds, and the damping must rise for all; with units of layers alone, late steps are shorter (docs/paper.md).
+    holds, and the damping must rise for all; with units of layers alone, late steps are shorter
+    (docs/research/2026-11-23-learning-scans.md).
     """
     diagonal = jacobian.diagonal()
     return _bounded(diagonal + SHARE * _layer_means(jacobian, diagonal))

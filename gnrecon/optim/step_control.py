@@ -8,7 +8,8 @@ trials fail. Source: Madsen, Nielsen, Tingleff, Methods for Non-linear Least Squ
 derivative along s. The step that undoes this within the model solves the same system for r_ss in the place of r, and
 half of that solution a is added:  s + a / 2. r_ss comes from one more evaluation,
 2 / h ((r(theta + h s) - r(theta)) / h - J s). A trial with |a|_D > 3/4 |s|_D is refused, because the step is then
-longer than the model can follow. In the long, bent valleys of sine networks this halves the steps (docs/solvers.md).
+longer than the model can follow. In the long, bent valleys of sine networks this halves the steps
+(docs/research/2026-11-21-step-control.md).
 Source: Transtrum and Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
 minimization (2012).
 """

@@ -69,7 +69,7 @@ def estimate(read: int, points: int, bounds: Float, options: Options) -> Estimat
     fit = options.fit()
     if not fit.adaptive or not options.device.startswith("cpu") or options.max_error is not None:
         return None
-    cells, detail = options.cells(bounds), fit.features / _FEATURES
+    cells, detail = options.mesh().cells(bounds), fit.features / _FEATURES
     fitting = _FIT_SECONDS * (points / _FIT_POINTS) ** _FIT_POWER * (0.72 + 0.28 * detail**2)
     meshing = _MESH_SECONDS * (cells / _MESH_CELLS) ** 2 * (0.51 + 0.49 * detail)
     seconds = _CORES_SHARE * (_START_SECONDS + read / _POINTS_A_SECOND + fitting + meshing)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import torch
 
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 Item = TypeVar("Item")
 
@@ -53,7 +53,7 @@ def abreast(
     work: Callable[[Item], Answer],
     items: Sequence[Item],
     device: str | torch.device = "cpu",
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
 ) -> list[Answer]:
     """Return the answers to items, in their order, found as many at a time as torch has threads, each by one of them.
 
@@ -77,7 +77,7 @@ def abreast(
         pool.shutdown(cancel_futures=True)
 
 
-def _told(answer: Answer, number: int, count: int, advance: Advance) -> Answer:
+def _told(answer: Answer, number: int, count: int, advance: ProgressCallback) -> Answer:
     advance(number / count)
     return answer
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-Advance = Callable[[float], None]
+ProgressCallback = Callable[[float], None]
 """Told the share of the work that is done, from 0 to 1 and never less than before."""
 
 
-def unheard(share: float) -> None:
+def ignore_progress(share: float) -> None:
     """Take no notice."""
 
 
-def part(advance: Advance, begin: float, end: float) -> Advance:
+def part(advance: ProgressCallback, begin: float, end: float) -> ProgressCallback:
     """Return what tells `advance` of a part of the work, which takes it from the share `begin` to `end`."""
     return lambda share: advance(begin + (end - begin) * share)

@@ -13,7 +13,7 @@ averaging (1992), with weights that fall off, as there is no end at which to beg
 
 Gauss-Newton may begin with a wider network (`wider`), and take the units that are too many away again, one by one,
 with some steps after each (`shapes.prune`). On the rocker arm that ends a seventh lower than the same network does
-that was never wider (docs/paper.md).
+that was never wider (docs/research/2026-11-25-vertex-normals-and-width.md).
 """
 
 from __future__ import annotations

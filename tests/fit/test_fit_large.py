@@ -32,7 +32,7 @@ from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.options import Options
 from gnrecon.runtime.errors import Cancelled, FitError, MemoryLimitError, UsageError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 COUNT = 1500
 AXES = np.array([1.0, 0.6, 0.5])
@@ -63,7 +63,10 @@ def constant_field(samples: Samples) -> NeuralSDF:
 
 
 def fitted(
-    folder: Path | None = None, block_points: int = 200, scheduler: str | None = None, advance: Advance = unheard
+    folder: Path | None = None,
+    block_points: int = 200,
+    scheduler: str | None = None,
+    advance: ProgressCallback = ignore_progress,
 ) -> tuple[NeuralSDF, Detail]:
     samples = ellipsoid()
     sdf, rng = constant_field(samples), np.random.default_rng(0)
@@ -137,7 +140,7 @@ def test_a_cluster_that_loses_a_worker_changes_no_digit(
         (folder / "block-000000.npz").unlink()
         (folder / "normals.npy").unlink()
         with pytest.raises(FitError, match=r"The cluster could not solve a block: .*normals\.npy"):
-            scheduled.solve_scheduled(Work(folder), [0], cluster.scheduler_address, unheard)
+            scheduled.solve_scheduled(Work(folder), [0], cluster.scheduler_address, ignore_progress)
 
 
 def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,7 +149,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
     assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
     monkeypatch.setattr("gnrecon.runtime.parallel.PATIENCE", "1s")
     with pytest.raises(UsageError, match=r"No scheduler answers at tcp://127\.0\.0\.1:9"):
-        scheduled.solve_scheduled(Work(tmp_path), [0], "tcp://127.0.0.1:9", unheard)
+        scheduled.solve_scheduled(Work(tmp_path), [0], "tcp://127.0.0.1:9", ignore_progress)
 
 
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
@@ -285,4 +288,4 @@ def test_a_process_that_fails_ends_the_fit(
     monkeypatch.setattr(workers.sys, "executable", str(program))
     monkeypatch.setattr(workers, "_room", lambda: 2)
     with pytest.raises(error, match=sentence):
-        workers.solve_blocks(Work(tmp_path), [0, 1, 2], 2, "cpu", unheard)
+        workers.solve_blocks(Work(tmp_path), [0, 1, 2], 2, "cpu", ignore_progress)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from least_squares import CASES, Formula, Plain, rosenbrock
+from least_squares_problems import CASES, Formula, Plain, rosenbrock
 from torch import Tensor
 
 from gnrecon.least_squares import Cholesky, DampedSystem, DenseJacobian

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from least_squares import CASES, Case, Formula, Plain
+from least_squares_problems import CASES, Case, Formula, Plain
 from torch import Tensor
 
 from gnrecon.optim import LBFGS, Adam, StopRule

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from least_squares import CASES, Plain, rosenbrock
+from least_squares_problems import CASES, Plain, rosenbrock
 from scripted import Scripted, posed
 from torch import Tensor
 from torch.func import jacrev

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from least_squares import CASES, Plain, rosenbrock
+from least_squares_problems import CASES, Plain, rosenbrock
 from torch import Tensor
 
 from gnrecon.least_squares import DenseJacobian

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from least_squares import CASES
+from least_squares_problems import CASES
 from scripted import posed
 
 from gnrecon.optim import FixedStep, GaussNewton, LogLineSearch, StopRule

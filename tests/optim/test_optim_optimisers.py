@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from least_squares import CASES, Case, Plain, circle_fit, exponential_fit, rosenbrock
+from least_squares_problems import CASES, Case, Plain, circle_fit, exponential_fit, rosenbrock
 from torch import Tensor
 
 from gnrecon.optim import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from least_squares import CASES, Case, Plain, rosenbrock
+from least_squares_problems import CASES, Case, Plain, rosenbrock
 from scripted import Scripted, posed
 from torch import Tensor
 

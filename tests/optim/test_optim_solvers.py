@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from least_squares import CASES, Case
+from least_squares_problems import CASES, Case
 from torch import Tensor
 
 from gnrecon.least_squares import SOLVERS, Cholesky, DampedSystem, Jacobian, Metric, Step, identity

@@ -20,7 +20,7 @@ from gnrecon.export.repair import repair
 from gnrecon.export.verify import verify
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.runtime.progress import Advance, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 GENTLER = (1.0, 0.5, 0.25)
 """Factors by which a step's strength is lowered before it is given up."""
@@ -73,7 +73,7 @@ class RefineOptions:
 
 
 def refine(
-    mesh: Mesh, field: SignedDistance, options: RefineOptions, *, advance: Advance = unheard
+    mesh: Mesh, field: SignedDistance, options: RefineOptions, *, advance: ProgressCallback = ignore_progress
 ) -> tuple[Mesh, list[str]]:
     """Adapt a mesh to the options; where they ask for nothing, it comes back as it is.
 

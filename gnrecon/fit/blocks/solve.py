@@ -32,7 +32,7 @@ from gnrecon.fit.model_selection import Leftover, choose
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.parallel import slices
-from gnrecon.runtime.progress import Advance, part, unheard
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 LARGE = 200_000
 """Points from which a scan is fitted by blocks."""
@@ -51,7 +51,7 @@ def fit_large(
     options: FitOptions,
     rng: np.random.Generator,
     folder: str | Path | None = None,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     scheduler: str | None = None,
     block_points: int = BLOCK_POINTS,
 ) -> Detail:

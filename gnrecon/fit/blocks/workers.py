@@ -21,7 +21,7 @@ from gnrecon.fit.blocks.store import Work
 from gnrecon.fit.blocks.worker import DONE
 from gnrecon.runtime.errors import FitError, MemoryLimitError
 from gnrecon.runtime.parallel import connected, having_threads, require_distributed
-from gnrecon.runtime.progress import Advance
+from gnrecon.runtime.progress import ProgressCallback
 
 NEED = 1.2e9
 """Bytes that a process needs at most, with Python and torch; no more processes are started than have room."""
@@ -29,7 +29,7 @@ NEED = 1.2e9
 Process = subprocess.Popen[str]
 
 
-def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str, advance: Advance) -> None:
+def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str, advance: ProgressCallback) -> None:
     """Solve blocks of a work folder, in this process where one is enough, or where a GPU is shared.
 
     Parameters
@@ -64,7 +64,7 @@ def _room() -> int:
     return max(1, int(psutil.virtual_memory().available / NEED))
 
 
-def _solve_beside(folder: Path, blocks: Sequence[int], processes: int, advance: Advance) -> None:
+def _solve_beside(folder: Path, blocks: Sequence[int], processes: int, advance: ProgressCallback) -> None:
     waiting, done = iter(blocks), 0
     with _started(folder, processes) as workers, selectors.DefaultSelector() as answers:
         for worker in workers:
@@ -141,7 +141,7 @@ RETRIES = 2
 # is solved twice, as by a worker that was only thought lost, does no harm.
 
 
-def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: Advance) -> None:
+def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: ProgressCallback) -> None:
     """Solve blocks of a work folder on a cluster, as many at a time as its workers have threads.
 
     Whatever ends this function early, such as Ctrl-C, calls back the blocks that are still waiting.

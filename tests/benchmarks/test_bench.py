@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.__main__ import main as bench

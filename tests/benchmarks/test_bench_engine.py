@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 from benchmarks.engine import kernel, million, ours
 from benchmarks.engine.baseline import DAMPING, Baseline, pretrained

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import math
-import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent / "export"))
-
 from analytic_fields import UTM, Field, torus
 
 from gnrecon.export import SignedDistance
 from gnrecon.export import mesh_field as meshing
 from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.export.resolution import chord_error
 from gnrecon.ingest.noise import neighbour_spacing
-from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError
 
@@ -38,14 +33,14 @@ def field() -> Precise:
 
 
 def test_an_edge_length_decides_the_cells(field: Precise) -> None:
-    meshed = mesh_field(field, Options(edge_length=1.2), data=None)
+    meshed = mesh_field(field, MeshOptions(edge_length=1.2), data=None)
     assert meshed.fineness.edge_length == pytest.approx(1.2, rel=0.1)
     assert meshed.actions == [meshed.fineness.describe()]
-    assert mesh_field(field, Options(resolution=20), data=None).actions == []
+    assert mesh_field(field, MeshOptions(resolution=20), data=None).actions == []
 
 
 def test_a_mesh_becomes_finer_until_the_error_is_small_enough(field: Precise) -> None:
-    coarse = mesh_field(field, Options(resolution=20), data=None)
+    coarse = mesh_field(field, MeshOptions(resolution=20), data=None)
     wanted = 0.2 * coarse.fineness.chord_error
     shares: dict[str, list[float]] = {}
 
@@ -56,7 +51,7 @@ def test_a_mesh_becomes_finer_until_the_error_is_small_enough(field: Precise) ->
     def advance(share: float) -> None:
         list(shares.values())[-1].append(share)
 
-    options = Options(resolution=20, max_error=wanted)
+    options = MeshOptions(resolution=20, max_error=wanted)
     meshed = mesh_field(field, options, data=None, bounds=field.bounds, stages=stage, advance=advance)
     assert 20 < meshed.fineness.resolution < 80
     found = chord_error(meshed.mesh, field, field.bounds, np.ptp(field.bounds, axis=0).max() / 50)
@@ -72,7 +67,7 @@ def test_a_mesh_becomes_finer_until_the_error_is_small_enough(field: Precise) ->
 
 def test_what_the_limit_of_cells_reaches_is_said(field: Precise, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(meshing, "MOST_REFINED", 30)
-    meshed = mesh_field(field, Options(resolution=20, max_error=1e-6), data=None)
+    meshed = mesh_field(field, MeshOptions(resolution=20, max_error=1e-6), data=None)
     assert meshed.fineness.resolution == 30
     assert meshed.actions[-1] == "That is not within 1e-06: the limit of 30 cells was reached."
 
@@ -80,17 +75,17 @@ def test_what_the_limit_of_cells_reaches_is_said(field: Precise, monkeypatch: py
 @pytest.mark.parametrize("values", [{"edge_length": 0.0}, {"edge_length": np.inf}, {"max_error": -1.0}])
 def test_senseless_lengths_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(UsageError, match="must be a positive length"):
-        Options(**values)
+        MeshOptions(**values)
 
 
 def test_a_resolution_and_an_edge_length_exclude_each_other() -> None:
     with pytest.raises(UsageError, match="only one of the two"):
-        Options(resolution=128, edge_length=0.5)
+        MeshOptions(resolution=128, edge_length=0.5)
     box = np.array([[0.0, 0, 0], [1, 1, 1]])
-    assert Options().cells(box) == 256
-    assert Options(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
+    assert MeshOptions().cells(box) == 256
+    assert MeshOptions(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
     with pytest.raises(UsageError, match="possible"):
-        Options(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))
+        MeshOptions(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))
 
 
 @pytest.mark.parametrize(("shift", "tilt", "kept"), [(0.0, 0.0, True), (0.3, 0.0, False), (0.0, 0.01, False)])
@@ -108,13 +103,13 @@ def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
     box, plane = np.array([[0.0, 0, 0], [1, 1, 0.2]]), np.stack(np.meshgrid(range(60), range(60), [0.0]), -1)
     points = plane.reshape(-1, 3) / 60
     spacing = neighbour_spacing(points)
-    assert Options().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
+    assert MeshOptions().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
     assert 128 < math.ceil(3.0 / spacing) < 256
-    assert Options().for_scan(points[::7], box).resolution == 128
-    assert Options().for_scan(points[:5], box).resolution == 128
-    assert Options().for_scan(points, 3 * box).resolution == 256
-    assert Options().for_scan(np.zeros((9, 3)), box).resolution == 256
-    assert Options(resolution=50).for_scan(points, box).resolution == 50
+    assert MeshOptions().for_scan(points[::7], box).resolution == 128
+    assert MeshOptions().for_scan(points[:5], box).resolution == 128
+    assert MeshOptions().for_scan(points, 3 * box).resolution == 256
+    assert MeshOptions().for_scan(np.zeros((9, 3)), box).resolution == 256
+    assert MeshOptions(resolution=50).for_scan(points, box).resolution == 50
 
 
 def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
@@ -130,7 +125,7 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
         cells = result.report["fineness"]["resolution"]
         assert result.report["options"]["resolution"] == cells
         found[noise] = cells
-        by_points = Options().for_scan(scan, box).resolution
+        by_points = MeshOptions().for_scan(scan, box).resolution
         assert by_points is not None
         assert cells >= by_points
         if noise == 0.0:

@@ -22,7 +22,7 @@ from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, limited, reconstruct
 from gnrecon.runtime.parallel import abreast
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
 HEAVY = ("torch", "open3d", "scipy", "trimesh", "pymeshlab", "skimage", "rich", "typer", "matplotlib")
 

@@ -44,7 +44,7 @@ def test_the_library_says_nothing_by_itself() -> None:
     script = (
         "import logging, gnrecon\nlogging.getLogger('gnrecon.fit').error('loud')\nprint(logging.getLogger().handlers)"
     )
-    repository = Path(__file__).resolve().parents[1]
+    repository = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=repository, check=True)
     assert (done.stdout, done.stderr) == ("[]\n", "")
 

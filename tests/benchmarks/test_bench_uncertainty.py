@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 # The benchmarks are scripts beside the package, as ./scripts/bench puts them on the path.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 from benchmarks.uncertainty.main import COLUMNS, main
 from benchmarks.uncertainty.picture import HIGHEST, LOWEST, colors

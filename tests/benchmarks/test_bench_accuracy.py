@@ -15,7 +15,7 @@ from rich.console import Console
 from gnrecon.geometry.arrays import Float
 
 # The benchmarks are scripts beside the package, as ./scripts/bench puts them on the path.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 from benchmarks.__main__ import main as bench
 from benchmarks.accuracy.cases import CASES, GROUPS, HARD
