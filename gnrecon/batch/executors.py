@@ -22,8 +22,8 @@ from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import Cause, Job, Outcome, Status, running_folder
 from gnrecon.options import Options
 from gnrecon.report.estimate import estimate
+from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.runtime.parallel import connected, require_distributed
 
 
 def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: Callable[[Outcome], None]) -> None:
@@ -157,7 +157,7 @@ class Abandoned:
 @contextmanager
 def _client(distributed: Any, address: str | None, count: int) -> Iterator[Any]:
     if address is not None:
-        with connected(address) as client:
+        with dask_client(address) as client:
             yield client
         return
     # The limits of memory are the jobs' own; a dashboard is for those who have a cluster of their own.

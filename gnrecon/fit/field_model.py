@@ -22,7 +22,7 @@ from gnrecon.geometry.point_cloud import Frame
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.files import atomic_write
-from gnrecon.runtime.parallel import abreast, slices
+from gnrecon.runtime.parallel import map_in_threads, slices
 from gnrecon.version import __version__
 
 _BATCH_BYTES = 4_000_000
@@ -186,7 +186,7 @@ class NeuralSDF:
     def _each_batch(self, fill: Callable[[slice], None], count: int) -> None:
         """Have `count` rows filled, so many at a time as the cache holds."""
         size = max(256, _BATCH_BYTES // (8 * max(self.field.widths)))
-        abreast(fill, slices(count, size), self.theta.device)
+        map_in_threads(fill, slices(count, size), self.theta.device)
 
 
 FORMAT = "gnrecon-sdf-1"

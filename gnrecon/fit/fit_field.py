@@ -17,7 +17,7 @@ from gnrecon.fit.two_level import fit_adaptive
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 WIDE_STARTED, DEEP_STARTED = 0.4, 0.05
 """About which share of the time has passed when the start is made, where steps follow."""
@@ -86,7 +86,7 @@ def _fit_network(
             callback(record)
         advance(started + (1.0 - started) * record.step / steps)
 
-    fitted = method(field, scene, options, rng, told, part(advance, 0.0, started))
+    fitted = method(field, scene, options, rng, told, subrange(advance, 0.0, started))
     return NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict()), fitted
 
 

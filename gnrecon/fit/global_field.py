@@ -23,9 +23,9 @@ from gnrecon.fit.objective import REACH, Scene
 from gnrecon.fit.single_network import fit_wide
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import is_certain
+from gnrecon.geometry.signed_distance import is_sign_certain
 from gnrecon.optim import Solution
-from gnrecon.runtime.progress import ProgressCallback, part
+from gnrecon.runtime.progress import ProgressCallback, subrange
 
 _log = logging.getLogger(__name__)
 
@@ -78,9 +78,9 @@ def fit_global(
 
     # Where more is asked of the surface in holes than the data says, normals may not carry it out of the box.
     reach = REACH if options.regularisers else smoothness.reach
-    sdf, solution, wrong = fitted(reach, part(advance, 0.0, 0.5))
+    sdf, solution, wrong = fitted(reach, subrange(advance, 0.0, 0.5))
     if reach > REACH and wrong > FEW:
-        plain, plainly, ghosts = fitted(REACH, part(advance, 0.5, 1.0))
+        plain, plainly, ghosts = fitted(REACH, subrange(advance, 0.5, 1.0))
         if wrong > ghosts + FEW:
             reach, sdf, solution = REACH, plain, plainly
     _log.info(
@@ -97,7 +97,7 @@ def wrong_sign(sdf: NeuralSDF, scene: Scene, rng: np.random.Generator) -> float:
     """Return the share of the free space where the field has the wrong sign beyond doubt, in [0, 1]."""
     x, distance = scene.volume(scene.volume_count, rng)
     other = sdf.sdf(sdf.frame.to_world(x)) * distance < 0
-    certain = is_certain(scene.coarse.winding_number(x[other]))
+    certain = is_sign_certain(scene.coarse.winding_number(x[other]))
     return float(certain.sum() / max(len(x), 1))
 
 

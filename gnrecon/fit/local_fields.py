@@ -25,8 +25,8 @@ from gnrecon.fit.model_selection import Leftover, Volume
 from gnrecon.fit.regularised import Shaping
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import CoarseDistance
-from gnrecon.runtime.parallel import abreast
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.parallel import map_in_threads
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 _log = logging.getLogger(__name__)
 
@@ -144,7 +144,7 @@ class _Cubes:
             patch = self.leftover.patch(rows, center, volumes[number], self.device)
             return length, self._solved(PatchSystem(patch, self.features, length, patch.size), length, center)
 
-        cubes = abreast(solved, range(len(keys)), self.device, part(advance, CHOSEN, 1.0))
+        cubes = map_in_threads(solved, range(len(keys)), self.device, subrange(advance, CHOSEN, 1.0))
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))

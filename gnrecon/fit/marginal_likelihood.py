@@ -27,7 +27,7 @@ from gnrecon.fit.local_solve import Patch, data_kernel
 from gnrecon.fit.shape_priors.edge_completion import over_planes
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.parallel import map_in_threads
 
 POSITIONS = (0.005, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 """Noise of the positions to choose from, over the radius of a point's disk."""
@@ -78,7 +78,7 @@ class Evidence:
         ----------
         length : over which the functions vary, unit coordinates
         """
-        kernels = abreast(
+        kernels = map_in_threads(
             lambda patch: data_kernel(patch, self.features, length, patch.size), self.patches, self.device
         )
         both = list(zip(self.patches, kernels, strict=True))
@@ -86,7 +86,7 @@ class Evidence:
         @cache
         def found(place: Place) -> float:
             position, angle = self._noise_at(place)
-            return sum(abreast(lambda one: log_density(*one, position, angle), both, self.device))
+            return sum(map_in_threads(lambda one: log_density(*one, position, angle), both, self.device))
 
         best = FIRST
         for stride in STRIDES:

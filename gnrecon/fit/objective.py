@@ -19,7 +19,7 @@ from gnrecon.field.networks import Siren
 from gnrecon.fit.fit_options import FitOptions, normal_residual
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, sample_near_surface
 from gnrecon.least_squares.jacobian import Block, LayeredJacobian
 from gnrecon.least_squares.layer_products import LayerRows
 from gnrecon.residuals.constraints import Linearised, Residual, eikonal, interface, signed_distance
@@ -264,7 +264,7 @@ def step_terms(
     volume : samples, of shape (Q, 3), and their coarse distances, of shape (Q,)
     """
     eikonal_count = min(EIKONAL_COUNT, most)
-    near = near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
+    near = sample_near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
     around = np.concatenate([near, scene.box.sample(eikonal_count // 3, rng)])
     eikonal_weight = (EIKONAL_REACH * scene.coarse.spacing) ** 2 * data_weight**0.5
     return [
@@ -344,7 +344,7 @@ class Scene:
 
     def places(self, count: int, rng: np.random.Generator) -> Float:
         """Return such points, of shape (Q, 3), also where no distance is known because the data is too near."""
-        shell = near_surface(self.samples.points, SHELL * self.coarse.spacing, count // 2, rng)
+        shell = sample_near_surface(self.samples.points, SHELL * self.coarse.spacing, count // 2, rng)
         inside = ((shell > self.box.lower) & (shell < self.box.upper)).all(axis=1)
         return np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]])
 

@@ -30,7 +30,7 @@ from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.objective import FieldProblem, Scene, Term, data_terms, distance_term
 from gnrecon.fit.regularisers import Jet, Regulariser, Sines, Wish, bent
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.geometry.signed_distance import Density, least_values
+from gnrecon.geometry.signed_distance import Density, free_space_bounds
 from gnrecon.least_squares.direct import damped_factor
 from gnrecon.level_set import LevelSet, sample_surface
 from gnrecon.residuals import SecondOrder, free_space
@@ -78,7 +78,7 @@ class Free:
         x = scene.places(MORE * scene.volume_count, rng)
         known, distance, _, certain = scene.coarse.at(x)
         kept = certain & (np.abs(distance) > CLEAR)
-        return cls(x[known][kept], least_values(distance[kept], DEEP))
+        return cls(x[known][kept], free_space_bounds(distance[kept], DEEP))
 
     def wishes(self, rows: Mask, known: Float, scale: float, like: Tensor) -> list[Wish]:
         """Return what is asked at some of the points.

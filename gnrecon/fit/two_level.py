@@ -31,7 +31,7 @@ from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.optim import Solution
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 COARSE_POINTS = 5000
 """Most points that the global field sees."""
@@ -153,7 +153,7 @@ def fit_adaptive(
     whole = task
     closes = not options.regularisers  # which say themselves how holes are closed
     task = task.continued(rng) if closes else task
-    first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, 0.0, SHARE / 2))
+    first = fit_global(task.samples, task.held, task.rows, options, rng, subrange(advance, 0.0, SHARE / 2))
     if not by_blocks:  # of so many points, distances alone tell the outliers
         off = outlying(first.sdf.sdf(samples.frame.to_world(samples.points)), Density(samples.points))
         left_out = int(off.sum())
@@ -161,12 +161,12 @@ def fit_adaptive(
             samples = replace(samples, points=samples.points[~off], normals=samples.normals[~off])
             task = _Task.of(samples, Sharp.of(samples), by_blocks, rng) if task.sharp else whole.without(off)
             task = task.continued(rng) if closes else task
-            first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, SHARE / 2, SHARE))
+            first = fit_global(task.samples, task.held, task.rows, options, rng, subrange(advance, SHARE / 2, SHARE))
     sdf = first.sdf
     shape = None
     if options.regularisers:
         sdf, shape = _shaped(first, task.samples, options, rng)
-    rest = part(advance, SHARE, 1.0)
+    rest = subrange(advance, SHARE, 1.0)
     known = None
     try:
         if by_blocks:
