@@ -157,9 +157,6 @@ def main(words: list[str]) -> NoReturn:
     os._exit(0)
 
 
-if __name__ == "__main__":
-    main(sys.argv[1:])
-
 _PR_SET_PDEATHSIG = 1
 
 
@@ -205,3 +202,7 @@ def end_with(parent: int) -> None:
 def _redirect(descriptor: int, target: int) -> None:
     os.dup2(descriptor, target)
     os.close(descriptor)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

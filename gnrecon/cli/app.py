@@ -212,7 +212,7 @@ def reconstruct_command(
         settings=config,
     )
     if dry_run:
-        from gnrecon.cli.inspect_commands import info
+        from gnrecon.cli.info_command import info
 
         files.check()
         raise SystemExit(info(scans, options, format))
@@ -642,7 +642,7 @@ def info_command(
     debug: Debug = False,
 ) -> None:
     """Tell what is in a scan, what would trouble a fit, and what a run would do by default."""
-    from gnrecon.cli.inspect_commands import info
+    from gnrecon.cli.info_command import info
 
     del debug
     raise SystemExit(info(scans, {}, format, as_json=as_json))
