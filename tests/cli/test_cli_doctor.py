@@ -16,7 +16,7 @@ from other_packages import install, packages
 from rich.console import Console
 
 import gnrecon
-from gnrecon.cli.app import doctor, system_packages
+from gnrecon.cli import doctor, system_packages
 from gnrecon.cli.doctor import Check
 
 
