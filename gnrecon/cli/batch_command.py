@@ -128,7 +128,7 @@ def batch_command(
     debug: Debug = False,
     **options: Any,
 ) -> None:
-    """Reconstruct many scans, each in its own process; failures do not stop the batch, and finished scans are skipped."""
+    """Reconstruct many scans, each in its own process; a failure stops no others, and finished scans are skipped."""
     from gnrecon.batch.request import Request
     from gnrecon.batch.runner import run_batch
     from gnrecon.config import read_settings

@@ -21,8 +21,8 @@ def mesh_command(
     crop: Annotated[
         str | None,
         typer.Option(
-            help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is then that of the box, and "
-            "cuts are closed by flat caps.",
+            help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is then that of the box, "
+            "and cuts are closed by flat caps.",
             rich_help_panel=Panel.MESH,
         ),
     ] = None,

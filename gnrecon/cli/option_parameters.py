@@ -52,7 +52,7 @@ def _parameter(row: OptionRow) -> inspect.Parameter:
 
 def _command_line_type(row: OptionRow) -> Any:
     """The type that typer reads: texts may be repeated; numbers in a list, or a number or a text, are one text."""
-    kind = list[str] if row.types == (tuple[str, ...],) else str if _is_parsed(row) else row.types[-1]
+    kind: Any = list[str] if row.types == (tuple[str, ...],) else str if _is_parsed(row) else row.types[-1]
     return kind | None if row.default is None else kind
 
 

@@ -395,6 +395,14 @@ def test_version_and_help() -> None:
         assert option in details.stdout
 
 
+def test_the_command_line_starts_without_the_stages() -> None:
+    code = "import sys, gnrecon.cli.app; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("gnrecon.")}
+    assert rooms == {"cli", "deprecated_paths", "geometry", "option_table", "runtime", "version"}
+    assert "scipy" not in loaded
+
+
 def test_a_scan_from_standard_input_makes_all_files(scan: Path, out: Path) -> None:
     command = [sys.executable, "-m", "gnrecon", "-", "--format", "ply", "-o", str(out / "a.ply"), *FAST_WORDS]
     command += ["--html", str(out / "a.html")]
