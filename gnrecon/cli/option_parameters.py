@@ -46,7 +46,8 @@ def with_table_options(*, batch: bool) -> Callable[[Callable[..., None]], Callab
 
 
 def _parameter(row: OptionRow) -> inspect.Parameter:
-    annotation = Annotated[_command_line_type(row), table_option(row.name)]
+    annotated: Any = Annotated  # type checkers would take Annotated[...] for an alias
+    annotation = annotated[_command_line_type(row), table_option(row.name)]
     return inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=row.default, annotation=annotation)
 
 
