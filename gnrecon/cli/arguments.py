@@ -161,7 +161,7 @@ Solver = Annotated[
     str,
     typer.Option(
         help="Linear solver of Gauss-Newton's steps: auto (by rows, parameters, memory and device), cholesky, qr, "
-        "row-space, cg-sampled, cg-neighbours, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, minres, gmres or "
+        "row-space, cg-sampled, cg-neighbours, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, gmres or "
         "sketched.",
         rich_help_panel=FIT,
     ),
