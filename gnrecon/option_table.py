@@ -237,7 +237,7 @@ class OptionTable:
         "auto",
         Panel.FIT,
         "Linear solver of Gauss-Newton's steps: auto (by rows, parameters, memory and device), cholesky, qr, "
-        "row-space, cg-sampled, cg-neighbours, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, minres, gmres or "
+        "row-space, cg-sampled, cg-neighbours, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, gmres or "
         "sketched.",
     )
     search: str = _row(

@@ -18,7 +18,7 @@ from gnrecon.ingest import Layers, layers_of, prepare, survey
 from gnrecon.io import (
     CLOUD_WRITERS,
     Reading,
-    all_members,
+    all_input_files,
     holds,
     read_any,
     read_mesh,
@@ -207,7 +207,7 @@ def evaluate(
     OutputError
         When the report cannot be written.
     """
-    require_files(all_members([path, reference]), [] if report is None else [report], overwrite)
+    require_files(all_input_files([path, reference]), [] if report is None else [report], overwrite)
     metrics = measure(read_mesh(path), read_reference(reference), samples=samples, seed=seed)
     if report is not None:
         figures = {"mesh": str(path), "reference": str(reference), "seed": seed, **metrics.as_dict()}
@@ -233,7 +233,7 @@ def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool 
     MeshError, OutputError
         When the target cannot be written.
     """
-    require_files(all_members([source]), [target], overwrite)
+    require_files(all_input_files([source]), [target], overwrite)
     extension = target.suffix.lower()
     if extension not in (known := dict.fromkeys([*writable(), *CLOUD_WRITERS])):
         named = ", ".join(suffix[1:] for suffix in known)

@@ -15,7 +15,7 @@ from gnrecon.cli.learn_inputs import FILES, NAME, DesignFiles, ScanFiles, is_sca
 from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
-from gnrecon.io import all_members, check_writable, write_mesh
+from gnrecon.io import all_input_files, check_writable, write_mesh
 from gnrecon.pipeline import limited
 from gnrecon.report.report import plain, versions
 from gnrecon.runtime.errors import ExitCode, UsageError
@@ -103,7 +103,7 @@ def run_learn(
         raise UsageError(f"A design is for the problem {NAME} alone, not for {name}.")
     check_writable(output)
     sources = [*files.named(), *([scan.path(name)] if is_scan(name) else [])]
-    require_files(all_members(sources), [path for path in (output, report) if path is not None], overwrite)
+    require_files(all_input_files(sources), [path for path in (output, report) if path is not None], overwrite)
     design = files.read() if name == NAME else None
     problem, frame = _posed(name, design, files, scan, options.seed)
     console = Console(stderr=True, quiet=quiet)
