@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+from importlib import import_module
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from gnrecon.shape_learning import PROBLEMS, catenoid
 def test_figures_of_a_small_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys.modules["gnrecon.shape_learning.learn"], "STEPS", 15)
+    monkeypatch.setattr(import_module("gnrecon.shape_learning.learn"), "STEPS", 15)
     monkeypatch.setitem(PROBLEMS, "catenoid", lambda: replace(catenoid(), network=Network((8, 8), TANH)))
     out = tmp_path / "figures.json"
     assert bench(["transport", "--problem", "catenoid", "--steps", "0,2", "--json", str(out)]) == ExitCode.OK
