@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.runtime.parallel import map_in_threads, slices
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
 
 OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
-from gnrecon.runtime.parallel import slices
 
 
 @dataclass(frozen=True)

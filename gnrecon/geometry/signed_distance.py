@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.runtime.parallel import map_in_threads, slices
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)

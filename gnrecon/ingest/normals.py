@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.local_pca import principal_axes, tangent_coordinates
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 _NEIGHBOURS = (12, 24, 48)
 

@@ -83,8 +83,3 @@ def map_in_threads(
         return [report(future.result(), number) for number, future in enumerate(futures, 1)]
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def slices(count: int, size: int = 1 << 18) -> list[slice]:
-    """Return slices that cover `count` rows, at most `size` rows each, so that temporary arrays stay small."""
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]

@@ -42,6 +42,9 @@ def test_each_point_is_where_the_weighted_quadric_says(rng: np.random.Generator)
     moved, turned = smooth_points(noisy, normals, 0.4)
     for row in range(0, 400, 40):
         near = np.flatnonzero((np.linalg.norm(noisy - noisy[row], axis=1) < 0.4) & (normals @ normals[row] > 0))
+        if len(near) < 9:  # too few for a quadric
+            np.testing.assert_array_equal(moved[row], noisy[row])
+            continue
         weights = (1 - (np.linalg.norm(noisy[near] - noisy[row], axis=1) / 0.4) ** 2) ** 4
         axis = weights @ normals[near]
         axis /= np.linalg.norm(axis)
