@@ -34,8 +34,7 @@ def principal_axes(groups: Float, *, covariance: bool = False) -> tuple[Float, F
 
 def principal_sums(groups: Float) -> Float:
     """Return the eigenvalues of S, of shape (G, 3), smallest first: sums of squared distances along the axes."""
-    sums: Float = np.linalg.eigvalsh(_scatter(groups))
-    return sums
+    return np.asarray(np.linalg.eigvalsh(_scatter(groups)), dtype=np.float64)
 
 
 def plane_normals(groups: Float) -> Float:
