@@ -21,7 +21,7 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.parameters import LocalSolveParameters
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,11 @@ from gnrecon.fit.parameters import ObjectiveParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
-from gnrecon.least_squares.jacobian import Block, LayeredJacobian
+from gnrecon.least_squares.jacobian import Block
 from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.least_squares.layered_jacobian import LayeredJacobian
 from gnrecon.residuals.constraints import Linearised, Residual, eikonal, interface, signed_distance
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)

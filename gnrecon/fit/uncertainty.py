@@ -34,7 +34,7 @@ from gnrecon.fit.parameters import UncertaintyParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,12 @@ LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
 
 
 @pytest.fixture
-def features() -> Features:
-    return Features.draw(30, np.random.default_rng(1), torch.zeros(0, dtype=torch.float64))
+def features(rng: np.random.Generator) -> Features:
+    return Features.draw(30, rng, torch.zeros(0, dtype=torch.float64))
 
 
 @pytest.fixture
-def patch() -> Patch:
-    rng = np.random.default_rng(2)
+def patch(rng: np.random.Generator) -> Patch:
     shapes = [(20, 3), (20,), (20, 3), (8, 3), (8,), (8,)]
     *draws, bound = [torch.as_tensor(rng.standard_normal(shape)) for shape in shapes]
     # Of the samples two have both bounds, three the lower one alone and three the upper one alone.
@@ -54,6 +53,7 @@ def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("system", [PatchSystem, RowSystem])
+@pytest.mark.seed(1503570714)
 def test_amplitudes_are_the_mode_of_bayesian_regression(
     system: type[PatchSystem | RowSystem], patch: Patch, features: Features
 ) -> None:
