@@ -23,6 +23,6 @@ def test_every_reason_has_its_bar() -> None:
 def test_what_troubles_a_scan_is_told() -> None:
     layers = {"share": 0.5, "offset": 0.25}
     told = remarks({"ingest": {"normals": "given", "clusters_found": 7}, "scan": {"layers": layers}})
-    assert told[:2] == ["Normals: given.", "Left 7 points alone that lie in isolated clusters."]
+    assert told[:2] == ["Normals: given.", "Kept 7 points in isolated clusters."]
     assert "At 50% of the points there are two layers, about 0.25 file units apart" in told[2]
     assert remarks({"scan": {"layers": None}}) == remarks({"scan": None}) == []

@@ -104,9 +104,9 @@ def remarks(report: Report) -> list[str]:
     counts, fit = report.get("ingest") or {}, report.get("fit") or {}
     sentences = [f"Normals: {counts['normals']}."] if counts.get("normals") else []
     if counts.get("outliers_found"):
-        sentences.append(f"Left {counts['outliers_found']} points alone that look like outliers.")
+        sentences.append(f"Kept {counts['outliers_found']} points that look like outliers.")
     if counts.get("clusters_found"):
-        sentences.append(f"Left {counts['clusters_found']} points alone that lie in isolated clusters.")
+        sentences.append(f"Kept {counts['clusters_found']} points in isolated clusters.")
     if layers := (report.get("scan") or {}).get("layers"):
         sentences.append(Layers(**layers).describe())
     return [*sentences, *(fit[name] for name in ("method", "status") if fit.get(name)), *report.get("actions", [])]
