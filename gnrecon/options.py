@@ -18,7 +18,7 @@ from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.noise import neighbour_spacing
 from gnrecon.ingest.orientation import require_orientation
-from gnrecon.io import MOST_POINTS
+from gnrecon.io import IOParameters
 from gnrecon.runtime.errors import UsageError
 
 RESOLUTION, FEWEST_CELLS, MOST_CELLS = MeshOptions.default_cells, 128, 1024
@@ -113,7 +113,7 @@ class Options:
         When a name is unknown or a value out of its range.
     """
 
-    read_points: int = MOST_POINTS
+    read_points: int = IOParameters.most_points
     crop: tuple[str, ...] = ()
     clip_plane: tuple[str, ...] = ()
     units: str | None = None

@@ -15,7 +15,7 @@ from rich.table import Table
 from benchmarks.engine.process import run_alone
 from benchmarks.ingest.scans import WRITERS
 from benchmarks.provenance import provenance
-from gnrecon.io import MOST_POINTS
+from gnrecon.io import IOParameters
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 from gnrecon.runtime.files import write_text
 
@@ -79,7 +79,8 @@ def _one(name: str, chosen: argparse.Namespace) -> dict[str, Any]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="bench ingest", description=__doc__)
     parser.add_argument("--points", type=int, default=POINTS, help="points in each file")
-    parser.add_argument("--keep", type=int, default=MOST_POINTS, help="points to keep, as of --read-points")
+    most = IOParameters.most_points
+    parser.add_argument("--keep", type=int, default=most, help="points to keep, as of --read-points")
     parser.add_argument("--formats", nargs="+", choices=list(WRITERS), default=list(WRITERS), help="formats to read")
     parser.add_argument("--json", type=Path, help="JSON file to write")
     return parser
