@@ -63,7 +63,7 @@ def info_command(
     debug: Debug = False,
 ) -> None:
     """Describe a scan, what might make a fit difficult, and what a run would do by default."""
-    from gnrecon.cli.inspect_files import info
+    from gnrecon.cli.scan_info import info
 
     del debug
     raise SystemExit(info(scans, {}, format, as_json=as_json))

@@ -103,7 +103,7 @@ def reconstruct_command(
         settings=config,
     )
     if dry_run:
-        from gnrecon.cli.inspect_files import info
+        from gnrecon.cli.scan_info import info
 
         files.check()
         raise SystemExit(info(scans, chosen, format))
