@@ -49,7 +49,7 @@ from gnrecon.options import Options
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
 from gnrecon.runtime.compute_limits import limited, require_device
-from gnrecon.runtime.logs import TOLD
+from gnrecon.runtime.logs import ALREADY_SHOWN
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import Sources, adorn, fitting, wanted
 
@@ -211,7 +211,7 @@ class _Run:
     def remark(self, sentences: Iterable[str]) -> None:
         """Pass on sentences to the log and to the caller."""
         for sentence in sentences:
-            _log.info(sentence, extra=TOLD)
+            _log.info(sentence, extra=ALREADY_SHOWN)
             self.progress.remark(sentence)
 
     @property

@@ -20,7 +20,7 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.runtime.chunks import slices
-from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.parallel import map_in_threads
 
 OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 
@@ -219,7 +219,7 @@ class Detail:
         def fill(rows: slice) -> None:
             values[rows] = self._blend_around(x[rows], offsets)
 
-        abreast(fill, slices(len(x), max(1, AROUND // len(offsets))), self.amplitudes.device)
+        map_in_threads(fill, slices(len(x), max(1, AROUND // len(offsets))), self.amplitudes.device)
         return values
 
     def hessian(self, x: Float) -> Float:
@@ -234,7 +234,7 @@ class Detail:
             for total, part in zip(sums, self._blend(x[rows], order), strict=True):
                 total[rows] = part
 
-        abreast(fill, slices(len(x), TOGETHER), self.amplitudes.device)
+        map_in_threads(fill, slices(len(x), TOGETHER), self.amplitudes.device)
         return sums
 
     def _blend(self, x: Float, order: int) -> list[Float]:

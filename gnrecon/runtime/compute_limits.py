@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import torch
 
 from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.runtime.parallel import having_threads
+from gnrecon.runtime.parallel import torch_threads
 
 
 @contextmanager
@@ -23,7 +23,7 @@ def limited(threads: int | None) -> Iterator[None]:
         When an allocation in the block failed.
     """
     try:
-        with having_threads(threads):
+        with torch_threads(threads):
             yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and already says what is too large
         raise
