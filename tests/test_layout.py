@@ -29,6 +29,7 @@ ROWS = [
     {"fit", "ingest", "io"},
     {"export"},
     {"rendering"},
+    {"option_table"},
     {"options", "shape_learning"},
     {"config", "report", "vertex_attributes"},
     {"solid"},

@@ -12,7 +12,7 @@ from torch import Tensor
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.level_set.level_set_parameters import LevelSetParameters
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 Value = Callable[[Tensor], Tensor]
 """Takes points, of shape (N, 3), and returns f there, of shape (N,)."""

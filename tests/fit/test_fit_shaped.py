@@ -62,6 +62,7 @@ def test_a_minimal_film_has_little_mean_curvature() -> None:
     assert np.abs(film.sdf(cloud.points)).mean() < 5e-3
 
 
+@pytest.mark.seed(1391994188)
 def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = can(0.12, 0.45)
 

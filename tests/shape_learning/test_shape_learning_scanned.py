@@ -11,8 +11,7 @@ import torch
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import Iterative, NeighbourSums
 from gnrecon.level_set import LevelSet
-from gnrecon.shape_learning import ScannedSurface, learn
-from gnrecon.shape_learning import scanned_shapes as scanned
+from gnrecon.shape_learning import ScannedSurface, learn, scanned
 from gnrecon.shape_learning.shape_problem import LAST, Drawn, Moment
 
 

@@ -31,7 +31,7 @@ from gnrecon.fit.model_selection import Leftover, choose
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 LARGE = 200_000
