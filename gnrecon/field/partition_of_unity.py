@@ -20,14 +20,9 @@ from torch import Tensor
 
 from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.field.random_features import Features
-<<<<<<< HEAD
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.runtime.parallel import abreast, slices
-=======
-from gnrecon.geometry.arrays import Float, Int
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import abreast
->>>>>>> main
 
 
 @functools.cache
