@@ -181,7 +181,9 @@ class _Steps:
         if self.by_blocks:
             return completed, first, 0
         scan = data.scan
-        outliers = find_outliers(first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points))
+        outliers = find_outliers(
+            first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points), parameters=self.parameters.outliers
+        )
         if not outliers.any():
             return completed, first, 0
         if data.sharp is None:
@@ -231,7 +233,7 @@ class _Steps:
         # A fit with curvature penalties closes holes by them.
         completed = data if self.options.regularisers else data.across_holes(self.rng)
         seen = completed.samples, completed.held_out, completed.seen
-        return completed, fit_global(*seen, self.options, self.rng, advance)
+        return completed, fit_global(*seen, self.options, self.rng, advance, parameters=self.parameters.global_field)
 
     def _draw(self, scan: Samples, sharp: Sharp | None) -> _Data:
         """Draw the validation points and those that the global field sees."""
