@@ -54,8 +54,8 @@ from gnrecon.optim import Record, Solution
 from gnrecon.options import Options
 from gnrecon.report.report import SCHEMA_VERSION, Stages, plain, versions
 from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.runtime.logs import TOLD
-from gnrecon.runtime.parallel import having_threads
+from gnrecon.runtime.logs import ALREADY_SHOWN
+from gnrecon.runtime.parallel import torch_threads
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import Sources, adorn, fitting, wanted
 
@@ -199,7 +199,7 @@ def limited(threads: int | None) -> Iterator[None]:
         When an allocation in the block failed.
     """
     try:
-        with having_threads(threads):
+        with torch_threads(threads):
             yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
         raise
@@ -220,7 +220,7 @@ def _run(
     _log.debug("Options: %s.", options)
 
     def remark(sentence: str) -> None:
-        _log.info(sentence, extra=TOLD)
+        _log.info(sentence, extra=ALREADY_SHOWN)
         progress.remark(sentence)
 
     def step(record: Record) -> None:

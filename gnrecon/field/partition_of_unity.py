@@ -22,7 +22,7 @@ from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.chunks import slices
-from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.parallel import map_in_threads
 
 
 @functools.cache
@@ -224,7 +224,7 @@ class Detail:
         def fill(rows: slice) -> None:
             values[rows] = self._blend_around(x[rows], offsets)
 
-        abreast(fill, slices(len(x), max(1, batch_values // len(offsets))), self.amplitudes.device)
+        map_in_threads(fill, slices(len(x), max(1, batch_values // len(offsets))), self.amplitudes.device)
         return values
 
     def hessian(self, x: Float) -> Float:
@@ -239,7 +239,7 @@ class Detail:
             for total, part in zip(sums, self._blend(x[rows], order), strict=True):
                 total[rows] = part
 
-        abreast(fill, slices(len(x), batch_points), self.amplitudes.device)
+        map_in_threads(fill, slices(len(x), batch_points), self.amplitudes.device)
         return sums
 
     def _blend(self, x: Float, order: int) -> list[Float]:

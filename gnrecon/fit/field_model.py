@@ -23,7 +23,7 @@ from gnrecon.geometry.signed_distance import Box
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.files import atomic_write
-from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.version import __version__
 
 
@@ -184,7 +184,7 @@ class NeuralSDF:
     def _each_batch(self, fill: Callable[[slice], None], count: int, *, batch_bytes: int = 4_000_000) -> None:
         """Fill `count` rows in batches whose activations stay in the processor's cache, which is twice as fast."""
         size = max(256, batch_bytes // (8 * max(self.field.widths)))
-        abreast(fill, slices(count, size), self.theta.device)
+        map_in_threads(fill, slices(count, size), self.theta.device)
 
 
 FORMAT = "gnrecon-sdf-1"

@@ -24,7 +24,7 @@ from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
 def fit(
@@ -93,7 +93,7 @@ def _fit_network(
         advance(started + (1.0 - started) * record.step / steps)
 
     method = fit_wide if wide else fit_deep
-    fitted = method(field, scene, options, rng, report, part(advance, 0.0, started))
+    fitted = method(field, scene, options, rng, report, subrange(advance, 0.0, started))
     return NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict()), fitted
 
 

@@ -11,7 +11,7 @@ from gnrecon.least_squares import SOLVERS
 from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, normal_projection, normal_vector
 from gnrecon.residuals.named_residuals import named
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.plugins import RESIDUALS, find, installed
+from gnrecon.runtime.plugins import find, installed
 
 NORMAL_RESIDUALS: dict[str, Residual] = {
     "vector": normal_vector,
@@ -158,8 +158,8 @@ def normal_residual(name: str) -> Residual:
     """
     if name in NORMAL_RESIDUALS:
         return NORMAL_RESIDUALS[name]
-    if find(RESIDUALS, name) is None:
-        known = [*NORMAL_RESIDUALS, *(one.entry.name for one in installed(RESIDUALS))]
+    if find("residual", name) is None:
+        known = [*NORMAL_RESIDUALS, *(one.entry.name for one in installed("residual"))]
         raise UsageError(f"The normal residual must be one of {', '.join(known)}, not {name!r}.")
     residual = named(name)
     if isinstance(residual, SecondOrder):

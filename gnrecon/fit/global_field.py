@@ -24,9 +24,9 @@ from gnrecon.fit.parameters import GlobalFieldParameters, ModelSelectionParamete
 from gnrecon.fit.single_network import fit_wide
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import is_certain
+from gnrecon.geometry.signed_distance import is_sign_certain
 from gnrecon.optim import Solution
-from gnrecon.runtime.progress import ProgressCallback, part
+from gnrecon.runtime.progress import ProgressCallback, subrange
 
 _log = logging.getLogger(__name__)
 
@@ -82,9 +82,9 @@ def fit_global(
     # Where more is asked of the surface in holes than the data says, normals may not carry it out of the box.
     plain_reach = ObjectiveParameters.normal_reach_spacings
     reach = plain_reach if options.regularisers else smoothness.reach
-    sdf, solution, wrong = fitted(reach, part(advance, 0.0, 0.5))
+    sdf, solution, wrong = fitted(reach, subrange(advance, 0.0, 0.5))
     if reach > plain_reach and wrong > parameters.wrong_sign_share:
-        plain, plainly, ghosts = fitted(plain_reach, part(advance, 0.5, 1.0))
+        plain, plainly, ghosts = fitted(plain_reach, subrange(advance, 0.5, 1.0))
         if wrong > ghosts + parameters.wrong_sign_share:
             reach, sdf, solution = plain_reach, plain, plainly
     _log.info(
@@ -101,7 +101,7 @@ def wrong_sign(sdf: NeuralSDF, scene: Scene, rng: np.random.Generator) -> float:
     """Return the share of the free space where the field has the wrong sign beyond doubt, in [0, 1]."""
     x, distance = scene.volume(scene.volume_count, rng)
     other = sdf.sdf(sdf.frame.to_world(x)) * distance < 0
-    certain = is_certain(scene.coarse.winding_number(x[other]))
+    certain = is_sign_certain(scene.coarse.winding_number(x[other]))
     return float(certain.sum() / max(len(x), 1))
 
 

@@ -28,7 +28,7 @@ from gnrecon.fit.parameters import CleanScanParameters, MarginalLikelihoodParame
 from gnrecon.fit.shape_priors.edge_completion import over_planes
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.parallel import map_in_threads
 
 Place = tuple[int, int]
 
@@ -74,7 +74,7 @@ class Evidence:
         ----------
         length : over which the functions vary, unit coordinates
         """
-        kernels = abreast(
+        kernels = map_in_threads(
             lambda patch: data_kernel(patch, self.features, length, patch.size), self.patches, self.device
         )
         both = list(zip(self.patches, kernels, strict=True))
@@ -82,7 +82,7 @@ class Evidence:
         @cache
         def found(place: Place) -> float:
             position, angle = self._noise_at(place)
-            return sum(abreast(lambda one: log_density(*one, position, angle), both, self.device))
+            return sum(map_in_threads(lambda one: log_density(*one, position, angle), both, self.device))
 
         best = self.parameters.first_index
         for stride in self.parameters.strides:

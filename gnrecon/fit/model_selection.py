@@ -30,7 +30,7 @@ from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionP
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import abreast
+from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
@@ -355,7 +355,7 @@ class Trials:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
         if length not in self._scored:
             self.noises(length)  # once, before the patches ask for them side by side
-            found = abreast(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
+            found = map_in_threads(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
             self._scored[length] = np.array(found) / self.radius
         return self._scored[length]
 

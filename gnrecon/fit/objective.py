@@ -20,7 +20,7 @@ from gnrecon.fit.fit_options import FitOptions, normal_residual
 from gnrecon.fit.parameters import ObjectiveParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, sample_near_surface
 from gnrecon.least_squares.jacobian import Block
 from gnrecon.least_squares.layer_products import LayerRows
 from gnrecon.least_squares.layered_jacobian import LayeredJacobian
@@ -253,7 +253,7 @@ def step_terms(
     volume : samples, of shape (Q, 3), and their coarse distances, of shape (Q,)
     """
     eikonal_count = min(parameters.eikonal_samples, most)
-    near = near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
+    near = sample_near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
     around = np.concatenate([near, scene.box.sample(eikonal_count // 3, rng)])
     eikonal_weight = (parameters.eikonal_reach_spacings * scene.coarse.spacing) ** 2 * data_weight**0.5
     return [
@@ -332,7 +332,7 @@ class Scene:
         self, count: int, rng: np.random.Generator, *, shell_spacings: float = ObjectiveParameters.shell_spacings
     ) -> Float:
         """Return such points, of shape (Q, 3), also where no distance is known because the data is too near."""
-        shell = near_surface(self.samples.points, shell_spacings * self.coarse.spacing, count // 2, rng)
+        shell = sample_near_surface(self.samples.points, shell_spacings * self.coarse.spacing, count // 2, rng)
         inside = ((shell > self.box.lower) & (shell < self.box.upper)).all(axis=1)
         return np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]])
 

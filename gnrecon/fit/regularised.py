@@ -30,7 +30,7 @@ from gnrecon.fit.objective import FieldProblem, Scene, Term, data_terms, distanc
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
 from gnrecon.fit.regularisers import Jet, Regulariser, Sines, Wish, bent
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.geometry.signed_distance import Density, least_values
+from gnrecon.geometry.signed_distance import Density, free_space_bounds
 from gnrecon.least_squares.direct import damped_factor
 from gnrecon.level_set import LevelSet, sample_surface
 from gnrecon.residuals import SecondOrder, free_space
@@ -58,7 +58,7 @@ class Free:
         x = scene.places(parameters.free_space_factor * scene.volume_count, rng)
         known, distance, _, certain = scene.coarse.at(x)
         kept = certain & (np.abs(distance) > parameters.free_space_clearance_radii)
-        return cls(x[known][kept], least_values(distance[kept], parameters.most_free_space_distance_radii))
+        return cls(x[known][kept], free_space_bounds(distance[kept], parameters.most_free_space_distance_radii))
 
     def wishes(
         self,

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import Box, halved
+from gnrecon.geometry.signed_distance import Box, kd_tree_order
 from gnrecon.level_set.level_set import LevelSet
 from gnrecon.level_set.level_set_parameters import LevelSetParameters
 from gnrecon.level_set.newton_projection import newton_step, project
@@ -34,7 +34,7 @@ class SurfaceSample:
 
     Parameters
     ----------
-    points : of shape (N, 3), on the level set and in the box, in the order of `gnrecon.geometry.signed_distance.halved`
+    points : of shape (N, 3), on the level set and in the box, in `kd_tree_order`
     normals : grad f / |grad f| there, of shape (N, 3)
     area : an unbiased estimate of the surface's area in the box, in squared units of the coordinates
     """
@@ -100,7 +100,7 @@ def _projected_sample(level_set: LevelSet, points: Tensor, cap: float, area: flo
     """Project the points and keep those that converge within the box."""
     projected = project(level_set, points, cap)
     kept = (projected.converged & level_set.contains(projected.points)).nonzero()[:, 0]
-    kept = kept[torch.as_tensor(halved(projected.points[kept].cpu().numpy())).to(kept.device)]
+    kept = kept[torch.as_tensor(kd_tree_order(projected.points[kept].cpu().numpy())).to(kept.device)]
     return SurfaceSample(projected.points[kept], torch.nn.functional.normalize(projected.gradients[kept], dim=1), area)
 
 

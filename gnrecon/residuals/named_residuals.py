@@ -25,7 +25,6 @@ from gnrecon.residuals.constraints import (
     surface_strain,
 )
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.plugins import RESIDUALS as GROUP
 from gnrecon.runtime.plugins import Plugin, find, installed
 
 RESIDUALS: dict[str, Residual | SecondOrder] = {
@@ -52,9 +51,9 @@ def named(name: str) -> Residual | SecondOrder:
     """
     if name in RESIDUALS:
         return RESIDUALS[name]
-    plugin = find(GROUP, name)
+    plugin = find("residual", name)
     if plugin is None:
-        known = ", ".join([*RESIDUALS, *(one.entry.name for one in installed(GROUP))])
+        known = ", ".join([*RESIDUALS, *(one.entry.name for one in installed("residual"))])
         raise UsageError(f"There is no residual {name!r}; there are {known}.")
     found = plugin.load()
     return _second(plugin, found) if isinstance(found, SecondOrder) else _first(plugin, found)

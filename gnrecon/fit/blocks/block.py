@@ -25,7 +25,7 @@ from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.model_selection import Leftover, Volume
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import Box, is_certain, side_of
+from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding
 
 CHANCE = 3
 """Tells the cubes' chance from that of the rest of the fit, which has the same seed."""
@@ -151,6 +151,6 @@ class Blocks:
         clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
-        signed = side_of(winding) * np.sqrt(distance**2 - disks**2)
+        signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         has = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, has, signed, is_certain(winding), distance)
+        return Volume.around(x, has, signed, is_sign_certain(winding), distance)
