@@ -129,7 +129,9 @@ def smooth_spectrum(
 
     It is that of the detail's features, with which the length is chosen, too.
     """
-    return Spectrum(max(length, parameters.least_length_spacings * scene.coarse.spacing), FieldParameters.degrees_of_freedom)
+    return Spectrum(
+        max(length, parameters.least_length_spacings * scene.coarse.spacing), FieldParameters.degrees_of_freedom
+    )
 
 
 def global_smoothness(

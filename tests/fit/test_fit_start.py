@@ -74,7 +74,9 @@ def test_values_that_are_not_finite_end_with_a_sentence() -> None:
         solve_last_layer(field, broken, theta)
 
 
-@pytest.mark.parametrize("spectrum", [Spectrum(), Spectrum(0.25, FieldParameters.degrees_of_freedom)], ids=["coarse", "smooth"])
+@pytest.mark.parametrize(
+    "spectrum", [Spectrum(), Spectrum(0.25, FieldParameters.degrees_of_freedom)], ids=["coarse", "smooth"]
+)
 def test_features_have_a_maternlike_spectrum(spectrum: Spectrum) -> None:
     """The kernel E[2 sin(w.x + b) sin(w.y + b)] = E[cos w.(x - y)] is Matern's, of smoothness nu / 2."""
     like = torch.zeros(1, dtype=torch.float64)
