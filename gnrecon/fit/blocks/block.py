@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gnrecon.field.networks import Siren
-from gnrecon.field.partition_of_unity import OFFSETS, Partition
+from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, Work
 from gnrecon.fit.blocks.tree import Codes, Dipoles, morton
@@ -134,7 +134,7 @@ class Blocks:
 
     def _around(self, key: Int) -> Int:
         """Return the rows of the points in a cell and its neighbours, in order; they hold all of the cube's data."""
-        keys = key + OFFSETS
+        keys = key + neighbour_offsets()
         codes = np.sort(morton(keys[(keys >= 0).all(axis=1)]))
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
