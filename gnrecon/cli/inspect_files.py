@@ -1,4 +1,4 @@
-"""``gnrecon info SCAN``: what is in a scan and what would trouble a fit; and what a run would do, without doing it."""
+"""The commands on files: ``gnrecon check``, ``eval`` and ``convert``."""
 
 from __future__ import annotations
 

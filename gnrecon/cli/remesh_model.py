@@ -14,9 +14,9 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import check_writable, supports_attribute, write_mesh
 from gnrecon.options import Options
-from gnrecon.pipeline import limited, require_device
 from gnrecon.report.report import Stages
 from gnrecon.run import shown, summarise
+from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import require_files
 from gnrecon.solid import Shape, shaped

@@ -13,7 +13,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.runtime.errors import InputError
-from gnrecon.runtime.plugins import guarded, told
+from gnrecon.runtime.plugins import describe_error, guarded
 
 Columns = Mapping[str, Values]
 
@@ -163,4 +163,4 @@ def guard_parser(kind: str) -> AbstractContextManager[None]:
     InputError
         When the library in the block raises any exception; see `gnrecon.runtime.plugins.guarded`.
     """
-    return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({told(error)}).")
+    return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({describe_error(error)}).")

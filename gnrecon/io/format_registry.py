@@ -35,9 +35,7 @@ from gnrecon.io.formats.vtp import read_vtp
 from gnrecon.io.formats.xyz import read_xyz, write_xyz
 from gnrecon.io.interop import as_shape
 from gnrecon.runtime.errors import InputError, OutputError
-from gnrecon.runtime.plugins import READERS as READER_GROUP
-from gnrecon.runtime.plugins import WRITERS as WRITER_GROUP
-from gnrecon.runtime.plugins import Plugin, find, installed
+from gnrecon.runtime.plugins import Plugin, PluginKind, find, installed
 
 READERS: dict[str, Callable[[Path], Contents]] = {
     ".ply": read_ply,
@@ -132,12 +130,12 @@ def is_readable(extension: str) -> bool:
 
 def readable() -> list[str]:
     """Return the extensions, with their dots, of all files that can be read."""
-    return _with_plugins(READERS, READER_GROUP)
+    return _with_plugins(READERS, "reader")
 
 
 def writable() -> list[str]:
     """Return the extensions, with their dots, of all files that a mesh can be written to."""
-    return _with_plugins(WRITERS, WRITER_GROUP)
+    return _with_plugins(WRITERS, "writer")
 
 
 def reader_of(extension: str) -> Callable[[Path], Contents] | None:
@@ -150,7 +148,7 @@ def reader_of(extension: str) -> Callable[[Path], Contents] | None:
     """
     if extension in READERS:
         return READERS[extension]
-    plugin = find(READER_GROUP, extension.removeprefix("."))
+    plugin = find("reader", extension.removeprefix("."))
     if plugin is None:
         return None
     read = plugin.load()
@@ -167,15 +165,15 @@ def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
     """
     if extension in WRITERS:
         return WRITERS[extension]
-    plugin = find(WRITER_GROUP, extension.removeprefix("."))
+    plugin = find("writer", extension.removeprefix("."))
     if plugin is None:
         return None
     write = plugin.load()
     return lambda mesh, path: _write_with_plugin(plugin, write, mesh, path)
 
 
-def _with_plugins(built_in: dict[str, Any], group: str) -> list[str]:
-    return list(dict.fromkeys([*built_in, *(f".{plugin.entry.name}" for plugin in installed(group))]))
+def _with_plugins(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
+    return list(dict.fromkeys([*built_in, *(f".{plugin.entry.name}" for plugin in installed(kind))]))
 
 
 def _read_with_plugin(plugin: Plugin, read: Callable[[Path], Any], path: Path) -> Contents:

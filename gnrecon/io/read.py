@@ -22,7 +22,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import Contents
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
-from gnrecon.runtime.files import STANDARD_INPUT
+from gnrecon.runtime.files import is_standard_input
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ def reader_extension(path: Path, format: str | None) -> str:
     UsageError
         When `format` is not supported, or standard input is read without one.
     """
-    if format is None and path == STANDARD_INPUT:
+    if format is None and is_standard_input(path):
         supported = ", ".join(suffix[1:] for suffix in readable())
         raise UsageError(f"Standard input has no extension: say with --format how to read it, as one of {supported}.")
     extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
@@ -135,7 +135,7 @@ def read_contents(path: Path, format: str | None) -> Contents:
 @contextmanager
 def input_errors_for(path: Path) -> Iterator[None]:
     """Turn every failure to read a file into an error of one sentence that begins with the file's name."""
-    name = "standard input" if path == STANDARD_INPUT else path
+    name = "standard input" if is_standard_input(path) else path
     try:
         yield
     except InputError as error:
@@ -204,11 +204,11 @@ def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
     UsageError
         When standard input is a terminal, so that no file is sent.
     """
-    if path != STANDARD_INPUT and not _is_compressed(path):
+    if not is_standard_input(path) and not _is_compressed(path):
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="gnrecon-") as folder:
-        source = _from_standard_input(Path(folder) / f"stream{extension}") if path == STANDARD_INPUT else path
+        source = _from_standard_input(Path(folder) / f"stream{extension}") if is_standard_input(path) else path
         yield _unpacked(source, Path(folder) / f"unpacked{extension}") if _is_compressed(source) else source
 
 

@@ -23,7 +23,7 @@ from benchmarks.engine.scans import VOLUME_COUNT, surrounded
 from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
 from gnrecon.fit.objective import FieldProblem
-from gnrecon.fit.single_network import ENERGY
+from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 
@@ -60,7 +60,7 @@ def ours(points: Tensor, normals: Tensor, seconds: float, on_record: OnRecord, e
         return posed(field, theta, drawn(sample, count, generator), torch.float32, weights=weights)
 
     start = solved_start(field, sample)
-    solver = SOLVERS["auto"](ENERGY)
+    solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
     search = GainRatioDamping(initial_damping=DAMPING, metric=layer_scaled, geodesic=True)
     steps = 1_000_000
     stop = StopRule(steps, tolerance=0.0, patience=steps, seconds=seconds - clock.seconds)

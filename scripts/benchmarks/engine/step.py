@@ -23,7 +23,7 @@ from benchmarks.engine.clock import timed
 from benchmarks.engine.loss import Sample, posed
 from benchmarks.engine.start import solved_start
 from gnrecon.field import Siren
-from gnrecon.fit.single_network import ENERGY
+from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, Solution, StopRule
 
@@ -50,7 +50,7 @@ class Frozen:
 
 def our_steps(frozen: Frozen, steps: int) -> tuple[Solution, str]:
     """Take so many of our steps on the frozen sample; return where they led, and what the solver says of itself."""
-    solver = SOLVERS["auto"](ENERGY)
+    solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
     search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled)
     field = Siren(frozen.widths)
     never = StopRule(steps=steps, tolerance=0.0, patience=steps + 1)
