@@ -53,8 +53,8 @@ def find_scans(sources: Sequence[str], lists: Sequence[Path], search: ScanSearch
                 found.setdefault(scan.scan.absolute(), scan)
     if not found:
         searched = ", ".join([*sources, *map(str, lists)])
-        wanted = f"that match {' or '.join(search.patterns)}; " if search.patterns else "; "
-        raise InputError(f"There are no scans in {searched} {wanted}extensions read are {', '.join(readable())}.")
+        matching = f" that match {' or '.join(search.patterns)}" if search.patterns else ""
+        raise InputError(f"There are no scans in {searched}{matching}; extensions read are {', '.join(readable())}.")
     return list(found.values())
 
 
