@@ -10,7 +10,7 @@ import numpy as np
 
 from gnrecon.export import RefineOptions
 from gnrecon.export.mesh_options import MeshOptions
-from gnrecon.fit.blocks.solve import LARGE
+from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Region
@@ -253,7 +253,7 @@ class Options:
         if self.resolution is not None or self.edge_length is not None:
             return self
         longest = float(np.ptp(bounds, axis=0).max())
-        dense = len(points) >= LARGE
+        dense = len(points) >= BlockParameters.large_scan_points
         edge = (CELL_SPACINGS if dense else SPARSE_CELL_SPACINGS) * neighbour_spacing(points)
         least, most = (RESOLUTION, MOST_CELLS) if dense else (FEWEST_CELLS, RESOLUTION)
         return replace(self, resolution=math.ceil(min(max(longest / edge, least), most)) if edge > 0 else most)

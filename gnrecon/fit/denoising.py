@@ -19,17 +19,17 @@ import numpy as np
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Choice, Leftover, Trials
-from gnrecon.fit.shape_priors.bilateral_filter import Averaging
-from gnrecon.fit.shape_priors.sharp_shape import Sharp, has_edges
+from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape, has_edges
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import Samples
 
 _log = logging.getLogger(__name__)
 
-FIRST = Averaging(2.5, 0.4)
+FIRST = BilateralFilter(2.5, 0.4)
 """What is tried first; only where it helps are the others."""
 
-OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4))
+OTHERS = (BilateralFilter(4.0, 0.4), BilateralFilter(6.0, 0.4))
 
 CLEARLY = 2.0
 """Standard errors by which patches must be better for averaging where no edges are seen."""
@@ -53,10 +53,10 @@ class Told:
     samples: Samples
     leftover: Leftover
     belief: Belief
-    averaging: Averaging | None = None
+    averaging: BilateralFilter | None = None
 
     @classmethod
-    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> Told:
+    def of_faces(cls, sdf: NeuralSDF, sharp: SharpShape) -> Told:
         """Return what faces that were continued to their edges tell by themselves, beside a global field."""
         return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
 
@@ -97,26 +97,26 @@ def told(
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
         return Told(samples, leftover, plain)
 
-    def with_kept(averaging: Averaging) -> Trials:
+    def with_kept(averaging: BilateralFilter) -> Trials:
         points, normals = samples.points.copy(), samples.normals.copy()
-        points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
+        points[~held], normals[~held] = averaging.apply(points[~held], normals[~held])
         # The noise of averaged points is alike among neighbours, of which no evidence is made.
         of_averaged = Leftover.of(sdf, replace(samples, points=points, normals=normals))
         return replace(trials, leftover=of_averaged, evidence=None)
 
-    found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
+    found = _best(choice, with_kept, lambda: has_edges(*FIRST.apply(samples.points, samples.normals)))
     if found is None:
         return Told(samples, leftover, plain)
     averaging, better = found
-    points, normals = averaging.of(samples.points, samples.normals)
+    points, normals = averaging.apply(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
-    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
+    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width_radii)
     return Told(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
 
 
 def _best(
-    choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: Callable[[], bool]
-) -> tuple[Averaging, Trials] | None:
+    choice: Choice, kept_averaged: Callable[[BilateralFilter], Trials], edges: Callable[[], bool]
+) -> tuple[BilateralFilter, Trials] | None:
     """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
 
     Whether there are edges is asked where the patches alone do not decide. All are compared at the length that suits
@@ -124,7 +124,7 @@ def _best(
     """
     plain = _of_best_noise(choice.scores)
 
-    def tried(averaging: Averaging) -> tuple[Float, Trials]:
+    def tried(averaging: BilateralFilter) -> tuple[Float, Trials]:
         trials = kept_averaged(averaging)
         return plain - _of_best_noise(trials.scores(choice.belief.length)), trials
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.local_solve import Patch, data_kernel
-from gnrecon.fit.shape_priors.edge_completion import over_planes
+from gnrecon.fit.shape_priors.edge_completion import heights_over_planes
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.runtime.parallel import abreast
@@ -198,5 +198,5 @@ def heights(points: Float, normals: Float, density: Density) -> float:
     paired = (distance > 0) & (distance < DISKS * disks) & (cosine > ALIKE)
     if paired.sum() < LEAST_PAIRS:
         return np.nan
-    height, own = over_planes(points, normals, asked, near)
+    height, own = heights_over_planes(points, normals, asked, near)
     return float(np.median((np.abs(height - own) / 2 / np.maximum(distance, disks))[paired]))

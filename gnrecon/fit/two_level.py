@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.fit.blocks.solve import LARGE, fit_large
+from gnrecon.fit.blocks.block_parameters import BlockParameters
+from gnrecon.fit.blocks.solve import fit_large
 from gnrecon.fit.consistency import outlying, reconciled
 from gnrecon.fit.denoising import Told, told
 from gnrecon.fit.field_model import NeuralSDF
@@ -23,9 +24,9 @@ from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.local_fields import CHOSEN, ShapingFor, fit_detail
 from gnrecon.fit.regularised import Free, Shaping, bend_global
-from gnrecon.fit.shape_priors.ball_fit import Ball
-from gnrecon.fit.shape_priors.hole_completion import Continued, continued
-from gnrecon.fit.shape_priors.sharp_shape import Sharp
+from gnrecon.fit.shape_priors.ball_fit import BallFit
+from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
@@ -59,11 +60,11 @@ class _Task:
     samples: Samples
     held: Mask
     rows: Int
-    sharp: Sharp | None
-    across: Continued
+    sharp: SharpShape | None
+    across: HoleCompletion
 
     @classmethod
-    def of(cls, samples: Samples, sharp: Sharp | None, by_blocks: bool, rng: np.random.Generator) -> _Task:
+    def of(cls, samples: Samples, sharp: SharpShape | None, by_blocks: bool, rng: np.random.Generator) -> _Task:
         """Draw what is held out of a scan, whose faces may be continued."""
         if sharp is not None:
             samples = sharp.samples
@@ -72,17 +73,17 @@ class _Task:
         out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
         held: Mask = np.zeros(len(samples), dtype=bool)
         held[order[:out]] = True
-        across = Continued.none() if sharp is None else sharp.across
+        across = HoleCompletion.none() if sharp is None else sharp.holes
         return cls(samples, held, np.sort(order[out:][:COARSE_POINTS]), sharp, across)
 
     def continued(self, rng: np.random.Generator) -> _Task:
         """Return the task with samples across the holes; a scan whose faces are continued to their edges has them."""
         if self.sharp:
             return self
-        across = continued(self.samples.points, self.samples.normals, not self.samples.estimated)
+        across = complete_holes(self.samples.points, self.samples.normals, not self.samples.estimated)
         if not len(across):
             return self
-        points, normals = across.joined(self.samples.points, self.samples.normals)
+        points, normals = across.appended_to(self.samples.points, self.samples.normals)
         held = np.concatenate([self.held, np.zeros(len(across), dtype=bool)])
         # As many of them as of the points that are not held out.
         share = len(self.rows) / max(len(self.samples) - int(self.held.sum()), 1)
@@ -96,7 +97,7 @@ class _Task:
         seen = np.zeros(len(off), dtype=bool)
         seen[self.rows] = True
         rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
-        return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None, Continued.none())
+        return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None, HoleCompletion.none())
 
     def told(self, sdf: NeuralSDF, options: FitOptions, rng: np.random.Generator, outliers: bool) -> Told:
         """Return what the samples tell beside a global field; `outliers` says whether some were found among them."""
@@ -133,22 +134,22 @@ def fit_adaptive(
     FitError
         When a linear system cannot be solved.
     """
-    by_blocks = folder is not None or len(samples) >= LARGE
+    by_blocks = folder is not None or len(samples) >= BlockParameters.large_scan_points
     if by_blocks and options.regularisers:
         raise UsageError(
-            f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; "
+            f"smooth, fill and prior are for fits of fewer than {BlockParameters.large_scan_points} points without a work folder; "
             "thin the scan with --max-points."
         )
     edges = not (by_blocks or options.regularisers)
-    ball = Ball.of(samples) if edges else None
+    ball = BallFit.of(samples) if edges else None
     scanned = len(samples)
     samples = samples if ball is None else ball.samples
-    sharp = Sharp.of(samples) if edges and not samples.estimated else None
+    sharp = SharpShape.of(samples) if edges and not samples.estimated else None
     task = _Task.of(samples, sharp, by_blocks, rng)
     turned, left_out = 0.0, 0
     if samples.estimated:
         samples, turned = reconciled(samples, task.rows, options)
-        sharp = Sharp.of(samples) if edges else None
+        sharp = SharpShape.of(samples) if edges else None
         task = replace(task, samples=samples) if sharp is None else _Task.of(samples, sharp, by_blocks, rng)
     whole = task
     closes = not options.regularisers  # which say themselves how holes are closed
@@ -159,7 +160,7 @@ def fit_adaptive(
         left_out = int(off.sum())
         if left_out:
             samples = replace(samples, points=samples.points[~off], normals=samples.normals[~off])
-            task = _Task.of(samples, Sharp.of(samples), by_blocks, rng) if task.sharp else whole.without(off)
+            task = _Task.of(samples, SharpShape.of(samples), by_blocks, rng) if task.sharp else whole.without(off)
             task = task.continued(rng) if closes else task
             first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, SHARE / 2, SHARE))
     sdf = first.sdf
@@ -182,7 +183,9 @@ def fit_adaptive(
     also = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
     also += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
     if known is not None and known.averaging is not None:
-        also += f" Averaged noisy points over {known.averaging.width:g} of their disks' radii, where normals agree."
+        also += (
+            f" Averaged noisy points over {known.averaging.width_radii:g} of their disks' radii, where normals agree."
+        )
     if ball is not None:
         also += (
             f" Laid {scanned} points on a ball of radius {ball.radius:.6g}, from which their noise cannot tell them, "
@@ -204,13 +207,13 @@ def fit_adaptive(
     return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
 
 
-def _laid(sharp: Sharp) -> str:
+def _laid(sharp: SharpShape) -> str:
     """Return a sentence about points that were laid on surfaces, after a blank, or nothing."""
-    if sharp.laid is None:
+    if sharp.snapped is None:
         return ""
-    laid = sharp.laid
+    laid = sharp.snapped
     return (
-        f" Laid {int(laid.on.sum())} points on {laid.surfaces} planes, cylinders and spheres, "
+        f" Laid {int(laid.snapped.sum())} points on {laid.primitives} planes, cylinders and spheres, "
         "from which the noise cannot tell them."
     )
 

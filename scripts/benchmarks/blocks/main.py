@@ -19,7 +19,7 @@ from benchmarks.alone import run_program
 from benchmarks.blocks.plot import draw
 from benchmarks.engine.plot import require_matplotlib
 from benchmarks.provenance import provenance
-from gnrecon.fit.blocks.solve import LARGE
+from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 from gnrecon.runtime.files import write_text
 
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
     report: dict[str, Any] = provenance("blocks", arguments) | {"runs": []}
     console = Console(highlight=False)
     for count in sorted(chosen.counts):
-        for blocks in (False, True) if count < LARGE else (True,):
+        for blocks in (False, True) if count < BlockParameters.large_scan_points else (True,):
             console.print(f"bench: {count:,} points{'' if blocks else f', {IN_ONE}'}", style="dim")
             report["runs"].append({"points": count, "blocks": blocks} | _one(count, blocks, chosen))
     if chosen.json:
