@@ -14,8 +14,8 @@ from benchmarks.batch.main import sound, table
 from benchmarks.batch.scans import BROKEN, CONFIG, make_scans
 from benchmarks.batch.witness import Witness
 
-from gnrecon.batch.job import PROGRESS, running_folder
-from gnrecon.batch.scan_search import Search, find_scans
+from gnrecon.batch.job import progress_file, running_folder
+from gnrecon.batch.scan_search import ScanSearch, find_scans
 from gnrecon.config import read_settings
 from gnrecon.io import read_cloud
 from gnrecon.runtime.errors import ExitCode, InputError
@@ -27,7 +27,7 @@ SPEED = {"scans": 4, "ratio": 2.0, "cpu_ratio": 3.0, "overhead_seconds": 0.1}
 def test_its_scans_are_good_and_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "HOG_POINTS", 1000)
     good = make_scans(tmp_path / "scans", 4)
-    found = {path.scan.stem: path.scan for path in find_scans([str(tmp_path / "scans")], [], Search())}
+    found = {path.scan.stem: path.scan for path in find_scans([str(tmp_path / "scans")], [], ScanSearch())}
     assert set(found) == {*good, *BROKEN}
     assert {len(read_cloud(found[name])) for name in good} == {scans.POINTS}
     assert len({found[name].read_bytes() for name in good}) == len(good)
@@ -55,7 +55,7 @@ def test_its_witness_sees_records_and_brings_accidents(tmp_path: Path) -> None:
         witness.look()
         (records / "twice.json").write_text("again")
         witness.look()
-        (folder / PROGRESS).write_text(json.dumps({"pid": victim.pid}))
+        progress_file(folder).write_text(json.dumps({"pid": victim.pid}))
         assert victim.wait(30) == -signal.SIGSEGV
     assert witness.finished() == ["once", "twice"]
     assert witness.twice() == ["twice"]

@@ -52,6 +52,7 @@ def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("system", [PatchSystem, RowSystem])
+@pytest.mark.seed(1503570714)
 def test_amplitudes_are_the_mode_of_bayesian_regression(
     system: type[PatchSystem | RowSystem], patch: Patch, features: Features
 ) -> None:

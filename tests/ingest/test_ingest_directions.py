@@ -51,6 +51,7 @@ def test_sharp_edges_are_not_blurred(rng: np.random.Generator) -> None:
     assert adaptive.mean() < 0.5 * plain.mean()
 
 
+@pytest.mark.seed(1329029803)
 def test_a_plate_as_thin_as_its_points_are_apart(rng: np.random.Generator) -> None:
     points, truth = cube(4000, rng)
     flat = np.abs(truth[:, 2]) == 1

@@ -20,9 +20,10 @@ from gnrecon.field.partition_of_unity import OFFSETS, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
 from gnrecon.fit.blocks.tree import Codes, DipoleTree, morton_codes
-from gnrecon.fit.local_fields import BEYOND, CLEAR, LEAST_POINTS, VOLUME, cube_length
+from gnrecon.fit.local_fields import cube_length
 from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.model_selection import Leftover, Volume
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Box, is_certain, side_of
 
@@ -118,9 +119,9 @@ class BlockSolver:
     def _solve_cube(self, key: Int) -> tuple[float, Float] | None:
         """Return the length and amplitudes of a cube, or None where it holds too few points."""
         center, nearby = self.partition.center(key), self._nearby_points(key)
-        reach = self.partition.reach + BEYOND * self.radius
+        reach = self.partition.reach + LocalFieldParameters.data_margin_disk_radii * self.radius
         rows = nearby[(np.abs(self.leftover.points[nearby] - center) <= reach).all(axis=1)]
-        if len(rows) < LEAST_POINTS:
+        if len(rows) < LocalFieldParameters.least_points:
             return None
         length = cube_length(self.belief, self.disks[rows], self.radius)
         patch = self.leftover.patch(rows, center, self._free_space(key, center, nearby), self.device)
@@ -141,11 +142,11 @@ class BlockSolver:
         """Return samples of the cube away from the points, with the bounds that the coarse distance sets there."""
         # The 3 separates the cubes' random streams from others of the fit with the same seed.
         rng = np.random.default_rng([self.seed, 3, *(int(number) + 1 for number in key)])
-        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (VOLUME, 3))
+        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (LocalFieldParameters.volume_samples, 3))
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
         distance, nearest = cKDTree(self.leftover.points[nearby]).query(x)
         disks = self.disks[nearby][nearest]
-        clear = distance > CLEAR * disks
+        clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
         signed = side_of(winding) * np.sqrt(distance**2 - disks**2)

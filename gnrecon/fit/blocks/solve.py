@@ -28,12 +28,12 @@ from gnrecon.fit.blocks.tree import DipoleTree, morton_codes, octree_blocks
 from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_fields import CELL, CHOSEN
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Leftover, choose
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 
@@ -59,7 +59,7 @@ def fit_large(
     rng : draws the features
     folder : where the work is saved, so that the same fit can resume; by default a temporary one
     advance : called with the share that is done
-    scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks; by default local processes do
+    scheduler : address of a Dask scheduler whose workers see the folder; by default local processes solve the blocks
     block_points : points of a block at most
 
     Raises
@@ -71,21 +71,23 @@ def fit_large(
     """
     leftover = Leftover.of(sdf, samples)
     belief = choose(leftover, held, leftover.density.radius, rng, options.device)
-    advance(CHOSEN)
+    chosen = LocalFieldParameters.selection_time_share
+    advance(chosen)
     like = torch.zeros(0, dtype=torch.float64, device=options.device)
     features = Features.draw(options.features, rng, like)
     # Offset by a part of a cell that no regular scan shares, as in `gnrecon.fit.local_fields`.
-    partition = Partition(leftover.points.min(axis=0) - 0.137 * CELL * belief.length, CELL * belief.length)
+    edge = LocalFieldParameters.cube_edge_lengths
+    partition = Partition(leftover.points.min(axis=0) - 0.137 * edge * belief.length, edge * belief.length)
     arrays, facts = _task_data(sdf, leftover, belief, features, partition, block_points)
     with _work_folder(folder) as path:
         work = WorkFolder.open(path, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
         missing = [number for number in range(count) if not work.is_solved(number)]
         if scheduler is not None and missing:
-            solve_on_cluster(work, missing, scheduler, part(advance, CHOSEN, 1.0))
+            solve_on_cluster(work, missing, scheduler, part(advance, chosen, 1.0))
         else:
             # As many processes as torch has threads: the option, or by default the cores.
-            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, CHOSEN, 1.0))
+            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, chosen, 1.0))
         return _assembled(work, count, arrays["keys"], partition, features, belief)
 
 

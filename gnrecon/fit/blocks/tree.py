@@ -1,9 +1,9 @@
-"""Octrees over Morton codes: blocks of neighbouring cells, and a tree of dipoles for the winding number of many points.
+"""Octrees over Morton codes: blocks of neighbouring cells, and a tree of dipoles for the winding number of points.
 
-Morton codes interleave the bits of a cell's three numbers. In their order every node of an octree is one range of cells;
-so are the points, which can be stored in a file block after block. A block is a node that holds few enough points.
+Morton codes interleave the bits of a cell's three numbers. In their order every node of an octree is one range of cells
+and of points, which can be stored in a file block after block. A block is a node that holds few enough points.
 
-The tree of dipoles gathers points in cubes, those in cubes of twice the side, and so on. A distant cube acts as a single
+The tree of dipoles gathers points in cubes, these in cubes of twice the side, and so on. A distant cube acts as one
 dipole: the sum of its points' normals times the areas that they represent, at their mean position. For the queries in
 one box, a cube counts as a whole where the gap between both is wider than the cube; otherwise its eight children are
 examined. So each query costs some hundred terms however many points there are.
@@ -127,7 +127,7 @@ class DipoleTree:
         )
         codes = morton_codes(np.floor((points - origin) / side).astype(np.int64))
         order = np.argsort(codes, kind="stable")
-        # In units of pi: the factor 1 / (4 pi) of the winding number is applied to the normals below.
+        # Areas in units of pi, so that the dipole a n / (4 pi) of the winding number is this area times n / 4.
         areas = disks**2
         sums = np.column_stack([areas, areas[:, None] * points, areas[:, None] * normals / 4])[order]
         first: Int

@@ -25,7 +25,7 @@ from gnrecon.fit.shape_priors.prior_parameters import BilateralParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.geometry.statistics import deviation
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 Neighbourhoods = tuple[slice, Int, Float]
 

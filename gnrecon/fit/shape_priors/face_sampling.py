@@ -16,7 +16,7 @@ from gnrecon.fit.shape_priors.prior_parameters import ResamplingParameters
 from gnrecon.fit.shape_priors.snapping import PrimitiveFace
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)

@@ -111,8 +111,8 @@ class _Bench:
         found = []
         for pid in running(output, "torus"):
             with contextlib.suppress(psutil.Error):
-                forker = psutil.Process(pid).parent()
-                worker = None if forker is None else forker.parent()
+                server = psutil.Process(pid).parent()
+                worker = None if server is None else server.parent()
                 found += [] if worker is None else [worker.pid]
         return found
 

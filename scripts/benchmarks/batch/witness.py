@@ -11,7 +11,7 @@ from collections import defaultdict
 from pathlib import Path
 from types import TracebackType
 
-from gnrecon.batch.job import PROGRESS, STATE, running_folder
+from gnrecon.batch.job import progress_file, records_folder, running_folder
 
 ACCIDENTS = {"killed": signal.SIGSEGV, "hangs": signal.SIGSTOP}
 """Names of scans, and the signals that their processes are sent."""
@@ -48,7 +48,7 @@ class Witness:
 
     def look(self) -> None:
         """Note which records are there, and when they were written."""
-        for record in (self._output / STATE / "records").glob("[a-z]*.json"):
+        for record in records_folder(self._output).glob("[a-z]*.json"):
             with contextlib.suppress(FileNotFoundError):
                 self._writings[record.stem].add(record.stat().st_mtime_ns)
 
@@ -68,7 +68,7 @@ class Witness:
 def running(output: Path, name: str) -> list[int]:
     """Return the processes that work at a scan now."""
     found = []
-    for progress in running_folder(output).glob(f"{name}-*/{PROGRESS}"):
+    for progress in map(progress_file, running_folder(output).glob(f"{name}-*")):
         with contextlib.suppress(OSError, ValueError, KeyError):
             found.append(int(json.loads(progress.read_text(encoding="utf-8"))["pid"]))
     return found
