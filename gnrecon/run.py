@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gnrecon.config import settings_text
-from gnrecon.io import all_members, check_writable, written_origin
+from gnrecon.io import all_input_files, check_writable, written_origin
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
@@ -87,7 +87,7 @@ class Files:
         """Return the files that are read, those that scans name among them, and the files that are written."""
         asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
         inputs = [path for path in (self.reference, self.settings) if path is not None]
-        return [*all_members(self.scans, self.format), *all_members(inputs)], [
+        return [*all_input_files(self.scans, self.format), *all_input_files(inputs)], [
             path for path in asked if path is not None
         ]
 

@@ -22,7 +22,7 @@ import numpy as np
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
 MOST_BLOCKS = 96

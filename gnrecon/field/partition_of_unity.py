@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.runtime.parallel import abreast, slices
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import abreast
 
 OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 

@@ -20,9 +20,10 @@ from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.geometry.signed_distance import Box
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.files import atomic_write
-from gnrecon.runtime.parallel import abreast, slices
+from gnrecon.runtime.parallel import abreast
 from gnrecon.version import __version__
 
 _BATCH_BYTES = 4_000_000

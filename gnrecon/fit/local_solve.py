@@ -20,7 +20,7 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 SIZE = 3.0
 """Standard deviation s of the correction, over the root mean square of what is left over."""

@@ -20,10 +20,11 @@ from gnrecon.fit.fit_options import FitOptions, normal_residual
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
-from gnrecon.least_squares.jacobian import Block, LayeredJacobian
+from gnrecon.least_squares.jacobian import Block
 from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.least_squares.layered_jacobian import LayeredJacobian
 from gnrecon.residuals.constraints import Linearised, Residual, eikonal, interface, signed_distance
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000
 """Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""

@@ -33,7 +33,7 @@ from gnrecon.fit.objective import normal_weight
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 MOST_POINTS = 20_000
 """Data points that count; more of them are thinned at random, so that sigma is rather too large."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
-from gnrecon.runtime.parallel import slices
 
 FOLDED = math.radians(45.0)
 """Angle from the area-weighted normal at which edge-weighted ones are no longer believed."""

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.runtime.parallel import abreast, slices
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import abreast
 
 _SOURCES = 4000
 _NEIGHBOURS = 8

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 _NEIGHBOURS = (12, 24, 48)
 

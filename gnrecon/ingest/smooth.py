@@ -14,7 +14,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.noise import neighbour_spacing
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 _LEAST = 9
 """Neighbours, the point itself included, that a quadric needs; points with fewer stay where they are."""

@@ -12,8 +12,8 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.noise import mean_spacing
 from gnrecon.ingest.outliers import thickness
 from gnrecon.ingest.voxel_grid import voxel_representatives, voxel_representatives_of_side
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.parallel import slices
 
 
 def _random(points: Float, count: int, rng: np.random.Generator) -> Int:

@@ -222,7 +222,7 @@ def same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[
 # Which files a scan consists of: its own, and those that its own names.
 
 
-def members(path: Path, format: str | None = None) -> list[Path]:
+def input_files(path: Path, format: str | None = None) -> list[Path]:
     """Return a scan's file and all files that it names and that exist, each once.
 
     A file that cannot be parsed names none: its reader reports what is wrong with it.
@@ -234,16 +234,16 @@ def members(path: Path, format: str | None = None) -> list[Path]:
     """
     extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
     try:
-        named = _NAMES.get(extension, lambda _: [])(path)
-        there = [beside(path.parent, name, "file") for name in named]
+        names = _NAMES.get(extension, lambda _: [])(path)
+        named = [beside(path.parent, name, "file") for name in names]
     except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError):
-        there = []
-    return list(dict.fromkeys([path, *(member for member in there if member.is_file())]))
+        named = []
+    return list(dict.fromkeys([path, *(file for file in named if file.is_file())]))
 
 
-def all_members(paths: Iterable[Path], format: str | None = None) -> list[Path]:
-    """Return all files that scans are read from, see `members`: none of them may be written."""
-    return [member for path in paths for member in members(path, format)]
+def all_input_files(paths: Iterable[Path], format: str | None = None) -> list[Path]:
+    """Return all files that scans are read from, see `input_files`: none of them may be written."""
+    return [file for path in paths for file in input_files(path, format)]
 
 
 def _of_conf(path: Path) -> list[str]:

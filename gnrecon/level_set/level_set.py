@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Box
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 Value = Callable[[Tensor], Tensor]
 """Takes points, of shape (N, 3), and returns f there, of shape (N,)."""

@@ -82,20 +82,10 @@ def _told(answer: Answer, number: int, count: int, advance: ProgressCallback) ->
     return answer
 
 
-# Rows by stretches: what is computed of millions at a time takes little memory beside them.
-
-
-def slices(count: int, size: int = 1 << 18) -> list[slice]:
-    """Return slices that cover `count` rows, at most `size` at a time."""
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-
 PATIENCE = "20s"
 
 
 # A Dask scheduler that is there already, for whoever hands tasks in: batches of scans and blocks of a large one.
-
-
 def require_distributed() -> Any:
     """Return the package `distributed`.
 

@@ -24,7 +24,7 @@ from gnrecon.field import CurvedJet, Network
 from gnrecon.least_squares import Block, LayeredJacobian
 from gnrecon.level_set import transported
 from gnrecon.residuals import Linearised, Residual, SecondOrder, tangents
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 CHUNK = 8192
 FOLLOWED, LONGEST = 2, 0.1

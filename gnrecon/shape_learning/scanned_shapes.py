@@ -25,7 +25,7 @@ from gnrecon.field import Network
 from gnrecon.field.layers import SINE
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Box, CoarseDistance, halved, least_values
-from gnrecon.least_squares import Iterative, LinearSolver, Neighbours, Preconditioner, jacobian_layer_scaled
+from gnrecon.least_squares import Iterative, LinearSolver, NeighbourSums, Preconditioner, jacobian_layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
 from gnrecon.shape_learning.shape_problem import (
@@ -151,7 +151,7 @@ def by_few_neighbours() -> LinearSolver:
     10 iterations and a quarter of J^T J's cost, runs of eight 33, runs of two 4. Later pairs are cheaper than fours,
     and in the end J^T J itself is cheaper than both.
     """
-    return Iterative("cg", Neighbours(longest=LONGEST), energy=EXACT, reuse=False, adapt=_Shorter())
+    return Iterative("cg", NeighbourSums(longest=LONGEST), energy=EXACT, reuse=False, adapt=_Shorter())
 
 
 @dataclass
@@ -163,7 +163,7 @@ class _Shorter:
     def __call__(self, preconditioner: Preconditioner, iterations: float) -> Preconditioner:
         """Return the preconditioner of the next step, by the mean number of iterations of the last ones."""
         self.waited += 1
-        if not isinstance(preconditioner, Neighbours) or iterations <= MANY or self.waited < WAIT:
+        if not isinstance(preconditioner, NeighbourSums) or iterations <= MANY or self.waited < WAIT:
             return preconditioner
         self.waited = 0
         return replace(preconditioner, longest=max(preconditioner.longest // 2, 1))

@@ -14,7 +14,7 @@ from torch import Tensor
 from gnrecon.field import TANH, Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Box, halved
-from gnrecon.least_squares import Iterative, LinearSolver, Neighbours, identity
+from gnrecon.least_squares import Iterative, LinearSolver, NeighbourSums, identity
 from gnrecon.level_set import KnownSurface, LevelSet, sample_surface
 from gnrecon.optim import GainRatioDamping, Search
 from gnrecon.residuals import Residual, SecondOrder
@@ -44,7 +44,7 @@ def by_neighbours() -> LinearSolver:
     The rows of points on a smooth surface, in the order in which `sample_surface` gives them, change little from one
     to the next, and few of J^T J's eigenvalues are above the damping. Where rows do change, J^T J itself is taken.
     """
-    return Iterative("cg", Neighbours(ALIKE), energy=ENERGY, reuse=False, rounding=ROUNDING)
+    return Iterative("cg", NeighbourSums(ALIKE), energy=ENERGY, reuse=False, rounding=ROUNDING)
 
 
 Start = Callable[[Tensor], Tensor]

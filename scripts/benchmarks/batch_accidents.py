@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 import gnrecon
-from gnrecon.batch.job import PROGRESS, STATE, running_folder
+from gnrecon.batch.job import progress_file, records_folder, running_folder
 
 BROKEN = {
     "torn": "input",
@@ -114,7 +114,7 @@ class BatchWatcher:
 
     def look(self) -> None:
         """Note the records that exist, and when they were written."""
-        for record in (self._output / STATE / "records").glob("[a-z]*.json"):
+        for record in records_folder(self._output).glob("[a-z]*.json"):
             with contextlib.suppress(FileNotFoundError):
                 self._writings[record.stem].add(record.stat().st_mtime_ns)
 
@@ -134,7 +134,7 @@ class BatchWatcher:
 def running(output: Path, name: str) -> list[int]:
     """Return the processes that work on a scan now."""
     found = []
-    for progress in running_folder(output).glob(f"{name}-*/{PROGRESS}"):
+    for progress in map(progress_file, running_folder(output).glob(f"{name}-*")):
         with contextlib.suppress(OSError, ValueError, KeyError):
             found.append(int(json.loads(progress.read_text(encoding="utf-8"))["pid"]))
     return found

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.harness.command_line import require_matplotlib
 
-from gnrecon.cli.learn_command import LearnOptions
+from gnrecon.cli.learn_problem import LearnOptions
 from gnrecon.runtime.errors import ExitCode, GnreconError
 from gnrecon.runtime.files import write_text
 from reproduction.experiments import PROBLEMS, Experiment, as_csv, as_markdown, experiments, interrupted

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gnrecon.cli.learn_command import LearnOptions, run_learn
 from gnrecon.cli.learn_inputs import DesignFiles, ScanFiles, is_scan
+from gnrecon.cli.learn_problem import LearnOptions, run_learn
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.shape_learning import OPTIMISERS
 

@@ -10,26 +10,26 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import errands
+import fake_work
 import psutil
 import pytest
-from errands import job, notes
+from fake_work import job, notes
 
-from gnrecon.batch.child_process import close_forkers
+from gnrecon.batch.child_process import close_fork_servers
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import Cause, Job, Limits, Outcome, Status, read_record, running_folder
-from gnrecon.batch.runner import workplace
+from gnrecon.batch.job import Cause, Job, JobOutcome, Limits, Status, read_record, running_folder
+from gnrecon.batch.runner import locked_output_folder
 from gnrecon.runtime.errors import ExitCode
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forker() -> Iterator[None]:
+def fork_servers() -> Iterator[None]:
     yield
-    close_forkers()
+    close_fork_servers()
 
 
-def done(one: Job, stop: threading.Event | None = None) -> Outcome:
-    outcome = run_job(one, stop, work=errands.WORK)
+def done(one: Job, stop: threading.Event | None = None) -> JobOutcome:
+    outcome = run_job(one, stop, work=fake_work.WORK)
     assert not list(running_folder(one.output).glob("*"))
     return outcome
 
@@ -114,7 +114,7 @@ def test_a_batch_killed_before_the_files_had_their_names_gives_them_at_its_next_
         staged = one.output / record.staged / name
         staged.parent.mkdir(parents=True, exist_ok=True)
         (one.output / name).rename(staged)
-    with workplace(one.output):
+    with locked_output_folder(one.output):
         assert done(one) == replace(first, status=Status.UNCHANGED, attempts=0, seconds=0.0)
 
 
@@ -204,10 +204,10 @@ def test_temporary_files_of_the_libraries_are_gone_with_the_attempt(tmp_path: Pa
     assert not list(tmp_path.rglob("left"))
 
 
-def test_a_forker_that_was_killed_is_started_again(tmp_path: Path) -> None:
+def test_a_fork_server_that_was_killed_is_started_again(tmp_path: Path) -> None:
     done(job(tmp_path, "first", "good"))
-    (forker,) = [p for p in psutil.Process().children() if "gnrecon.batch.fork_server" in p.cmdline()]
-    threading.Timer(0.5, lambda: os.kill(forker.pid, signal.SIGKILL)).start()
+    (server,) = [p for p in psutil.Process().children() if "gnrecon.batch.fork_server" in p.cmdline()]
+    threading.Timer(0.5, lambda: os.kill(server.pid, signal.SIGKILL)).start()
     assert done(job(tmp_path, "second", "good 1.5")).status == Status.MADE
     assert notes(tmp_path / "scans", "began") == ["first", "second", "second"]
     assert notes(tmp_path / "scans", "ended") == ["first", "second"]

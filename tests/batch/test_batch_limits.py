@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import errands
+import fake_work
 import pytest
 
-from gnrecon.batch import executors as capacity
+from gnrecon.batch import executors
 from gnrecon.batch.executors import fitting_jobs
 from gnrecon.batch.job import Job, Limits
 from gnrecon.batch.plan import parse_megabytes, parse_seconds
 from gnrecon.batch.request import Request
-from gnrecon.batch.runner import workplace
+from gnrecon.batch.runner import locked_output_folder
 from gnrecon.options import Options
 from gnrecon.runtime.errors import OutputError, UsageError
 
@@ -22,7 +22,7 @@ def test_times() -> None:
     for text, seconds in times.items():
         assert parse_seconds(text) == seconds
     for text in ("", "-3", "0", "soon", "3 weeks", "nan", "1e3"):
-        with pytest.raises(UsageError, match="is no time such as"):
+        with pytest.raises(UsageError, match="is not a time such as"):
             parse_seconds(text)
 
 
@@ -31,38 +31,38 @@ def test_amounts_of_memory() -> None:
     for text, megabytes in amounts.items():
         assert parse_megabytes(text) == pytest.approx(megabytes)
     for text in ("", "4", "0GB", "-1GB", "4 apples"):
-        with pytest.raises(UsageError, match="is no amount of memory such as"):
+        with pytest.raises(UsageError, match="is not an amount of memory such as"):
             parse_megabytes(text)
 
 
 def a_job(folder: Path, limit: float | None = None, **options: object) -> Job:
     values = Options.of(**{"threads": 1, **options}).as_dict()
-    return errands.job(folder, "scan", "good", Limits(memory_mb=limit), options=values)
+    return fake_work.job(folder, "scan", "good", Limits(memory_mb=limit), options=values)
 
 
 def test_as_many_jobs_as_cores_and_memory_allow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "available_cores", lambda: 8)
-    monkeypatch.setattr(capacity, "available_memory_mb", lambda: 100_000.0)
+    monkeypatch.setattr(executors, "available_cores", lambda: 8)
+    monkeypatch.setattr(executors, "available_memory_mb", lambda: 100_000.0)
     assert fitting_jobs([a_job(tmp_path)] * 20, threads=1) == 8
     assert fitting_jobs([a_job(tmp_path)] * 20, threads=3) == 2
     assert fitting_jobs([a_job(tmp_path)] * 20, threads=16) == 1
     assert fitting_jobs([a_job(tmp_path)] * 3, threads=1) == 3
     assert fitting_jobs([a_job(tmp_path, limit=30_000.0)] * 20, threads=1) == 3
     assert fitting_jobs([a_job(tmp_path), a_job(tmp_path, resolution=2048)] * 20, threads=1) == 6
-    monkeypatch.setattr(capacity, "available_memory_mb", lambda: 100.0)
+    monkeypatch.setattr(executors, "available_memory_mb", lambda: 100.0)
     assert fitting_jobs([a_job(tmp_path)] * 20, threads=1) == 1
 
 
 def test_what_this_machine_has_is_positive() -> None:
-    assert capacity.available_cores() >= 1
-    assert capacity.available_memory_mb() > 0
+    assert executors.available_cores() >= 1
+    assert executors.available_memory_mb() > 0
 
 
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
         ({"sources": ()}, "Name a folder, a pattern or scans"),
-        ({"sources": ("-",)}, "reads no standard input"),
+        ({"sources": ("-",)}, "does not read standard input"),
         ({"mesh_format": "fbx"}, "cannot be written as 'fbx'; use obj, ply"),
         ({"jobs": 0}, "jobs must be positive, not 0"),
         ({"retry": -1}, "must not be negative, not -1"),
@@ -75,10 +75,14 @@ def test_requests_that_make_no_sense(values: dict[str, object], sentence: str, t
 
 def test_one_batch_at_a_time_works_in_a_folder(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"
-    with workplace(folder), pytest.raises(UsageError, match="Another batch is at work in"), workplace(folder):
+    with (
+        locked_output_folder(folder),
+        pytest.raises(UsageError, match="Another batch is running in"),
+        locked_output_folder(folder),
+    ):
         pass
-    with workplace(folder):
+    with locked_output_folder(folder):
         pass
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="cannot be made"), workplace(tmp_path / "file"):
+    with pytest.raises(OutputError, match="cannot be created"), locked_output_folder(tmp_path / "file"):
         pass

@@ -12,8 +12,8 @@ from benchmarks.__main__ import main as bench
 from benchmarks.batch_accidents import BROKEN, CONFIG, BatchWatcher, make_scans
 from benchmarks.batch_recovery import sound, table
 
-from gnrecon.batch.job import PROGRESS, running_folder
-from gnrecon.batch.scan_search import Search, find_scans
+from gnrecon.batch.job import progress_file, running_folder
+from gnrecon.batch.scan_search import ScanSearch, find_scans
 from gnrecon.config import read_settings
 from gnrecon.io import read_cloud
 from gnrecon.runtime.errors import ExitCode, InputError
@@ -24,7 +24,7 @@ SPEED = {"scans": 4, "ratio": 2.0, "cpu_ratio": 3.0, "overhead_seconds": 0.1}
 
 def test_its_scans_are_good_and_broken(tmp_path: Path) -> None:
     good = make_scans(tmp_path / "scans", 4, points=350, hog_points=1000)
-    found = {path.scan.stem: path.scan for path in find_scans([str(tmp_path / "scans")], [], Search())}
+    found = {path.scan.stem: path.scan for path in find_scans([str(tmp_path / "scans")], [], ScanSearch())}
     assert set(found) == {*good, *BROKEN}
     assert {len(read_cloud(found[name])) for name in good} == {350}
     assert len({found[name].read_bytes() for name in good}) == len(good)
@@ -52,7 +52,7 @@ def test_its_watcher_sees_records_and_brings_accidents(tmp_path: Path) -> None:
         watcher.look()
         (records / "twice.json").write_text("again")
         watcher.look()
-        (folder / PROGRESS).write_text(json.dumps({"pid": victim.pid}))
+        progress_file(folder).write_text(json.dumps({"pid": victim.pid}))
         assert victim.wait(30) == -signal.SIGSEGV
     assert watcher.finished() == ["once", "twice"]
     assert watcher.twice() == ["twice"]

@@ -16,7 +16,7 @@ from other_packages import install, packages
 from rich.console import Console
 
 import gnrecon
-from gnrecon.cli.app import doctor, system_packages
+from gnrecon.cli import doctor, system_packages
 from gnrecon.cli.doctor import Check
 
 
@@ -125,7 +125,7 @@ def test_the_table_shows_brackets_as_they_are_and_commands_in_one_line() -> None
 
 
 def test_the_missing_packages_are_printed_one_a_line(repository: Path) -> None:
-    script = repository / "gnrecon" / "system_packages.py"
+    script = repository / "gnrecon" / "cli" / "system_packages.py"
     done = subprocess.run([sys.executable, "-I", script], capture_output=True, text=True, check=True)
     expected = system_packages.missing_venv_packages() + system_packages.missing_library_packages()
     assert done.stdout.split() == expected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,6 @@ from gnrecon.field import Network
 from gnrecon.field.layers import WAVELET
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.shape_learning import learn as pretrain
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def gnrecon(capfd: pytest.CaptureFixture[str]) -> CommandLine:
 
 
 def test_a_few_steps_of_the_sample(gnrecon: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pretrain, "STEPS", 12)
+    monkeypatch.setattr(import_module("gnrecon.shape_learning.learn"), "STEPS", 12)
     monkeypatch.setattr("gnrecon.shape_learning.part_problem.POOL", 30_000)
     monkeypatch.setattr("gnrecon.shape_learning.part_problem.CELLS", 32)
     monkeypatch.setattr("gnrecon.shape_learning.part_problem.NETWORK", Network((8, 8), WAVELET, (6.0, 2.0)))

@@ -16,6 +16,7 @@ from gnrecon.export.mesh_field import fine_enough, mesh_field
 from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.export.resolution import chord_error
 from gnrecon.ingest.noise import neighbour_spacing
+from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError
 
@@ -83,7 +84,7 @@ def test_a_resolution_and_an_edge_length_exclude_each_other() -> None:
         MeshOptions(resolution=128, edge_length=0.5)
     box = np.array([[0.0, 0, 0], [1, 1, 1]])
     assert MeshOptions().cells(box) == 256
-    assert MeshOptions(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
+    assert Options(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
     with pytest.raises(UsageError, match="possible"):
         MeshOptions(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))
 
@@ -103,13 +104,13 @@ def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
     box, plane = np.array([[0.0, 0, 0], [1, 1, 0.2]]), np.stack(np.meshgrid(range(60), range(60), [0.0]), -1)
     points = plane.reshape(-1, 3) / 60
     spacing = neighbour_spacing(points)
-    assert MeshOptions().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
+    assert Options().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
     assert 128 < math.ceil(3.0 / spacing) < 256
-    assert MeshOptions().for_scan(points[::7], box).resolution == 128
-    assert MeshOptions().for_scan(points[:5], box).resolution == 128
-    assert MeshOptions().for_scan(points, 3 * box).resolution == 256
-    assert MeshOptions().for_scan(np.zeros((9, 3)), box).resolution == 256
-    assert MeshOptions(resolution=50).for_scan(points, box).resolution == 50
+    assert Options().for_scan(points[::7], box).resolution == 128
+    assert Options().for_scan(points[:5], box).resolution == 128
+    assert Options().for_scan(points, 3 * box).resolution == 256
+    assert Options().for_scan(np.zeros((9, 3)), box).resolution == 256
+    assert Options(resolution=50).for_scan(points, box).resolution == 50
 
 
 def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
@@ -125,7 +126,7 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
         cells = result.report["fineness"]["resolution"]
         assert result.report["options"]["resolution"] == cells
         found[noise] = cells
-        by_points = MeshOptions().for_scan(scan, box).resolution
+        by_points = Options().for_scan(scan, box).resolution
         assert by_points is not None
         assert cells >= by_points
         if noise == 0.0:

@@ -18,8 +18,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.io import read_cloud, read_mesh, write_mesh
 from gnrecon.pipeline import reconstruct
-from gnrecon.residuals import SecondOrder, eikonal, interface, mean_curvature
-from gnrecon.residuals import named_residuals as named
+from gnrecon.residuals import SecondOrder, eikonal, interface, mean_curvature, named
 from gnrecon.runtime.errors import FitError, GnreconError, InputError, OutputError, UsageError
 
 TETRA = Mesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

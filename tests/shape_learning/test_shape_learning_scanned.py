@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from gnrecon.geometry.point_cloud import Frame, Samples
-from gnrecon.least_squares import Iterative, Neighbours
+from gnrecon.least_squares import Iterative, NeighbourSums
 from gnrecon.level_set import LevelSet
-from gnrecon.shape_learning import ScannedSurface, learn
-from gnrecon.shape_learning import scanned_shapes as scanned
+from gnrecon.shape_learning import ScannedSurface, learn, scanned
 from gnrecon.shape_learning.shape_problem import LAST, Drawn, Moment
 
 
@@ -154,6 +153,6 @@ def test_neighbours_come_together_for_the_solver() -> None:
     longest = []
     for iterations in [5.0] * 10 + [50.0] * 30:
         solver.preconditioner = solver.adapt(solver.preconditioner, iterations)
-        assert isinstance(solver.preconditioner, Neighbours)
+        assert isinstance(solver.preconditioner, NeighbourSums)
         longest.append(solver.preconditioner.longest)
     assert longest == [4] * 10 + [2] * 8 + [1] * 22, "shorter runs wait until they have shown what they do"

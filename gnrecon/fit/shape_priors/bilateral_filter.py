@@ -24,7 +24,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.geometry.statistics import deviation
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 Part = tuple[slice, Int, Float]
 

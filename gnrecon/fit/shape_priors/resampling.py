@@ -23,7 +23,7 @@ from gnrecon.fit.shape_priors.primitives import LEAST, Cylinder, Plane, agreed, 
 from gnrecon.fit.shape_priors.snapping import OFF, Face, Search
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Density, winding_number
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 NOISE, ANGLE = 0.005, 10.0
 """Noise with which surfaces are looked for, in radii of a point's disk, and degrees between their normals and a

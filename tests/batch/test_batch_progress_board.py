@@ -9,23 +9,25 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gnrecon.batch.job import PROGRESS, Cause, Outcome, Status, running_folder
-from gnrecon.batch.progress_board import Board
+from gnrecon.batch.job import Cause, JobOutcome, Status, progress_file, running_folder
+from gnrecon.batch.progress_board import ProgressBoard
 
-MADE = Outcome("ring", "s/ring.ply", Status.MADE, files={"mesh": "out/ring.obj"}, attempts=1)
-OLD = Outcome("old", "s/old.ply", Status.UNCHANGED, files={"mesh": "out/old.obj"})
-TORN = Outcome("torn", "s/torn.ply", Status.FAILED, Cause.INPUT, "s/torn.ply: it ends early.", 3, attempts=1)
+MADE = JobOutcome("ring", "s/ring.ply", Status.MADE, files={"mesh": "out/ring.obj"}, attempts=1)
+OLD = JobOutcome("old", "s/old.ply", Status.UNCHANGED, files={"mesh": "out/old.obj"})
+TORN = JobOutcome("torn", "s/torn.ply", Status.FAILED, Cause.INPUT, "s/torn.ply: it ends early.", 3, attempts=1)
 
 
 def write_state(output: Path, text: str, name: str) -> None:
     folder = running_folder(output) / name
     folder.mkdir(parents=True)
-    (folder / PROGRESS).write_text(text)
+    progress_file(folder).write_text(text)
 
 
 def shown(output: Path, *, terminal: bool, quiet: bool = False) -> str:
     text = io.StringIO()
-    board = Board(Console(file=text, force_terminal=terminal, width=100, quiet=quiet, color_system=None), 5, output)
+    board = ProgressBoard(
+        Console(file=text, force_terminal=terminal, width=100, quiet=quiet, color_system=None), 5, output
+    )
     with board.shown():
         for outcome in (MADE, OLD, TORN):
             board.done(outcome)

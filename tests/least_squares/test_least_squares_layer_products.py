@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from damped_problems import randn
 from torch import Tensor
 
-from gnrecon.least_squares.layer_products import BLOCK, gram
+from gnrecon.least_squares.layer_products import gram
 
 
 def in_chunks(J: Tensor, size: int) -> Iterator[Tensor]:
@@ -20,6 +21,9 @@ def in_chunks(J: Tensor, size: int) -> Iterator[Tensor]:
         buffer[: len(rows)] = rows
         yield buffer[: len(rows)]
         buffer.fill_(torch.nan)
+
+
+BLOCK = inspect.signature(gram).parameters["block_columns"].default
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 7, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK + 3])

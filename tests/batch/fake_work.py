@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gnrecon.batch.job import FAILURE, Job, Limits
+from gnrecon.batch.job import Job, Limits, failure_file
 
-WORK = "errands"
+WORK = "fake_work"
 
 PNG = b"no picture"
 REPORT = {
@@ -40,7 +40,7 @@ def work(argument: dict[str, Any]) -> int:
     print(f"words of {scan.name}")
     code = _DEEDS[words[0]](*words[1:])
     if code:
-        (folder / FAILURE).write_text(f"{scan.name} ends with {code}.")
+        failure_file(folder).write_text(f"{scan.name} ends with {code}.")
         return code
     for kind, name in argument["files"].items():
         (folder / name).write_bytes(_content(kind, scan, argument["options"]))

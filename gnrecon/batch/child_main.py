@@ -1,6 +1,7 @@
-"""What a child process does for one scan: the same as ``gnrecon SCAN -o MESH``, with all files in a folder of its own.
+"""Entry point of a child process, which reconstructs one scan as ``gnrecon SCAN -o MESH`` does.
 
-Only when everything was written and verified there do the files receive their names, from the process that waits.
+All files are written into a folder of the attempt. The waiting process moves them into place once everything was
+written and verified. `work` is started by `gnrecon.batch.fork_server`.
 """
 
 from __future__ import annotations
@@ -13,24 +14,22 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from gnrecon.batch.job import FAILURE, PROGRESS
+from gnrecon.batch.job import failure_file, progress_file
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress
 from gnrecon.runtime.errors import ExitCode, failure
 
-_SELDOM = 0.5
-
 
 def prepare() -> None:
-    """Import what a run needs, before any child is forked."""
-    import gnrecon.run  # noqa: F401 - what is imported here, no child has to import
+    """Import everything that a run needs, before any child is forked."""
+    import gnrecon.run  # noqa: F401 - imported once here, so that no child has to
     from gnrecon.runtime.preload import preload
 
     preload()
 
 
 def work(argument: dict[str, Any]) -> int:
-    """Reconstruct a scan and return the exit code; a failure's sentence is left in the attempt's folder.
+    """Reconstruct a scan and return the exit code; the sentence on a failure is written to the attempt's folder.
 
     Parameters
     ----------
@@ -44,7 +43,7 @@ def work(argument: dict[str, Any]) -> int:
         traceback.print_exc()
         sentence, code = failure(error)
         print(f"gnrecon: {sentence}", file=sys.stderr)
-        (folder / FAILURE).write_text(sentence, encoding="utf-8")
+        failure_file(folder).write_text(sentence, encoding="utf-8")
         return code
 
 
@@ -63,43 +62,51 @@ def _reconstruct(argument: dict[str, Any], folder: Path) -> ExitCode:
         html=paths.get("page"),
         thumbnail=paths["thumbnail"],
     )
-    told = Told(argument["name"], folder / PROGRESS)
-    return ExitCode(run(files, argument["options"], command=argument["command"], watcher=told))
+    progress = ProgressFile(argument["name"], progress_file(folder))
+    return ExitCode(run(files, argument["options"], command=argument["command"], watcher=progress))
 
 
-class Told(Progress):
-    """Tells the stage of a run, and how much of it is done, by a small file that is written anew now and then."""
+class ProgressFile(Progress):
+    """Writes the stage of a run, and the share of it that is done, to a small JSON file.
 
-    def __init__(self, name: str, path: Path) -> None:
-        self._name, self._path, self._begun = name, path, time.time()
-        self._stage, self._share, self._told = "start", 0.0, 0.0
+    Parameters
+    ----------
+    name : of the scan's outputs
+    path : file to write, replaced on each update
+    interval_seconds : time between two updates within a stage; the live table is drawn twice a second
+    """
+
+    def __init__(self, name: str, path: Path, *, interval_seconds: float = 0.5) -> None:
+        self._name, self._path, self._interval = name, path, interval_seconds
+        self._start_time = time.time()
+        self._stage, self._share, self._written_at = "start", 0.0, 0.0
         self._write()
 
     def stage(self, name: str) -> None:
-        """Tell a new stage at once."""
+        """Write a new stage immediately."""
         self._stage, self._share = name, 0.0
         self._write()
 
     def advance(self, share: float) -> None:
-        """Tell the share, but not too often."""
+        """Write the share if the last update is old enough."""
         self._share = share
-        if time.monotonic() - self._told > _SELDOM:
+        if time.monotonic() - self._written_at > self._interval:
             self._write()
 
     def step(self, record: Record, total: int) -> None:
-        """Take a step as its share of all."""
+        """Count a step as its share of all steps."""
         self.advance(record.step / max(total, 1))
 
     def remark(self, sentence: str) -> None:
-        """Put a sentence into the log."""
+        """Print a sentence, which goes to the log."""
         print(sentence, file=sys.stderr, flush=True)
 
     def _write(self) -> None:
-        self._told = time.monotonic()
+        self._written_at = time.monotonic()
         state = {
             "name": self._name,
             "pid": os.getpid(),
-            "begun": self._begun,
+            "begun": self._start_time,
             "stage": self._stage,
             "share": round(self._share, 3),
         }

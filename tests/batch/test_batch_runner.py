@@ -12,18 +12,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-import errands
+import fake_work
 import jsonschema
 import numpy as np
 import psutil
 import pytest
-from errands import notes
+from fake_work import notes
 from scan_files import box, sphere, start, torus, write_scan
 
-from gnrecon.batch import executors as local
-from gnrecon.batch import runner
+from gnrecon.batch import executors, runner
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import PROGRESS, Outcome, running_folder
+from gnrecon.batch.job import JobOutcome, progress_file, running_folder
 from gnrecon.batch.request import Request
 from gnrecon.batch.runner import run_batch
 from gnrecon.cli.app import main
@@ -67,7 +66,7 @@ def accidents(output: Path) -> Iterator[None]:
     def befall() -> None:
         while not over.wait(0.02):
             for name, number in (("killed", signal.SIGSEGV), ("hangs", signal.SIGSTOP)):
-                for progress in running_folder(output).glob(f"{name}-*/{PROGRESS}"):
+                for progress in map(progress_file, running_folder(output).glob(f"{name}-*")):
                     with suppress(OSError, ValueError):
                         os.kill(json.loads(progress.read_text())["pid"], number)
 
@@ -113,10 +112,10 @@ def test_a_batch_that_was_killed_is_continued_and_every_failure_is_named(tmp_pat
     )
     with accidents(meshes):
         assert run_batch(request) == ExitCode.BATCH
-    told = summary(meshes)
-    assert {name for name, scan in told.items() if scan["status"] == "unchanged"} == set(finished)
-    assert {name for name, scan in told.items() if scan["status"] != "failed"} == set(good)
-    causes = {name: (scan["cause"], scan["message"]) for name, scan in told.items() if scan["status"] == "failed"}
+    listed = summary(meshes)
+    assert {name for name, scan in listed.items() if scan["status"] == "unchanged"} == set(finished)
+    assert {name for name, scan in listed.items() if scan["status"] != "failed"} == set(good)
+    causes = {name: (scan["cause"], scan["message"]) for name, scan in listed.items() if scan["status"] == "failed"}
     assert causes == {
         "torn": ("input", f"{scans}/torn.ply: the header declares 600 vertex rows, but the file ends after 100."),
         "void": ("input", f"{scans}/void.ply: the file is empty."),
@@ -166,8 +165,8 @@ def command(*words: object) -> int:
 
 @pytest.fixture
 def errand_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the jobs of this process's batches be errands."""
-    monkeypatch.setattr(local, "run_job", lambda *words: run_job(*words, work=errands.WORK))
+    """Let the jobs of this process's batches be fake_work."""
+    monkeypatch.setattr(executors, "run_job", lambda *words: run_job(*words, work=fake_work.WORK))
 
 
 def write_errands(folder: Path, **texts: str) -> Path:
@@ -229,19 +228,19 @@ def test_an_interrupted_batch_keeps_the_account_of_what_it_did(
 ) -> None:
     scans = write_errands(tmp_path / "scans", a="good", b="good 60", c="good")
 
-    class Impatient(runner.Board):
-        def done(self, outcome: Outcome) -> None:
+    class Impatient(runner.ProgressBoard):
+        def done(self, outcome: JobOutcome) -> None:
             raise KeyboardInterrupt(outcome.name)
 
-    monkeypatch.setattr(runner, "Board", Impatient)
+    monkeypatch.setattr(runner, "ProgressBoard", Impatient)
     began = time.monotonic()
     request = Request((str(scans),), tmp_path / "out", jobs=2, quiet=True)
     assert run_batch(request) == ExitCode.INTERRUPTED
     assert time.monotonic() - began < 30
-    told = tmp_path / "out" / "summary.json"
+    written = tmp_path / "out" / "summary.json"
     assert list(summary(tmp_path / "out")) == ["a"]
-    assert json.loads(told.read_text())["scans_asked_for"] == 3
-    assert capfd.readouterr().err == f"gnrecon: Interrupted; {told} tells what was done until then.\n"
+    assert json.loads(written.read_text())["scans_asked_for"] == 3
+    assert capfd.readouterr().err == f"gnrecon: Interrupted; {written} lists what was done until then.\n"
     assert not list(running_folder(tmp_path / "out").glob("*"))
     assert not (tmp_path / "out" / "b.obj").exists()
 
@@ -258,7 +257,7 @@ def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
         run_batch(Request((str(tmp_path),), tmp_path))
     with pytest.raises(UsageError, match="resolution must be at least 16"):
         run_batch(Request((str(tmp_path),), out, settings=Settings({"resolution": 3})))
-    with pytest.raises(OutputError, match="cannot be made"):
+    with pytest.raises(OutputError, match="cannot be created"):
         run_batch(Request((str(tmp_path),), tmp_path / "README.md" / "meshes"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "a.obj"]
 

@@ -8,13 +8,13 @@ import signal
 import time
 from pathlib import Path
 
-import errands
+import fake_work
 import psutil
 import pytest
-from errands import job, notes
+from fake_work import job, notes
 
-from gnrecon.batch.executors import Abandoned, run_on_cluster
-from gnrecon.batch.job import Outcome, Status, running_folder
+from gnrecon.batch.executors import FileRemoved, run_on_cluster
+from gnrecon.batch.job import JobOutcome, Status, running_folder
 from gnrecon.runtime.errors import UsageError
 
 # Dask's own threads and sockets go when they please.
@@ -24,14 +24,14 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 def test_nothing_is_lost_and_nothing_done_twice_where_a_worker_is_killed(tmp_path: Path) -> None:
     jobs = [job(tmp_path, f"s{number}", "good 0.4") for number in range(6)]
     jobs += [job(tmp_path, "bad", "exit 4"), job(tmp_path, "killed", "signal SIGSEGV")]
-    outcomes: list[Outcome] = []
+    outcomes: list[JobOutcome] = []
 
-    def done(outcome: Outcome) -> None:
+    def done(outcome: JobOutcome) -> None:
         outcomes.append(outcome)
         if len(outcomes) == 2:
             kill_a_worker(tmp_path)
 
-    run_on_cluster(jobs, None, 2, [], done, work=errands.WORK)
+    run_on_cluster(jobs, None, 2, [], done, work=fake_work.WORK)
     causes = {outcome.name: outcome.cause for outcome in outcomes}
     assert len(causes) == len(outcomes) == len(jobs)
     assert {name: str(cause) for name, cause in causes.items() if cause is not None} == {
@@ -45,8 +45,8 @@ def test_nothing_is_lost_and_nothing_done_twice_where_a_worker_is_killed(tmp_pat
     assert len(notes(tmp_path / "scans", "began")) > len(jobs)
     assert not list(running_folder(tmp_path / "meshes").glob(".batch-*"))
     # What is there is not done again, whichever the engine.
-    again: list[Outcome] = []
-    run_on_cluster(jobs[:6], None, 1, [], again.append, work=errands.WORK)
+    again: list[JobOutcome] = []
+    run_on_cluster(jobs[:6], None, 1, [], again.append, work=fake_work.WORK)
     assert {outcome.status for outcome in again} == {Status.UNCHANGED}
 
 
@@ -56,8 +56,8 @@ def kill_a_worker(folder: Path) -> None:
     while time.monotonic() < deadline:
         for process in psutil.Process().children(recursive=True):
             try:
-                forker = process.parent()
-                if _is_child(process, folder) and forker is not None and (worker := forker.parent()) is not None:
+                server = process.parent()
+                if _is_child(process, folder) and server is not None and (worker := server.parent()) is not None:
                     os.kill(worker.pid, signal.SIGKILL)
                     return
             except psutil.Error:
@@ -71,7 +71,7 @@ def _is_child(process: psutil.Process, folder: Path) -> bool:
 
 def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gnrecon.runtime.parallel.PATIENCE", "1s")
-    outcomes: list[Outcome] = []
+    outcomes: list[JobOutcome] = []
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         with pytest.raises(UsageError, match=f"No scheduler answers at {re.escape(address)}"):
             run_on_cluster([job(tmp_path, "a", "good")], address, 1, [], outcomes.append)
@@ -79,7 +79,7 @@ def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_sign_that_is_late_is_no_end(tmp_path: Path) -> None:
-    stop = Abandoned(tmp_path / "sign")
+    stop = FileRemoved(tmp_path / "sign")
     assert not stop.is_set()
     (tmp_path / "sign").touch()
     assert not stop.is_set()
