@@ -22,7 +22,7 @@ from benchmarks.harness.command_line import (
 from benchmarks.harness.measurement import Stopwatch, run_isolated
 from benchmarks.harness.tables import Figure, column_table
 from gnrecon.geometry.arrays import Float
-from gnrecon.io import MOST_POINTS, read_scans
+from gnrecon.io import IOParameters, read_scans
 from gnrecon.io.parse import format_rows
 from gnrecon.runtime.errors import ExitCode, UsageError
 
@@ -78,7 +78,9 @@ def _measure(name: str, chosen: argparse.Namespace) -> dict[str, Any]:
 def _parser() -> argparse.ArgumentParser:
     parser = benchmark_parser("ingest", __doc__)
     parser.add_argument("--points", type=int, default=20_000_000, help="points in each file")
-    parser.add_argument("--keep", type=int, default=MOST_POINTS, help="points to keep, as of --read-points")
+    parser.add_argument(
+        "--keep", type=int, default=IOParameters.most_points, help="points to keep, as of --read-points"
+    )
     parser.add_argument("--formats", nargs="+", choices=list(WRITERS), default=list(WRITERS), help="formats to read")
     add_outputs(parser)
     return parser

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gnrecon.field.networks import Siren
-from gnrecon.field.partition_of_unity import OFFSETS, Partition
+from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, Work
 from gnrecon.fit.blocks.tree import Codes, Dipoles, morton
@@ -25,7 +25,7 @@ from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.model_selection import Leftover, Volume
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import Box, is_certain, side_of
+from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding
 
 CHANCE = 3
 """Tells the cubes' chance from that of the rest of the fit, which has the same seed."""
@@ -134,7 +134,7 @@ class Blocks:
 
     def _around(self, key: Int) -> Int:
         """Return the rows of the points in a cell and its neighbours, in order; they hold all of the cube's data."""
-        keys = key + OFFSETS
+        keys = key + neighbour_offsets()
         codes = np.sort(morton(keys[(keys >= 0).all(axis=1)]))
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
@@ -151,6 +151,6 @@ class Blocks:
         clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
-        signed = side_of(winding) * np.sqrt(distance**2 - disks**2)
+        signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         has = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, has, signed, is_certain(winding), distance)
+        return Volume.around(x, has, signed, is_sign_certain(winding), distance)

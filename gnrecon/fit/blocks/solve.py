@@ -32,7 +32,7 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.chunks import slices
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 LARGE = 200_000
 """Points from which a scan is fitted by blocks."""
@@ -91,10 +91,10 @@ def fit_large(
         count = len(arrays["ends"]) - 1
         missing = [number for number in range(count) if not work.done(number)]
         if scheduler is not None and missing:
-            solve_scheduled(work, missing, scheduler, part(advance, chosen, 1.0))
+            solve_scheduled(work, missing, scheduler, subrange(advance, chosen, 1.0))
         else:
             # As many as torch has threads, which is what was asked for, or the machine's cores.
-            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, chosen, 1.0))
+            solve_blocks(work, missing, torch.get_num_threads(), options.device, subrange(advance, chosen, 1.0))
         return _gathered(work, count, arrays["keys"], partition, features, belief)
 
 

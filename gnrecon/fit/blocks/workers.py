@@ -19,8 +19,9 @@ from pathlib import Path
 from gnrecon.fit.blocks.block import solve_block
 from gnrecon.fit.blocks.store import Work
 from gnrecon.fit.blocks.worker import DONE
+from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import FitError, MemoryLimitError
-from gnrecon.runtime.parallel import connected, having_threads, require_distributed
+from gnrecon.runtime.parallel import torch_threads
 from gnrecon.runtime.progress import ProgressCallback
 
 NEED = 1.2e9
@@ -51,7 +52,7 @@ def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str,
     if processes > 1 and device == "cpu":
         _solve_beside(work.folder, blocks, processes, advance)
         return
-    with having_threads(1):
+    with torch_threads(1):
         for number, block in enumerate(blocks, 1):
             solve_block(work.folder, block, device)
             advance(number / len(blocks))
@@ -161,7 +162,7 @@ def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: Pr
         When a block cannot be solved.
     """
     folder, run = str(work.folder.absolute()), secrets.token_hex(4)
-    with connected(address) as client, client.as_current():
+    with dask_client(address) as client, client.as_current():
         futures = [
             client.submit(on_worker, folder, block, key=f"gnrecon-block-{run}-{block}", retries=RETRIES)
             for block in blocks
@@ -179,5 +180,5 @@ def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: Pr
 
 def on_worker(folder: str, block: int) -> None:
     """Solve a block on a worker, with one thread, because sums by several differ in their last digits."""
-    with having_threads(1):
+    with torch_threads(1):
         solve_block(folder, block)

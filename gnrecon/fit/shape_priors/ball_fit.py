@@ -17,7 +17,7 @@ from gnrecon.fit.shape_priors.whiteness_test import is_white
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.geometry.statistics import deviation
+from gnrecon.geometry.statistics import robust_deviation
 
 LEAST = 30
 """Fewest points that could tell a sphere from a quadric by what is noise."""
@@ -57,7 +57,7 @@ class Ball:
         density = Density(points)
         sphere = _first(points, normals).fitted(points, normals, density.radius, 0.0)
         height = sphere.at(points)
-        size = deviation(height)
+        size = robust_deviation(height)
         if sphere.side < 0 or np.abs(height).max() > max(OFF * size, EXACT * sphere.radius):
             return None
         if size > EXACT * sphere.radius and not (

@@ -21,8 +21,9 @@ from gnrecon.fit.shape_priors.bilateral_filter import Averaging
 from gnrecon.fit.shape_priors.primitives import LEAST, Primitive, Seen, Wanted, agreed, cosine_of, feet, surfaces
 from gnrecon.fit.shape_priors.whiteness_test import is_white
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.local_pca import plane_normals, principal_sums
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.geometry.statistics import deviation
+from gnrecon.geometry.statistics import robust_deviation
 
 MADE = 0.5
 """Least share of the points that lie on such surfaces, where a shape is a made one: 0.8 and more on machine parts, 0.2
@@ -91,7 +92,7 @@ def laid(points: Float, normals: Float, averaged: tuple[Float, Float]) -> Laid |
     density = Density(points)
     off = np.einsum("nd,nd->n", points - averaged[0], averaged[1])
     # The median heeds neither edges nor outliers.
-    search = Search(density, max(deviation(off), EXACT * density.radius), np.random.default_rng(0))
+    search = Search(density, max(robust_deviation(off), EXACT * density.radius), np.random.default_rng(0))
     found = search.all(*averaged, ANGLES[0], [])
     if search.share(found) < MADE:
         return None
@@ -333,8 +334,7 @@ def laid_bare(points: Float, normals: Float) -> Laid | None:
 def _noise(density: Density) -> float:
     """Return the noise with which surfaces are looked for, by how thick neighbourhoods within faces are."""
     near = density.tree.query(density.points, min(FLAT, len(density.points)))[1]
-    spread = density.points[near] - density.points[near].mean(axis=1, keepdims=True)
-    least = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", spread, spread))[:, 0].clip(0.0)
+    least = principal_sums(density.points[near])[:, 0].clip(0.0)
     thick = np.sqrt(np.percentile(least, LEVEL) / (FLAT - 3))
     return max(float(ROOM * thick), NOISE * density.radius)
 
@@ -347,8 +347,7 @@ def _anew(density: Density, normals: Float, rest: Int) -> Float:
     points = density.points[rest]
     away, near = cKDTree(points).query(points, ESTIMATED_BESIDE)
     enough = (away < WITHIN * density.radius).sum(axis=1) >= ENOUGH
-    spread = points[near] - points[near].mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
+    axes = plane_normals(points[near])
     sides = np.where(np.einsum("nd,nd->n", axes, normals[rest]) < 0, -1.0, 1.0)
     found[rest[enough]] = (sides[:, None] * axes)[enough]
     return found

@@ -27,7 +27,7 @@ from benchmarks.harness.measurement import Clock
 from gnrecon.field import Siren
 from gnrecon.fit.initialisation import solve_last_layer
 from gnrecon.fit.objective import FieldProblem, Scene, Term
-from gnrecon.fit.single_network import ENERGY
+from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
@@ -77,7 +77,7 @@ def our_fit(
         return posed(field, theta, drawn(sample, count, generator), torch.float32, weights=weights)
 
     start = solved_start(field, sample)
-    solver = SOLVERS["auto"](ENERGY)
+    solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
     search = GainRatioDamping(initial_damping=initial_damping, metric=layer_scaled, geodesic=True)
     steps = 1_000_000
     stop = StopRule(steps, tolerance=0.0, patience=steps, seconds=seconds - clock.seconds)

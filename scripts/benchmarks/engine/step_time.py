@@ -28,7 +28,7 @@ from benchmarks.engine.paper_loss import Sample, posed
 from benchmarks.engine.plain_baseline import Baseline
 from benchmarks.harness.measurement import timed
 from gnrecon.field import Siren
-from gnrecon.fit.single_network import ENERGY
+from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, Cholesky, Jacobian, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, Solution, StopRule
 
@@ -52,7 +52,7 @@ def our_steps(frozen: Frozen, steps: int) -> tuple[Solution, str]:
 
     The factors of the rows are stored in float32.
     """
-    solver = SOLVERS["auto"](ENERGY)
+    solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
     search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled)
     field = Siren(frozen.widths)
     never = StopRule(steps=steps, tolerance=0.0, patience=steps + 1)

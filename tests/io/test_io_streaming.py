@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scan_writers import FORMS, file_of, random_cloud
 
-from gnrecon.io import read_cloud, read_scans
-from gnrecon.io import streaming as chunks
+from gnrecon.io import READERS, IOParameters, read_cloud, read_scans
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats.stanford_conf import parse_conf
-from gnrecon.io.streaming import Gatherer
+from gnrecon.io.streaming import VoxelThinning, chunk_reader
 from gnrecon.runtime.errors import InputError
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -100,13 +99,11 @@ def test_several_files_are_merged(rng: np.random.Generator, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["ply", "xyz", "txt", "csv", "pts", "las", "laz", "ptx", "xyz-gz", "ply-text"])
-def test_chunks_make_no_difference(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_make_no_difference(name: str, tmp_path: Path) -> None:
     path = file_of(name, random_cloud(np.random.default_rng(5), 100), tmp_path)
     whole, _ = read_scans([path])
-    monkeypatch.setattr(chunks, "LARGE", 0)
     for rows in (7, 50, 1000):
-        monkeypatch.setattr(chunks, "ROWS", rows)
-        cloud, reading = read_scans([path])
+        cloud, reading = read_scans([path], parameters=IOParameters(chunked_file_bytes=0, chunk_points=rows))
         np.testing.assert_array_equal(cloud.points, whole.points)
         assert (cloud.normals is None) == (whole.normals is None)
         assert cloud.normals is None or np.array_equal(cloud.normals, whole.normals)
@@ -123,7 +120,7 @@ def test_chunks_make_no_difference(name: str, tmp_path: Path, monkeypatch: pytes
     most=st.integers(1, 100),
     scale=st.sampled_from([1e-12, 1.0, 1e9, 1e300]),
 )
-def test_gathering_keeps_the_first_point_of_each_cube_however_it_is_cut(
+def test_thinning_keeps_the_first_point_of_each_voxel_however_it_is_cut(
     seed: int, count: int, most: int, scale: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -131,10 +128,10 @@ def test_gathering_keeps_the_first_point_of_each_cube_however_it_is_cut(
     points[rng.random(count) < 0.05] = np.nan
     results = []
     for cuts in (np.array([], int), np.sort(rng.integers(0, count, 5)), np.arange(1, count)):
-        gatherer = Gatherer(most)
+        thinning = VoxelThinning(most)
         for rows in np.split(np.arange(count), cuts):
-            gatherer.add(Contents(points[rows], attributes={"row": rows}))
-        results.append((gatherer.gathered(), gatherer.side, gatherer.seen))
+            thinning.add(Contents(points[rows], attributes={"row": rows}))
+        results.append((thinning.result(), thinning.side, thinning.seen))
     first, side, seen = results[0]
     assert seen == count
     if count <= most:
@@ -167,15 +164,16 @@ def test_more_points_than_are_to_be_kept(rng: np.random.Generator, tmp_path: Pat
     assert reading.remarks()[0].startswith(f"Kept {len(cloud)} of 500 points, the first one in each cube of side ")
 
 
-def test_large_files_that_are_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunks, "LARGE", 0)
-    monkeypatch.setattr(chunks, "ROWS", 8)
+def test_large_files_that_are_damaged(tmp_path: Path) -> None:
+    parameters = IOParameters(chunked_file_bytes=0, chunk_points=8)
     for name in ("ply", "xyz", "las", "laz", "ptx"):
         path = file_of(name, random_cloud(np.random.default_rng(1), 50), tmp_path)
         path.write_bytes(path.read_bytes()[:-300] + b"\n0 0 a\n")
         with pytest.raises(InputError, match=f"^{path}: "):
-            read_scans([path])
+            read_scans([path], parameters=parameters)
 
 
 def test_every_chunked_format_is_tried_here() -> None:
-    assert {*chunks.CHUNKED} <= {form.suffix for form in FORMS.values()}
+    chunked = {extension for extension in READERS if chunk_reader(extension) is not None}
+    assert chunked
+    assert chunked <= {form.suffix for form in FORMS.values()}

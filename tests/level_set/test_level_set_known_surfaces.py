@@ -107,6 +107,7 @@ def test_the_area_of_the_catenoid_is_in_its_shares() -> None:
     assert float((shares * points[:, 2] ** 2).sum()) == pytest.approx(float(expected), rel=1e-4)
 
 
+@pytest.mark.seed(3358385388)
 def test_nearest_points_beat_all_samples(known: ParametricSurface, rng: np.random.Generator) -> None:
     queries = torch.as_tensor(rng.uniform(-1, 1, (60, 3)))
     feet, inside = known.nearest(queries)

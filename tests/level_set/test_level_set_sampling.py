@@ -44,6 +44,7 @@ def test_neighbours_come_together(shape: Shape, rng: np.random.Generator) -> Non
     assert np.mean(sides) < 5 * np.sqrt(sample.area / 2000)
 
 
+@pytest.mark.seed(1902792177)
 def test_rough_values_find_the_same_surface(shape: Shape, rng: np.random.Generator) -> None:
     exact = shape.level_set
 

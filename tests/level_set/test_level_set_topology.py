@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import pytest
 import torch
 from implicit_shapes import cube, level_set
 from scipy import ndimage
 
-from gnrecon.level_set import Beside, LevelSet, Region, joints, refined, separate_components
+from gnrecon.level_set import GridRegion, LevelSet, joints, refined, separate_components
 
 
 def balls(*centers: tuple[float, float, float], width: float = 0.25, level: float = 0.5) -> LevelSet:
@@ -26,7 +24,7 @@ def balls(*centers: tuple[float, float, float], width: float = 0.25, level: floa
 
 def test_two_balls_are_joined_halfway() -> None:
     pair = balls((-0.5, 0.0, 0.1), (0.5, 0.2, 0.1))
-    found = joints(pair, Region.within(pair.box, cells=24), margin=0.03)
+    found = joints(pair, GridRegion.within(pair.box, cells=24), margin=0.03)
     assert (found.components, found.islands) == (2, 0)
     torch.testing.assert_close(found.points, torch.tensor([[0.0, 0.1, 0.1]], dtype=torch.float64), atol=1e-7, rtol=0)
     assert found.targets.tolist() == [-0.03]
@@ -34,7 +32,7 @@ def test_two_balls_are_joined_halfway() -> None:
 
 def test_three_balls_are_joined_by_two_passes() -> None:
     row = balls((-0.7, 0.0, 0.0), (0.0, 0.05, 0.0), (0.7, 0.0, 0.1), width=0.2)
-    found = joints(row, Region.within(row.box, cells=24), margin=0.02)
+    found = joints(row, GridRegion.within(row.box, cells=24), margin=0.02)
     assert found.components == 3
     # The passes lie between neighbours, never between the two that are farthest apart.
     assert sorted(found.points[:, 0].sign().tolist()) == [-1.0, 1.0]
@@ -45,7 +43,7 @@ def test_three_balls_are_joined_by_two_passes() -> None:
 
 def test_a_field_that_meets_the_targets_is_connected() -> None:
     pair = balls((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
-    region = Region.within(pair.box, cells=32)
+    region = GridRegion.within(pair.box, cells=32)
     found = joints(pair, region, margin=0.1)
     deepened = found.targets[0] - pair.value(found.points)[0]
 
@@ -57,13 +55,13 @@ def test_a_field_that_meets_the_targets_is_connected() -> None:
 
 def test_one_piece_asks_for_nothing() -> None:
     ball = balls((0.0, 0.0, 0.0))
-    found = joints(ball, Region.within(ball.box, cells=16), margin=0.1)
+    found = joints(ball, GridRegion.within(ball.box, cells=16), margin=0.1)
     assert (found.components, found.points.shape, found.targets.shape) == (1, (0, 3), (0,))
 
 
 def test_an_empty_solid_has_no_components() -> None:
     nothing = level_set(lambda x: 1 + x.square().sum(1), cube(1.0))
-    found = joints(nothing, Region.within(nothing.box, cells=8), margin=0.1)
+    found = joints(nothing, GridRegion.within(nothing.box, cells=8), margin=0.1)
     assert (found.components, found.islands, len(found.points)) == (0, 0, 0)
 
 
@@ -74,14 +72,14 @@ def test_no_way_leads_through_what_is_outside_of_the_region() -> None:
     def with_gap(x: np.ndarray) -> np.ndarray:
         return (np.abs(x[:, 0]) > 0.1) | (x[:, 1] > 0.7)
 
-    found = joints(pair, Region.within(pair.box, with_gap, cells=32), margin=0.1)
+    found = joints(pair, GridRegion.within(pair.box, with_gap, cells=32), margin=0.1)
     assert found.components == 2
     assert float(found.points[0, 1]) == pytest.approx(0.75, abs=0.0626)
 
 
 def test_islands_that_nothing_can_join_are_counted() -> None:
     pair = balls((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
-    found = joints(pair, Region.within(pair.box, lambda x: np.abs(x[:, 0]) > 0.1, cells=32), margin=0.1)
+    found = joints(pair, GridRegion.within(pair.box, lambda x: np.abs(x[:, 0]) > 0.1, cells=32), margin=0.1)
     assert (found.components, found.islands, len(found.points)) == (2, 1, 0)
 
 
@@ -91,7 +89,7 @@ def test_anchored_components_are_joined_and_small_others_removed() -> None:
         return large - 0.55 * torch.exp(-(x - torch.tensor([0.0, 0.8, 0.0])).square().sum(1) / (2 * 0.1**2))
 
     crumbs = level_set(function, cube(1.0))
-    region = Region.within(crumbs.box, cells=32)
+    region = GridRegion.within(crumbs.box, cells=32)
     anchors = np.array([[-0.6, 0.2, 0.0], [0.6, 0.0, 0.2]])
     found = joints(crumbs, region, 0.02, anchors)
     assert found.components == 3
@@ -139,32 +137,3 @@ def test_critical_points_are_refined_only_to_their_own_kind() -> None:
     assert torch.equal(refined(saddle, node, 0.01, negative=1), node)
     flat = level_set(lambda x: 0 * x[:, 0], cube(1.0))
     assert torch.equal(refined(flat, node, 0.1, negative=1), node)
-
-
-def test_work_beside_answers_the_call_before() -> None:
-    with Beside(lambda x: x * x) as square:
-        assert [square(n) for n in (2, 3, 4, 5)] == [4, 4, 9, 16]
-
-
-def test_work_beside_runs_while_the_caller_goes_on() -> None:
-    start = threading.Event()
-
-    def work(number: int) -> int:
-        if number:
-            assert start.wait(10), "the caller never went on"
-        return number
-
-    with Beside(work) as beside:
-        assert beside(0) == 0
-        # Returns although the work on 1 has not ended: it waits for the caller.
-        assert beside(1) == 0
-        start.set()
-        assert beside(2) == 1
-
-
-def test_failures_beside_reach_the_caller() -> None:
-    def fail(number: int) -> int:
-        raise ValueError(f"no {number}")
-
-    with Beside(fail) as beside, pytest.raises(ValueError, match="no 7"):
-        beside(7)
