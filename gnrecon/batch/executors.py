@@ -26,8 +26,8 @@ from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import Cause, Job, JobOutcome, Status, running_folder
 from gnrecon.options import Options
 from gnrecon.report.estimate import estimate
+from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.runtime.parallel import connected, require_distributed
 
 
 def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: Callable[[JobOutcome], None]) -> None:
@@ -156,7 +156,7 @@ class FileRemoved:
 @contextmanager
 def _client(distributed: Any, address: str | None, count: int) -> Iterator[Any]:
     if address is not None:
-        with connected(address) as client:
+        with dask_client(address) as client:
             yield client
         return
     # Each job has its own memory limit, and a local cluster needs no dashboard.

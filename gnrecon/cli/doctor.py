@@ -17,6 +17,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 from rich.console import Console
 from rich.table import Table
@@ -141,14 +142,14 @@ def check_package(distribution: str, module: str) -> Check:
 
 def check_plugins() -> list[Check]:
     """Return, for each reader, writer and residual that other packages bring, whether it can be loaded."""
-    from gnrecon.runtime.plugins import KINDS, installed
+    from gnrecon.runtime.plugins import PluginKind, installed
 
     checks = []
-    for plugin in (plugin for group in KINDS for plugin in installed(group)):
-        code = f"from gnrecon.runtime.plugins import find; find({plugin.group!r}, {plugin.entry.name!r}).load()"
+    for plugin in (plugin for kind in get_args(PluginKind) for plugin in installed(kind)):
+        code = f"from gnrecon.runtime.plugins import find; find({plugin.kind!r}, {plugin.entry.name!r}).load()"
         ok, said = run_python(code)
         remedy = "" if ok else f"Mend or uninstall {plugin.package}."
-        checks.append(Check(f"{KINDS[plugin.group]} {plugin.entry.name}", ok, plugin.package if ok else said, remedy))
+        checks.append(Check(f"{plugin.kind} {plugin.entry.name}", ok, plugin.package if ok else said, remedy))
     return checks
 
 

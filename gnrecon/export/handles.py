@@ -29,6 +29,7 @@ from gnrecon.export.cycles import Loop, short_loops
 from gnrecon.export.mesh_statistics import Edges, corner_fans
 from gnrecon.export.verify import require_sound
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.local_pca import plane_normals
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.statistics import widest_gap
 from gnrecon.runtime.errors import MeshError
@@ -169,8 +170,7 @@ class _Support:
         """
         points = self._density.points
         around = points[self._density.tree.query(points, k=min(AROUND + 1, len(points)))[1]]
-        spread = around - around.mean(axis=1, keepdims=True)
-        return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0])
+        return plane_normals(around)
 
     def bare(self, mesh: Mesh, disks: Float, loops: Sequence[Loop]) -> list[Loop]:
         """Return the loops that are short, and whose points leave more bare than they may."""

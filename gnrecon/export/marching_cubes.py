@@ -22,7 +22,7 @@ from gnrecon.export.sparse_grid import Band, narrow_band
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 EVALUATED = 0.9
 """About which share of the time has passed when the field is known; marching cubes takes the rest."""
@@ -68,8 +68,8 @@ def extract(
         When the resolution, the bounds or the batch make no sense.
     """
     lattice = Lattice.over(field, resolution, bounds, batch)
-    band = narrow_band(lattice, None if data is None else lattice.nodes(data), part(advance, 0.0, EVALUATED))
-    pieces = _march_all(band, part(advance, EVALUATED, 1.0))
+    band = narrow_band(lattice, None if data is None else lattice.nodes(data), subrange(advance, 0.0, EVALUATED))
+    pieces = _march_all(band, subrange(advance, EVALUATED, 1.0))
     del band
     if not pieces:
         raise MeshError(

@@ -20,7 +20,7 @@ from gnrecon.export.resolution import MOST_REFINED, Fineness, error_once_project
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 _log = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ def _extracted(
         # How often is not known before: each attempt gets half of what is left of the stage.
         end = 1.0 if options.max_error is None else (begin + 1.0) / 2
         fast = field if data is None else _coarse(field, data, cells)
-        mesh = extract(fast, resolution=cells, bounds=box, data=data, advance=part(advance, begin, end))
+        mesh = extract(fast, resolution=cells, bounds=box, data=data, advance=subrange(advance, begin, end))
         mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
         if options.max_error is None or cells >= MOST_REFINED:
             return mesh, fast, cells, dropped

@@ -23,7 +23,7 @@ from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.chunks import slices
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 MOST_BLOCKS = 96
 """Most coarse blocks along the longest side."""
@@ -310,7 +310,7 @@ def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCa
     done = LOCATED
     for share, leaves in search(lattice, coarse, band.leaves, data):
         begin, done = done, LOCATED + (1.0 - LOCATED) * share
-        band.evaluate(leaves, part(advance, begin, done))
+        band.evaluate(leaves, subrange(advance, begin, done))
     _propagate(band)
     return band
 

@@ -37,7 +37,7 @@ from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.optim import Solution
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
 def fit_two_level(
@@ -80,10 +80,10 @@ def fit_two_level(
     share = parameters.two_level.global_time_share
     ball = steps.detect_ball(samples)
     data, flipped_share = steps.prepare(samples if ball is None else ball.samples)
-    data, first, outliers = steps.fit_global(data, part(advance, 0.0, share))
+    data, first, outliers = steps.fit_global(data, subrange(advance, 0.0, share))
     sdf, shaping = steps.apply_penalties(first, data)
     try:
-        rest = part(advance, share, 1.0)
+        rest = subrange(advance, share, 1.0)
         detail, averaging_width = steps.fit_local(sdf, data, shaping, outliers > 0, rest, folder, scheduler)
     except KeyboardInterrupt:
         status = "Interrupted before the local fields were solved: this is the smooth global field alone."
@@ -177,12 +177,14 @@ class _Steps:
 
     def fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField, int]:
         """Return the completed data, the global field, and the number of outliers that were left out of both."""
-        completed, first = self._fit_global(data, part(advance, 0.0, 0.5))
+        completed, first = self._fit_global(data, subrange(advance, 0.0, 0.5))
         # Of large scans, the distances of ingest have found the outliers.
         if self.by_blocks:
             return completed, first, 0
         scan = data.scan
-        outliers = find_outliers(first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points))
+        outliers = find_outliers(
+            first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points), parameters=self.parameters.outliers
+        )
         if not outliers.any():
             return completed, first, 0
         if data.sharp is None:
@@ -190,7 +192,7 @@ class _Steps:
         else:
             scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
             data = self._draw(scan, SharpShape.of(scan))
-        return *self._fit_global(data, part(advance, 0.5, 1.0)), int(outliers.sum())
+        return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
 
     def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, ShapingFor | None]:
         """Return the global field after curvature penalties, and what gives those of a local length scale, if any."""
@@ -232,7 +234,7 @@ class _Steps:
         # A fit with curvature penalties closes holes by them.
         completed = data if self.options.regularisers else data.across_holes(self.rng)
         seen = completed.samples, completed.held_out, completed.seen
-        return completed, fit_global(*seen, self.options, self.rng, advance)
+        return completed, fit_global(*seen, self.options, self.rng, advance, parameters=self.parameters.global_field)
 
     def _draw(self, scan: Samples, sharp: SharpShape | None) -> _Data:
         """Draw the validation points and those that the global field sees."""

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.local_pca import tangent_coordinates
 
 _SIZES = (10, 15)
 """Points of the smallest neighbourhoods."""
@@ -82,7 +83,7 @@ def _extrapolated(near: float, near_reach: float, far: float, far_reach: float) 
 def _spread(tree: cKDTree, chosen: Float, size: int) -> tuple[float, float]:
     """The spread about quadrics of `size` points, and how far these reach, in the median."""
     distances, rows = tree.query(chosen, size)
-    u, v, w = np.moveaxis(local_frames(tree.data[rows]), 2, 0)
+    u, v, w = np.moveaxis(tangent_coordinates(tree.data[rows]), 2, 0)
     columns = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
     basis = np.linalg.qr(columns)[0]
     rest = w - np.einsum("gkc,gc->gk", basis, np.einsum("gkc,gk->gc", basis, w))
@@ -91,16 +92,6 @@ def _spread(tree: cKDTree, chosen: Float, size: int) -> tuple[float, float]:
     # Of chi squared, without scipy.stats, which takes as long to load as the rest of scipy.
     median = 2 * gammaincinv(freedom / 2, 0.5)
     return float(np.sqrt(np.median(squares) / median)), float(np.median(distances[:, -1]))
-
-
-def local_frames(groups: Float) -> Float:
-    """Neighbourhoods, of shape (G, k, 3), in units of their reach: two axes in their plane, one along its normal."""
-    centred = groups - groups[:, :1]
-    centred = centred / np.linalg.norm(centred, axis=2).max(axis=1)[:, None, None]
-    spread = centred - centred.mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("gki,gkj->gij", spread, spread))[1][:, :, ::-1]
-    local: Float = np.einsum("gki,gij->gkj", centred, axes)
-    return local
 
 
 _SPACING_QUERIES = 20_000

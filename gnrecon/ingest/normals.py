@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.local_pca import principal_axes, tangent_coordinates
 from gnrecon.runtime.chunks import slices
 
 _NEIGHBOURS = (12, 24, 48)
@@ -54,7 +55,7 @@ _LEAST = np.finfo(np.float64).tiny
 # A plane that straddles a sharp edge fits badly where one beside it fits well. Where a neighbour's plane holds the
 # point, and fits its own neighbours far better than the point's own plane does, it is taken instead (after Kuwahara's
 # filter of images).
-def directions(points: Float) -> Float:
+def unoriented_normals(points: Float) -> Float:
     """Return unit normals of either sign, of shape (N, 3).
 
     Parameters
@@ -100,10 +101,8 @@ def _sizes(count: int) -> list[int]:
 def _planes(points: Float, rows: Int) -> tuple[Float, Float, Float]:
     """Return centroids and unit normals, of shape (G, 3), and variances along three axes, of groups of rows (G, k)."""
     groups = points[rows]
-    centroids = groups.mean(axis=1)
-    spread = groups - centroids[:, None]
-    variances, axes = np.linalg.eigh(np.einsum("gki,gkj->gij", spread, spread) / rows.shape[1])
-    return centroids, axes[:, :, 0], np.maximum(variances, 0.0)
+    variances, axes = principal_axes(groups, covariance=True)
+    return groups.mean(axis=1), axes[:, :, 0], np.maximum(variances, 0.0)
 
 
 def _noise(points: Float, rows: Int, distances: npt.NDArray[np.float32]) -> Float:
@@ -120,12 +119,7 @@ def _noise(points: Float, rows: Int, distances: npt.NDArray[np.float32]) -> Floa
 
 def _off_quadric(groups: Float) -> Float:
     """Return how far groups, of shape (G, k, 3), spread about quadrics, of shape (G,), in units of their reach."""
-    centred = groups - groups[:, :1]
-    reach = np.linalg.norm(centred, axis=2).max(axis=1)
-    centred = centred / np.maximum(reach, _LEAST)[:, None, None]
-    spread = centred - centred.mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("gki,gkj->gij", spread, spread))[1][:, :, ::-1]
-    u, v, w = np.moveaxis(np.einsum("gki,gij->gkj", centred, axes), 2, 0)
+    u, v, w = np.moveaxis(tangent_coordinates(groups), 2, 0)
     columns = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
     # A trace on the diagonal, because points on a line leave the quadric open.
     product = np.einsum("gka,gkb->gab", columns, columns) + 1e-9 * np.eye(_QUADRIC)

@@ -1,10 +1,10 @@
 """Outward normals for clouds that come without, a check of those that come with some, and which of them are kept.
 
 Directions come from neighbourhoods (`gnrecon.ingest.normals`); what is hard is their sign. Where the scanner's position
-is known, the line of sight decides (`towards_scanner`). Otherwise there are two ways:
+is known, the line of sight decides (`orient_towards_scanner`). Otherwise there are two ways:
 
-- *propagation* along a spanning tree (`propagated`): right for dense scans, open ones included, but its overall sign is
-  open, and thin walls and sparse regions mislead it;
+- *propagation* along a spanning tree (`propagate_orientation`): right for dense scans, open ones included, but its
+  overall sign is open, and thin walls and sparse regions mislead it;
 - *Gauss's theorem* solved for all normals at once (`gauss_normals`), and normals that agree with the winding number
   that they make (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by
   construction; used on up to a few thousand points, from which the others take their sign.
@@ -20,15 +20,15 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.normals import directions, tangent_planes
+from gnrecon.ingest.normals import tangent_planes, unoriented_normals
 from gnrecon.ingest.orientation_methods import (
-    agreement,
     consistent_normals,
-    disorder,
     gauss_normals,
+    orient_towards_scanner,
     outwardness,
-    propagated,
-    towards_scanner,
+    propagate_orientation,
+    winding_agreement,
+    winding_disorder,
 )
 from gnrecon.runtime.errors import InputError, UsageError
 
@@ -93,12 +93,12 @@ def oriented_normals(points: Float, origins: Float | None = None, along: Float |
     centred = points - middle
     if len(points) <= 3:
         raise InputError(f"Normals cannot be estimated from {len(points)} points that span no volume.")
-    axes = directions(centred) if along is None else along
-    seen = towards_scanner(centred, axes, None if origins is None else origins - middle)
+    axes = unoriented_normals(centred) if along is None else along
+    seen = orient_towards_scanner(centred, axes, None if origins is None else origins - middle)
     if seen is not None:
         return Orientation(seen[0], BY_SIGHT, seen[1])
     normals, unrest = _by_shape(centred, axes, free=along is None)
-    return Orientation(normals, ESTIMATED if unrest <= _ORDERLY else UNCERTAIN, agreement(centred, normals))
+    return Orientation(normals, ESTIMATED if unrest <= _ORDERLY else UNCERTAIN, winding_agreement(centred, normals))
 
 
 def _by_shape(points: Float, axes: Float, free: bool) -> tuple[Float, float]:
@@ -106,16 +106,16 @@ def _by_shape(points: Float, axes: Float, free: bool) -> tuple[Float, float]:
     by_winding: list[Float] = []
     if len(points) <= _GAUSS_POINTS:
         by_winding = _by_winding(points, axes, free)
-        unrest = disorder(points, by_winding[-1])
+        unrest = winding_disorder(points, by_winding[-1])
         if unrest <= _ORDERLY:
             return by_winding[-1], unrest
-    normals = propagated(points, axes, tangent_planes(points, _LOCAL), 0.0)
-    unrest = disorder(points, normals)
+    normals = propagate_orientation(points, axes, tangent_planes(points, _LOCAL), 0.0)
+    unrest = winding_disorder(points, normals)
     if len(points) > _GAUSS_POINTS and unrest <= _ORDERLY:
         return normals, unrest
-    second = propagated(points, axes, tangent_planes(points, _SMOOTH), _OFF_PLANE_PENALTY)
-    normals, unrest = min((normals, unrest), (second, disorder(points, second)), key=_unrest)
-    others = [(found, disorder(points, found)) for found in by_winding or _by_winding(points, axes, free)]
+    second = propagate_orientation(points, axes, tangent_planes(points, _SMOOTH), _OFF_PLANE_PENALTY)
+    normals, unrest = min((normals, unrest), (second, winding_disorder(points, second)), key=_unrest)
+    others = [(found, winding_disorder(points, found)) for found in by_winding or _by_winding(points, axes, free)]
     third, other = min(others, key=_unrest)
     # An open scan stays disorderly either way, and there only propagation can be right.
     return (third, other) if other < _CLEARLY_BETTER * unrest else (normals, unrest)

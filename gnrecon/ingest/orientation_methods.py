@@ -21,7 +21,7 @@ _OPEN = 0.1  # outwardness, in size, that says nothing about inside and outside
 # Source: Hoppe et al., *Surface Reconstruction from Unorganized Points* (1992), as open3d has it, with a penalty of
 # edges that leave the plane. Right for dense scans, open ones included; the sign of the whole is left open, and thin
 # walls and sparse regions mislead it.
-def propagated(points: Float, directions: Float, planes: Float, penalty: float) -> Float:
+def propagate_orientation(points: Float, directions: Float, planes: Float, penalty: float) -> Float:
     """Return `directions` with signs propagated along `planes`, outward as a whole, or upward where it is open.
 
     Parameters
@@ -63,7 +63,7 @@ _KNOWN = 0.5
 #
 # Where the line of sight grazes the estimated plane, a small error of the plane would decide the side, and where a
 # point's origin is not known nothing does. Such points follow the mean normal of the nearest ones that are decided.
-def towards_scanner(points: Float, directions: Float, origins: Float | None) -> tuple[Float, float] | None:
+def orient_towards_scanner(points: Float, directions: Float, origins: Float | None) -> tuple[Float, float] | None:
     """Return the directions with the signs that look at the scanner, and the share of points where sight decides.
 
     Parameters
@@ -113,7 +113,7 @@ _QUERIES = 400
 # term is left out. Inward normals give -1/2, a flat sheet 0, half of a sphere 1/4. So the median of 2 w over the points
 # tells outward from inward and says how far the evidence goes: it is near 1 in size only for a surface that is nearly
 # closed.
-def winding_on_surface(points: Float, normals: Float) -> Float:
+def winding_at_points(points: Float, normals: Float) -> Float:
     """Return the principal value of the winding number at some of the points, of shape (Q,).
 
     Parameters
@@ -141,17 +141,17 @@ def winding_on_surface(points: Float, normals: Float) -> Float:
 def outwardness(points: Float, normals: Float) -> float:
     """Return 1 for a closed surface with outward normals, -1 with inward ones, less in size the more it is open."""
     # The median, because where sheets nearly touch single points see each other's singularity.
-    return 2 * float(np.median(winding_on_surface(points, normals)))
+    return 2 * float(np.median(winding_at_points(points, normals)))
 
 
-def disorder(points: Float, normals: Float) -> float:
+def winding_disorder(points: Float, normals: Float) -> float:
     """Return the mean distance of the winding number from 1/2: near 0 only for a consistent outward orientation."""
-    return float(np.minimum(np.abs(winding_on_surface(points, normals) - 0.5), 1.0).mean())
+    return float(np.minimum(np.abs(winding_at_points(points, normals) - 0.5), 1.0).mean())
 
 
-def agreement(points: Float, normals: Float) -> float:
+def winding_agreement(points: Float, normals: Float) -> float:
     """Return the share of the points, in [0, 1], at which the winding number is nearer to 1/2 than to 0 and to 1."""
-    return float((np.abs(winding_on_surface(points, normals) - 0.5) < 0.25).mean())
+    return float((np.abs(winding_at_points(points, normals) - 0.5) < 0.25).mean())
 
 
 Single = npt.NDArray[np.float32]

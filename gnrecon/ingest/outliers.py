@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.geometry.statistics import deviation
+from gnrecon.geometry.local_pca import surface_variation
+from gnrecon.geometry.statistics import robust_deviation
 from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.noise import mean_spacing
 from gnrecon.runtime.errors import UsageError
@@ -51,11 +52,11 @@ def find_outliers(points: Float) -> Mask:
         ratio = np.log(spacing / np.median(spacing[neighbours], axis=1))
         if bound is None:
             middle = float(np.median(ratio))
-            spread = deviation(ratio - middle)
+            spread = robust_deviation(ratio - middle)
             bound = max(float(np.log(_LEAST_FACTOR)), middle + _DEVIATIONS * spread)
         far = ratio > bound
         sparse = np.flatnonzero(spacing > _SPARSE_FACTOR * np.median(spacing))
-        far[sparse] |= thickness(points[remaining][neighbours[sparse]]) > _THICKNESS
+        far[sparse] |= surface_variation(points[remaining][neighbours[sparse]]) > _THICKNESS
         if not far.any():
             break
         remaining = remaining[~far]
@@ -71,18 +72,6 @@ def _spacing(points: Float) -> tuple[Float, Int]:
     distances, neighbours = cKDTree(points).query(points, _NEIGHBOURS + 1)
     # Distinct points may lie so close that a distance underflows; the logarithm needs a positive one.
     return np.maximum(distances[:, 1:].mean(axis=1), np.finfo(np.float64).tiny), neighbours[:, 1:]
-
-
-def thickness(groups: Float) -> Float:
-    """Return the smallest eigenvalue's share of each group's covariance, of shape (G,); `groups` has shape (G, k, 3).
-
-    It is 0 where all points of a group coincide.
-    """
-    centred = groups - groups.mean(axis=1, keepdims=True)
-    eigenvalues = np.linalg.eigvalsh(np.einsum("gki,gkj->gij", centred, centred))
-    sums = eigenvalues.sum(axis=1)
-    shares: Float = np.maximum(eigenvalues[:, 0], 0) / np.where(sums > 0, sums, 1)
-    return shares
 
 
 MODES = ("auto", "on", "off")

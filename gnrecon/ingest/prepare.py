@@ -13,7 +13,7 @@ from gnrecon.ingest.clean import LEAST_POINTS, clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.noise import mean_spacing
 from gnrecon.ingest.orientation import require_orientation, with_outward_normals
-from gnrecon.ingest.smooth import smoothed
+from gnrecon.ingest.smooth import smooth_points
 from gnrecon.ingest.subsample import subsample as thin
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
@@ -112,7 +112,7 @@ def _smooth(cloud: PointCloud, width: float | None) -> tuple[PointCloud, float |
     if width is None or cloud.normals is None:
         return cloud, None
     centre = cloud.points.mean(axis=0)
-    points, normals = smoothed(cloud.points - centre, cloud.normals, width)
+    points, normals = smooth_points(cloud.points - centre, cloud.normals, width)
     moved = float(np.sqrt(((points - (cloud.points - centre)) ** 2).sum(axis=1).mean()))
     return replace(cloud, points=points + centre, normals=normals), moved
 

@@ -27,7 +27,7 @@ _FARTHEST = 0.5
 """Of the width, beyond which a point would not move but jump."""
 
 
-def smoothed(points: Float, normals: Float, width: float) -> tuple[Float, Float]:
+def smooth_points(points: Float, normals: Float, width: float) -> tuple[Float, Float]:
     """Return smoother positions and their normals, both of shape (N, 3).
 
     Parameters

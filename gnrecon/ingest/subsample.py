@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.local_pca import surface_variation
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.noise import mean_spacing
-from gnrecon.ingest.outliers import thickness
 from gnrecon.ingest.voxel_grid import voxel_representatives, voxel_representatives_of_side
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import UsageError
@@ -35,7 +35,7 @@ def by_curvature(points: Float, count: int, rng: np.random.Generator) -> Int:
     ----------
     points : array of shape (N, 3), centred, distinct, N >= count >= 1
     """
-    bend = surface_variation(points)
+    bend = pointwise_surface_variation(points)
     weights = np.full(len(points), _EVENLY / len(points))
     weights += (1 - _EVENLY) * (bend / bend.sum() if bend.sum() > 0 else 1 / len(points))
     order = _along_curve(points)
@@ -253,7 +253,7 @@ _AT_A_TIME = 50_000
 _BITS = 20
 
 
-def surface_variation(points: Float) -> Float:
+def pointwise_surface_variation(points: Float) -> Float:
     """Return the smallest eigenvalue's share in the covariance of each point's neighbourhood, of shape (N,)."""
     from scipy.spatial import cKDTree
 
@@ -261,7 +261,7 @@ def surface_variation(points: Float) -> Float:
     found = np.zeros(len(points))
     for some in slices(len(points), _AT_A_TIME):
         rows = tree.query(points[some], min(_NEIGHBOURS, len(points)))[1]
-        found[some] = thickness(points[rows.reshape(len(rows), -1)])
+        found[some] = surface_variation(points[rows.reshape(len(rows), -1)])
     return found
 
 

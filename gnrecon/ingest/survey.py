@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.local_pca import tangent_coordinates
 from gnrecon.geometry.point_cloud import PointCloud, Samples
 from gnrecon.ingest.clean import isolated_clusters, repeated_points
-from gnrecon.ingest.noise import estimate_noise, local_frames, neighbour_spacing
+from gnrecon.ingest.noise import estimate_noise, neighbour_spacing
 from gnrecon.ingest.orientation import flip_if_inward
 from gnrecon.ingest.outliers import find_outliers
 
@@ -132,7 +133,7 @@ def _border_share(points: Float) -> float:
     rows = cKDTree(points).query(points, min(_MORE_NEIGHBOURS + 1, len(points)))[1]
     at_border = np.ones(len(points), bool)
     for count in (_NEIGHBOURS, _MORE_NEIGHBOURS):
-        local = local_frames(points[rows[:, : count + 1]])[:, 1:]
+        local = tangent_coordinates(points[rows[:, : count + 1]])[:, 1:]
         angles = np.sort(np.arctan2(local[:, :, 1], local[:, :, 0]), axis=1)
         at_border &= np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi).max(axis=1) > _GAP
     return float(at_border.mean())

@@ -34,7 +34,7 @@ from gnrecon.field import Network
 from gnrecon.field.layers import WAVELET
 from gnrecon.geometry.arrays import Float
 from gnrecon.least_squares import Averaged, identity
-from gnrecon.level_set import Beside, Joints, LevelSet, Region, joints
+from gnrecon.level_set import ConnectionTargets, GridRegion, LaggedWorker, LevelSet, joints
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import (
     clipped_strain,
@@ -205,17 +205,17 @@ def _free_surface(off_walls: Callable[[Float], Float], clip: float | None) -> Sa
 
 def _joints(design: Design, walls: Float) -> Sampler:
     """Return a sampler of the points that join components, found beside the step from the field of one step ago."""
-    region = Region.within(design.region.box, design.region.inside, CELLS)
+    region = GridRegion.within(design.region.box, design.region.inside, CELLS)
     anchors = walls[:: len(walls) // 2000]
 
-    def work(level_set: LevelSet) -> Joints:
+    def work(level_set: LevelSet) -> ConnectionTargets:
         return joints(level_set, region, NECK, anchors)
 
-    beside = Beside(work)
+    worker = LaggedWorker(work)
 
     def draw(moment: Moment) -> Drawn:
         # What is measured once is measured as it is.
-        found = work(moment.level_set) if moment.step == LAST else beside(moment.level_set)
+        found = work(moment.level_set) if moment.step == LAST else worker(moment.level_set)
         return Drawn(found.points, found.targets)
 
     return draw

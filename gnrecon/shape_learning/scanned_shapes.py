@@ -24,7 +24,7 @@ from torch import Tensor
 from gnrecon.field import Network
 from gnrecon.field.layers import SINE
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import Box, CoarseDistance, halved, least_values
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, free_space_bounds, kd_tree_order
 from gnrecon.least_squares import Iterative, LinearSolver, NeighbourSums, Preconditioner, jacobian_layer_scaled
 from gnrecon.optim import GainRatioDamping
 from gnrecon.residuals import eikonal, free_space, interface, normal_projection
@@ -119,7 +119,7 @@ def scanned(samples: Samples, all_points: Samples | None = None, name: str = "sc
     name : of the problem
     seed : of the coarse distance
     """
-    order = halved(samples.points)
+    order = kd_tree_order(samples.points)
     samples = replace(samples, points=samples.points[order], normals=samples.normals[order])
     box = Box.around(samples.points, MARGIN)
     coarse = CoarseDistance(samples.points, samples.normals, np.random.default_rng(seed))
@@ -192,7 +192,7 @@ def _free(samples: Samples, coarse: CoarseDistance, box: Box, rng: np.random.Gen
     known, signed, distance, _ = coarse.at(pool, CLEAR_DISKS)
     clear = distance > CLEAR
     points = torch.as_tensor(pool[known][clear])
-    least = torch.as_tensor(least_values(signed[clear], DEEP))
+    least = torch.as_tensor(free_space_bounds(signed[clear], DEEP))
     watched = torch.zeros(len(points), dtype=torch.bool)
 
     def draw(moment: Moment) -> Drawn:

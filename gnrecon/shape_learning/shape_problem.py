@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gnrecon.field import TANH, Network
 from gnrecon.geometry.arrays import Float
-from gnrecon.geometry.signed_distance import Box, halved
+from gnrecon.geometry.signed_distance import Box, kd_tree_order
 from gnrecon.least_squares import Iterative, LinearSolver, NeighbourSums, identity
 from gnrecon.level_set import KnownSurface, LevelSet, sample_surface
 from gnrecon.optim import GainRatioDamping, Search
@@ -265,7 +265,7 @@ def in_box(count: int, box: Box | None = None) -> Sampler:
 
     def draw(moment: Moment) -> Drawn:
         points = (box or moment.level_set.box).sample(count, moment.rng)
-        return Drawn(torch.as_tensor(points[halved(points)]))
+        return Drawn(torch.as_tensor(points[kd_tree_order(points)]))
 
     return draw
 

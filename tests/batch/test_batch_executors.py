@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import fake_work
@@ -15,6 +16,7 @@ from fake_work import job, notes
 
 from gnrecon.batch.executors import FileRemoved, run_on_cluster
 from gnrecon.batch.job import JobOutcome, Status, running_folder
+from gnrecon.runtime.dask_scheduler import dask_client
 from gnrecon.runtime.errors import UsageError
 
 # Dask's own threads and sockets go when they please.
@@ -70,7 +72,7 @@ def _is_child(process: psutil.Process, folder: Path) -> bool:
 
 
 def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gnrecon.runtime.parallel.PATIENCE", "1s")
+    monkeypatch.setattr("gnrecon.batch.executors.dask_client", partial(dask_client, timeout="1s"))
     outcomes: list[JobOutcome] = []
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         with pytest.raises(UsageError, match=f"No scheduler answers at {re.escape(address)}"):

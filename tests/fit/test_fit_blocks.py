@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.options import Options
+from gnrecon.runtime.dask_scheduler import dask_client
 from gnrecon.runtime.errors import Cancelled, FitError, MemoryLimitError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -144,7 +146,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
     with pytest.raises(UsageError, match="need a work folder"):
         Options(block_scheduler="tcp://127.0.0.1:9")
     assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
-    monkeypatch.setattr("gnrecon.runtime.parallel.PATIENCE", "1s")
+    monkeypatch.setattr(workers, "dask_client", partial(dask_client, timeout="1s"))
     with pytest.raises(UsageError, match=r"No scheduler answers at tcp://127\.0\.0\.1:9"):
         workers.solve_on_cluster(WorkFolder(tmp_path), [0], "tcp://127.0.0.1:9", ignore_progress)
 

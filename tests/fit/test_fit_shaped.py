@@ -11,7 +11,8 @@ from holed_can import RADIUS, can, distance
 from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import two_level as adaptive
-from gnrecon.fit.regularised import FREE, Free, Sheet, _joined
+from gnrecon.fit.parameters import PenaltyFitParameters
+from gnrecon.fit.regularised import Free, Sheet, _joined
 from gnrecon.fit.shape_priors import sharp_shape as sharp
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
@@ -119,7 +120,7 @@ def test_the_free_space_counts_as_a_whole() -> None:
     assert wish.still is not None
     assert wish.still.tolist() == [0, 2]
     # All three points together weigh as much as is asked, whatever part of them a cube holds.
-    assert (wish.scale**2).flatten().tolist() == pytest.approx([4 * FREE / 3] * 2)
+    assert (wish.scale**2).flatten().tolist() == pytest.approx([4 * PenaltyFitParameters.free_space_weight / 3] * 2)
 
 
 def test_sheets_without_data_are_no_part_of_the_shape() -> None:

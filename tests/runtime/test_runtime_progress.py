@@ -20,7 +20,7 @@ from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.report.report import report_schema
 from gnrecon.run import STAGES, Shown
 from gnrecon.runtime.errors import Cancelled, ExitCode
-from gnrecon.runtime.progress import part
+from gnrecon.runtime.progress import subrange
 
 SMALL: dict[str, Any] = {"widths": (100,), "steps": 2, "resolution": 32}
 SMALLEST = ("--widths", "80", "--steps", "0", "--resolution", "24")
@@ -154,7 +154,7 @@ def test_a_command_that_ends_before_it_writes_leaves_nothing(
 
 def test_a_part_tells_of_the_whole() -> None:
     told: list[float] = []
-    inner = part(part(told.append, 0.5, 1.0), 0.0, 0.5)
+    inner = subrange(subrange(told.append, 0.5, 1.0), 0.0, 0.5)
     for share in (0.0, 0.5, 1.0):
         inner(share)
     assert told == [0.5, 0.625, 0.75]

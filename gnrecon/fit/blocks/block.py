@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gnrecon.field.networks import Siren
-from gnrecon.field.partition_of_unity import OFFSETS, Partition
+from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
 from gnrecon.fit.blocks.tree import Codes, DipoleTree, morton_codes
@@ -25,7 +25,7 @@ from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.model_selection import Leftover, Volume
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import Box, is_certain, side_of
+from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding
 
 
 def solve_block(folder: str | Path, number: int, device: str = "cpu") -> None:
@@ -131,7 +131,7 @@ class BlockSolver:
 
     def _nearby_points(self, key: Int) -> Int:
         """Return the rows of the points in a cell and its neighbours, in order: all points of the cube."""
-        keys = key + OFFSETS
+        keys = key + neighbour_offsets()
         codes = np.sort(morton_codes(keys[(keys >= 0).all(axis=1)]))
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
@@ -149,6 +149,6 @@ class BlockSolver:
         clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
-        signed = side_of(winding) * np.sqrt(distance**2 - disks**2)
+        signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, value, signed, is_certain(winding), distance)
+        return Volume.around(x, value, signed, is_sign_certain(winding), distance)

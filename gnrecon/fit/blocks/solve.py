@@ -34,7 +34,7 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.chunks import slices
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
 def fit_large(
@@ -84,10 +84,10 @@ def fit_large(
         count = len(arrays["ends"]) - 1
         missing = [number for number in range(count) if not work.is_solved(number)]
         if scheduler is not None and missing:
-            solve_on_cluster(work, missing, scheduler, part(advance, chosen, 1.0))
+            solve_on_cluster(work, missing, scheduler, subrange(advance, chosen, 1.0))
         else:
             # As many processes as torch has threads: the option, or by default the cores.
-            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, chosen, 1.0))
+            solve_blocks(work, missing, torch.get_num_threads(), options.device, subrange(advance, chosen, 1.0))
         return _assembled(work, count, arrays["keys"], partition, features, belief)
 
 

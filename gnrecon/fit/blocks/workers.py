@@ -21,8 +21,9 @@ from gnrecon.fit.blocks.block import solve_block
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.blocks.worker import DONE
+from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import FitError, MemoryLimitError
-from gnrecon.runtime.parallel import connected, having_threads, require_distributed
+from gnrecon.runtime.parallel import torch_threads
 from gnrecon.runtime.progress import ProgressCallback
 
 Process = subprocess.Popen[str]
@@ -52,7 +53,7 @@ def solve_blocks(
     if processes > 1 and device == "cpu":
         _solve_in_processes(work.folder, blocks, processes, advance)
         return
-    with having_threads(1):
+    with torch_threads(1):
         for number, block in enumerate(blocks, 1):
             solve_block(work.folder, block, device)
             advance(number / len(blocks))
@@ -160,7 +161,7 @@ def solve_on_cluster(
         When a block cannot be solved.
     """
     folder, run = str(work.folder.absolute()), secrets.token_hex(4)
-    with connected(address) as client, client.as_current():
+    with dask_client(address) as client, client.as_current():
         futures = [
             client.submit(solve_on_worker, folder, block, key=f"gnrecon-block-{run}-{block}", retries=retries)
             for block in blocks
@@ -178,5 +179,5 @@ def solve_on_cluster(
 
 def solve_on_worker(folder: str, block: int) -> None:
     """Solve a block on a worker, with one thread: sums of several threads differ in their last digits."""
-    with having_threads(1):
+    with torch_threads(1):
         solve_block(folder, block)

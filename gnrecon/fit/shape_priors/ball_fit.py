@@ -19,7 +19,7 @@ from gnrecon.fit.shape_priors.whiteness_test import is_white_noise
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.geometry.statistics import deviation
+from gnrecon.geometry.statistics import robust_deviation
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def _fitted_sphere(points: Float, normals: Float, parameters: BallFitParameters)
     radius = Density(points).radius
     sphere = _algebraic_fit(points, normals).refitted(points, normals, radius, 0.0)
     height = sphere.signed_distance(points)
-    size, exact = deviation(height), parameters.exact_share * sphere.radius
+    size, exact = robust_deviation(height), parameters.exact_share * sphere.radius
     if sphere.side < 0 or np.abs(height).max() > max(parameters.max_height_deviations * size, exact):
         return None
     noisy = size > exact

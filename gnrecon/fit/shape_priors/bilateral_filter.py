@@ -24,7 +24,7 @@ import numpy as np
 from gnrecon.fit.shape_priors.prior_parameters import BilateralParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.geometry.statistics import deviation
+from gnrecon.geometry.statistics import robust_deviation
 from gnrecon.runtime.chunks import slices
 
 Neighbourhoods = tuple[slice, Int, Float]
@@ -91,7 +91,7 @@ class BilateralFilter:
         weights = self._weights(points, normals, rows, near, widths)[:, 1:]
         heights = _heights(points, normals, rows, near[:, 1:])
         counted = weights > self.parameters.min_weight_share * weights.max(axis=1, keepdims=True, initial=0.0)
-        return deviation(heights[counted]) if counted.any() else 0.0
+        return robust_deviation(heights[counted]) if counted.any() else 0.0
 
     def _points(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float, usual: float) -> Float:
         """Return some rows of the points, moved along their normals."""

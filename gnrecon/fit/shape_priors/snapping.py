@@ -22,7 +22,7 @@ from gnrecon.fit.shape_priors.prior_parameters import SnappingParameters
 from gnrecon.fit.shape_priors.whiteness_test import is_white_noise
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.geometry.statistics import deviation
+from gnrecon.geometry.statistics import robust_deviation
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def snap_to_primitives(
     density = Density(points)
     off = np.einsum("nd,nd->n", points - averaged[0], averaged[1])
     # A robust deviation: neither edges nor outliers change it much.
-    noise = max(deviation(off), p.exact_radii * density.radius)
+    noise = max(robust_deviation(off), p.exact_radii * density.radius)
     search = FaceSearch(density, noise, np.random.default_rng(0), p)
     found = search.detect(*averaged, p.first_degrees, [])
     if search.share(found) < p.min_snapped_share:

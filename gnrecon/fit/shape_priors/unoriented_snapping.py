@@ -19,6 +19,7 @@ from gnrecon.fit.shape_priors.primitives import is_inlier
 from gnrecon.fit.shape_priors.prior_parameters import UnorientedSnappingParameters
 from gnrecon.fit.shape_priors.snapping import FaceSearch, PrimitiveFace, SnappedPoints
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.local_pca import plane_normals, principal_sums
 from gnrecon.geometry.signed_distance import Density
 
 
@@ -65,8 +66,7 @@ def _face_noise(density: Density, *, neighbours: int = 10, percentile: float = 1
     factor : of tolerance over that thickness
     """
     near = density.tree.query(density.points, min(neighbours, len(density.points)))[1]
-    offsets = density.points[near] - density.points[near].mean(axis=1, keepdims=True)
-    least = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", offsets, offsets))[:, 0].clip(0.0)
+    least = principal_sums(density.points[near])[:, 0].clip(0.0)
     # A plane has three unknowns.
     return float(factor * np.sqrt(np.percentile(least, percentile) / (neighbours - 3)))
 
@@ -96,8 +96,7 @@ def _reestimated(
     points = density.points[rest]
     away, near = cKDTree(points).query(points, neighbours)
     enough = (away < reach_radii * density.radius).sum(axis=1) >= min_neighbours
-    offsets = points[near] - points[near].mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+    axes = plane_normals(points[near])
     sides = np.where(np.einsum("nd,nd->n", axes, normals[rest]) < 0, -1.0, 1.0)
     found[rest[enough]] = (sides[:, None] * axes)[enough]
     return found
