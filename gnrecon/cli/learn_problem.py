@@ -31,7 +31,7 @@ from gnrecon.shape_learning import (
     learn,
     mesh_of,
 )
-from gnrecon.shape_learning.design import Design, DesignFacts, judge
+from gnrecon.shape_learning.design import Design, DesignMeasurement, measure_design
 
 OPEN = "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
 CLOSED = "closed, oriented 2-manifold"
@@ -115,7 +115,7 @@ def run_learn(
             steps=options.steps,
             seed=options.seed,
             wider=options.wider,
-            heard=(lambda found: _say(console, told(found))) if verbose else None,
+            callback=(lambda found: _say(console, told(found))) if verbose else None,
         )
         rng = np.random.default_rng(options.seed)
         if design is None:
@@ -124,7 +124,7 @@ def run_learn(
         else:
             mesh, notes = part_mesh(learned.field, design, options.resolution, options.curvature, rng)
     facts = require_sound(mesh) if design is not None or verify(mesh).closed else require_bordered(mesh)
-    kept = None if design is None else judge(mesh, design, rng)
+    kept = None if design is None else measure_design(mesh, design, rng)
     said = _report(problem, options, learned, facts, kept, command)
     notes += _write(output, report, mesh, said, overwrite)
     if kept is not None:
@@ -185,7 +185,7 @@ def _report(
     options: LearnOptions,
     learned: Learned,
     facts: MeshFacts,
-    kept: DesignFacts | None,
+    kept: DesignMeasurement | None,
     command: str | None,
 ) -> dict[str, Any]:
     """All that is known of a run, ready for JSON; losses and Chamfer divergences first."""
