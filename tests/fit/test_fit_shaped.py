@@ -14,7 +14,7 @@ from gnrecon.fit import two_level as adaptive
 from gnrecon.fit.parameters import PenaltyFitParameters
 from gnrecon.fit.regularised import Free, Sheet, _joined
 from gnrecon.fit.shape_priors import sharp_shape as sharp
-from gnrecon.fit.shape_priors.hole_completion import Continued
+from gnrecon.fit.shape_priors.hole_completion import HoleCompletion
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest import prepare
@@ -78,9 +78,9 @@ def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> No
 
     assert off() < 2e-3  # its side goes on
     developable = [off(seed, prior="developable") for seed in range(3)]
-    monkeypatch.setattr(sharp, "continued", lambda *_: Continued.none())
-    monkeypatch.setattr(adaptive, "continued", lambda *_: Continued.none())
-    monkeypatch.setattr(sharp, "spread", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
+    monkeypatch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
+    monkeypatch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
+    monkeypatch.setattr(sharp, "resample_primitives", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
     smooth = [off(seed) for seed in range(3)]
     assert min(smooth) > 0.01
     # One fit in some ends in a worse minimum, and which one depends on the order of sums: the median does not.
