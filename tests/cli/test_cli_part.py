@@ -46,9 +46,9 @@ def test_a_few_steps_of_the_sample(gnrecon: CommandLine, tmp_path: Path, monkeyp
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("catenoid", "--clip", "100"), "A design is for the problem bracket alone"),
+        (("catenoid", "--clip", "100"), "A design is for the problem bracket only"),
         (("bracket", "--region", "region.stl"), "both --region and --interfaces"),
-        (("bracket", "--interfaces-frame", "0,0,0,1"), "--interfaces-frame is for --interfaces"),
+        (("bracket", "--interfaces-frame", "0,0,0,1"), "--interfaces-frame needs --interfaces"),
         (("bracket", "--clip", "-1"), "clipped at -1"),
         (("bracket", "--region", "a.stl", "--interfaces", "b.stl", "--interfaces-frame", "1,2,3"), "X,Y,Z,SCALE"),
         (("bracket", "--region", "a.stl", "--interfaces", "b.stl", "--interfaces-frame", "1,2,3,0"), "X,Y,Z,SCALE"),
