@@ -143,7 +143,7 @@ def test_a_cluster_that_loses_a_worker_changes_no_digit(whole: Detail, tmp_path:
 
 
 def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="need a work folder"):
+    with pytest.raises(UsageError, match="needs a work folder"):
         Options(block_scheduler="tcp://127.0.0.1:9")
     assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
     monkeypatch.setattr(workers, "dask_client", partial(dask_client, timeout="1s"))

@@ -247,7 +247,7 @@ class FaceSearch:
             beyond = (side * height < 0) & (np.abs(cosine) < cosine_of(p.rim_degrees))
             if len(some) < p.detection.min_points or beyond.mean() > max_wrong_side_share:
                 continue
-            # Points that are farther beyond than noise moves them show that the face goes on there.
+            # Points that are farther beyond than noise moves them show that the face continues there.
             beyond &= np.abs(height) < self.max_height
             x, height, cosine = x[beyond], height[beyond], cosine[beyond]
             along = opposite.normal(x) - cosine[:, None] * own.normal(x)
