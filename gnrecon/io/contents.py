@@ -100,6 +100,7 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
     normals = [piece.normals for piece in pieces if piece.normals is not None]
     names = dict.fromkeys(name for piece in pieces for name in piece.attributes)
     shared = {name: values for name in names if (values := _shared(name, pieces)) is not None}
+    # Dropped rather than filled up, because later stages cannot tell made-up values from measured ones.
     lost = [f"{name} of some of the scans" for name in names if name not in shared]
     if 0 < len(normals) < len(pieces):
         lost.append("normals of some of the scans")

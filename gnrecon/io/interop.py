@@ -85,6 +85,7 @@ def _from_library(obj: Any) -> Mesh | PointCloud | None:
     """The mesh or cloud of an object of a known library; None for other objects."""
     if isinstance(obj, PointCloud | Mesh):
         return obj
+    # All base classes count, so that subclasses of a library's types are recognised.
     libraries = {kind.__module__.partition(".")[0] for kind in type(obj).__mro__}
     if "open3d" in libraries and (hasattr(obj, "point") or hasattr(obj, "vertex")):
         return _from_open3d_tensor(obj)

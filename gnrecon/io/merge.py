@@ -207,6 +207,7 @@ class Moments:
         if self.count != other.count or self.count < least_points:
             return False
         mine, theirs = self.principal(), other.principal()
+        # Comparing with NaN is false, so scans whose moments overflow never match.
         return bool((np.abs(mine - theirs) <= tolerance * mine.max()).all())
 
 

@@ -80,6 +80,7 @@ class VoxelThinning:
 
     def _first_in_each_voxel(self, kept: Contents) -> Contents:
         keys = self._voxel_keys(kept.points)
+        # np.unique returns the first row of each key, and sorting the rows keeps the order of the points.
         _, rows = np.unique(keys, return_index=True)
         return kept if len(rows) == len(keys) else _selected(kept, np.sort(rows))
 
@@ -96,6 +97,7 @@ class VoxelThinning:
         least = 2.0 ** np.floor(np.log2(max(reach, np.finfo(np.float64).tiny / least_share)) + 2) / reach_voxels
         self.side = max(self.side, float(least))
         corner = np.floor(points / self.side - self._first / self.side)
+        # Numbers from 0 to 2^21 - 1, so that keys order and compare as one integer.
         x, y, z = corner.astype(np.int64).T + reach_voxels
         keys: Int = (x << 42) | (y << 21) | z
         return keys

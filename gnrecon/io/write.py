@@ -50,6 +50,7 @@ def write_mesh(
         raise MeshError("The mesh has no faces, so there is nothing to write.")
     if not np.isfinite(mesh.vertices).all():
         raise MeshError("The mesh has vertices that are not finite, so it is not written.")
+    # Most formats and readers store indices as signed 32-bit integers.
     if len(mesh.vertices) >= 2**31:
         raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices allow.")
     held = {name: values for name, values in mesh.attributes.items() if _supports(extension, name, values)}

@@ -16,7 +16,7 @@ from rich.table import Table
 from benchmarks.harness import command_line
 from benchmarks.harness.measurement import run_isolated
 from benchmarks.harness.tables import Figure, column_table
-from gnrecon.fit.blocks.solve import LARGE
+from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write
 
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     report: dict[str, Any] = command_line.provenance("blocks", arguments) | {"runs": []}
     console = Console(highlight=False)
     for count in sorted(chosen.counts):
-        for blocks in (False, True) if count < LARGE else (True,):
+        for blocks in (False, True) if count < BlockParameters.large_scan_points else (True,):
             console.print(f"bench: {count:,} points{'' if blocks else ', in one piece'}", style="dim")
             report["runs"].append({"points": count, "blocks": blocks} | _measure(count, blocks, chosen))
     command_line.write_report(chosen.json, report)

@@ -13,6 +13,7 @@ from scan_writers import file_of, random_cloud
 import gnrecon.io
 from gnrecon.io import IOParameters, read_scans
 from gnrecon.io.streaming import read_chunks
+from gnrecon.options import Options
 
 ROOM = Path(gnrecon.io.__file__).parent
 
@@ -33,6 +34,7 @@ def test_scans_are_thinned_to_the_most_points(tmp_path: Path) -> None:
     thinned, _ = read_scans([path], parameters=IOParameters(most_points=50))
     assert 5 < len(thinned) <= 50
     np.testing.assert_array_equal(thinned.points, read_scans([path], most=50)[0].points)
+    assert Options.of().read_points == IOParameters.most_points
     whole = read_scans([path])[0]
     assert len(whole) == 300
     np.testing.assert_array_equal(whole.points, read_scans([path], parameters=IOParameters())[0].points)

@@ -77,6 +77,7 @@ def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
         triangles = triangles[:0] if np.array_equal(triangles, [[0, 0, 0]]) else triangles
         # A mirroring matrix would turn faces inside out, so their corners are reversed.
         faces.append((triangles if np.linalg.det(matrix[:3, :3]) > 0 else triangles[:, ::-1]) + start)
+        # Normals transform by the inverse transpose of the matrix, which for row vectors is a product with the inverse.
         normals.append(np.asarray(part.vertex_normals) @ np.linalg.inv(matrix[:3, :3]))
         attributes.append(part.vertex_attributes)
         start += len(part.vertices)
@@ -97,6 +98,7 @@ def _unread(data: bytes) -> tuple[str, ...]:
         b"animations": "animations",
         b"skins": "skins",
     }
+    # A GLB begins with 12 bytes of header, then 4 for the length, 4 for the type, and the text of the JSON chunk.
     text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
     return tuple(name for word, name in names.items() if b'"' + word + b'"' in text)
 
@@ -119,6 +121,7 @@ def _readable_by_trimesh(data: bytes) -> bytes:
 def pack_glb(tree: dict[str, Any], rest: bytes) -> bytes:
     """Return the bytes of a GLB file with this JSON, followed by other chunks."""
     text = json.dumps(tree).encode()
+    # Chunks are padded to multiples of 4 bytes, JSON with blanks.
     text += b" " * (-len(text) % 4)
     size = (20 + len(text) + len(rest)).to_bytes(4, "little")
     return b"glTF\x02\0\0\0" + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
@@ -140,6 +143,7 @@ def _attributes(parts: list[dict[str, Any]]) -> dict[str, Values]:
         if name == "_COLOR_0":
             full = 1.0 if column.dtype.kind == "f" else float(np.iinfo(column.dtype).max)
             colors = to_srgb(column / full)
+            # A fully opaque alpha channel carries no information.
             found["colors"] = colors if (colors[:, 3:] < 255).any() else colors[:, :3]
         else:
             found[name.lstrip("_").lower()] = column[:, 0] if column.shape[1:] == (1,) else column

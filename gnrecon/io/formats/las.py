@@ -91,6 +91,7 @@ def drop_unused_attributes(contents: Contents) -> Contents:
 
 
 def _contents(chunk: Any) -> Contents:
+    # X, Y and Z are the unscaled integers, and the flags describe processing, not the surface.
     skipped = {"X", "Y", "Z", "red", "green", "blue", "withheld", "synthetic", "key_point", "overlap"}
     names = [name for name in chunk.point_format.dimension_names if name not in skipped]
     used = np.asarray(chunk.withheld) == 0
@@ -125,9 +126,12 @@ def _require_consistent_header(
     """
     size = path.stat().st_size
     with path.open("rb") as file:
+        # The header of LAS 1.4 has 375 bytes; that of older versions begins in the same way.
         head = file.read(375)
     if len(head) < least_header_bytes or not head.startswith(b"LASF"):
         raise InputError("the file does not begin with the header of a LAS file.")
+    # At offset 94: header size, start of the points, number of records before them, point format, and the length and
+    # number of points. LAS 1.4 repeats the number with 64 bits, after the extended records, at offset 235.
     minor, (header_size, start, vlrs, kind, length, count) = head[25], struct.unpack_from("<HIIBHI", head, 94)
     if minor >= 4 and len(head) == 375:
         evlr_start, evlrs, count = struct.unpack_from("<QIQ", head, 235)

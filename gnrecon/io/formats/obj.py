@@ -26,6 +26,7 @@ def read_obj(path: Path) -> Contents:
     InputError
         When there is no vertex, a word is not a number, or an index is out of range.
     """
+    # A backslash at the end of a line continues it.
     lines = [line.strip() for line in read_text(path).replace("\\\n", " ").splitlines()]
     vertices = parse_rows([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "the 'v' lines")
     normals = parse_rows([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "the 'vn' lines")
@@ -35,6 +36,7 @@ def read_obj(path: Path) -> Contents:
     points = np.ascontiguousarray(vertices[:, :3])
     counts, corners = _corners(lines)
     if not len(counts):
+        # Without faces nothing links normals to vertices; as many normals as vertices belong to them in order.
         given = normals[:, :3] if len(normals) == len(points) else None
         return Contents(points, given, no_faces(), colors, _unread(lines))
     corner_vertices = _indices([word.partition("/")[0] for word in corners], lines, counts, "v")

@@ -28,6 +28,7 @@ def read_off(path: Path) -> Contents:
     if keyword is None or "BINARY" in lines[0].upper():
         raise InputError("expected a text file that begins with the word OFF.")
     rest = lines[0][keyword.end() :].split()
+    # Some files have the counts on the line of the keyword.
     words, lines = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
     if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
         raise InputError(f"expected the numbers of vertices and faces, but found {' '.join(words)[:60]!r}.")

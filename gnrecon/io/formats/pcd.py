@@ -107,6 +107,7 @@ def _require_complete(header: Header, body: bytes, points: int) -> None:
         case "binary":
             found = len(body) // max(row, 1)
         case "binary_compressed":
+            # Compressed data begins with its own size and that of the unpacked data.
             packed, unpacked = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, 0)
             found = unpacked // max(row, 1) if packed <= len(body) - 8 else 0
         case other:

@@ -72,6 +72,8 @@ def _read_rows(buffer: bytes, offset: int, element: Element, order: str) -> tupl
     """Return the element's rows and the offset after them; `order` is empty for text converted to doubles."""
     lists = [prop for prop in element.properties if prop.count_type]
     if lists and element.count:
+        # Most files have lists of one length only. Then all rows have one record type, which numpy reads at once; a row
+        # of another length shows as a wrong count, and the rows are read one by one.
         lengths = _first_lengths(buffer, offset, element, order)
         layout = _layout(element, order, lengths)
         end = offset + element.count * layout.itemsize
@@ -81,6 +83,7 @@ def _read_rows(buffer: bytes, offset: int, element: Element, order: str) -> tupl
     else:
         layout = _layout(element, order, {prop.name: 0 for prop in lists})
         end = offset + element.count * layout.itemsize
+        # Checked before reading, because a damaged header may declare any number of rows.
         if end > len(buffer):
             raise truncation_error(element, (len(buffer) - offset) // layout.itemsize)
         table = np.frombuffer(buffer[offset:end], layout)
@@ -266,6 +269,7 @@ Column = tuple[str, str, Values]
 
 def vertex_columns(mesh: Mesh) -> list[Column]:
     """Return all columns of a mesh; an attribute of several columns becomes NAME_0, NAME_1, and so on."""
+    # Doubles, because projected coordinates lose centimetres in single precision.
     columns: list[Column] = [(name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")]
     if mesh.normals is not None:
         columns += [(f"n{name}", "float", mesh.normals[:, axis]) for axis, name in enumerate("xyz")]
@@ -300,6 +304,7 @@ def _ply_type(values: Values) -> str:
     kind = kinds.get(values.dtype.str[1:])
     if kind is not None:
         return kind
+    # PLY has no 64-bit integers.
     if values.dtype.kind in "iu" and len(values):
         for name, limits in (("int", np.iinfo(np.int32)), ("uint", np.iinfo(np.uint32))):
             if limits.min <= values.min() and values.max() <= limits.max:

@@ -72,6 +72,7 @@ def _pose(lines: list[str], number: int, *, tolerance: float = 1e-3) -> Float:
     if [len(row) for row in rows] != [3, 3, 3, 3, 4, 4, 4, 4]:
         raise InputError(f"scan {number} lacks the four lines of its position or the four of its matrix.")
     matrix = np.stack(rows[4:])
+    # For a rotation with one scale s, the product with the transpose is s^2 times the identity.
     square = matrix[:3, :3] @ matrix[:3, :3].T
     scale = float(np.trace(square)) / 3
     if not (scale > 0 and np.abs(square / scale - np.eye(3)).max() <= tolerance and np.isfinite(matrix).all()):
@@ -99,6 +100,7 @@ def _contents(table: Float, cells: Int, height: int, matrix: Float) -> Contents:
     attributes: dict[str, Values] = {"intensity": table[:, 3]}
     if table.shape[1] == 7:
         attributes["colors"] = np.clip(np.nan_to_num(table[:, 4:7]), 0, 255).astype(np.uint8)
+    # Cells are stored column by column, as the scanner turns.
     attributes |= {"row": (cells % height).astype(np.int32), "column": (cells // height).astype(np.int32)}
     points = table[:, :3] @ matrix[:3, :3] + matrix[3, :3]
     origins = np.broadcast_to(matrix[3, :3], points.shape)

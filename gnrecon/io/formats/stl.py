@@ -38,6 +38,7 @@ def read_stl(path: Path) -> Contents:
     if not solids:
         raise InputError("the file holds no complete STL solid: it is empty, cut short, or of another format.")
     corners = np.concatenate([np.asarray(solid["vertices"], np.float64) for solid in solids])
+    # np.unique sorts the positions; `rank` restores the order of appearance.
     _, first, which = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)

@@ -61,6 +61,7 @@ def write_3mf(mesh: Mesh, path: Path) -> None:
         ):
             entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # the first date that a ZIP archive can store
             entry.compress_type = zipfile.ZIP_DEFLATED
+            # The size is not known before, and may exceed the 4 GiB of the older format.
             with archive.open(entry, "w", force_zip64=True) as file:
                 file.write(declaration.encode("ascii"))
                 for block in blocks:
@@ -104,6 +105,7 @@ def _palette(colors: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint32], Int
 def _shift(mesh: Mesh) -> Float:
     """What is subtracted from the coordinates, of shape (3,): zero, unless float32 rounding would be visible."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    # Readers may convert coordinates to float32.
     rounding = float(np.abs(mesh.vertices).max()) * float(np.finfo(np.float32).eps)
     visible = IOParameters.visible_rounding_diagonals * float(np.linalg.norm(high - low))
     return (low + high) / 2 if rounding > visible else np.zeros(3)
@@ -258,6 +260,7 @@ def _transformed(model: _Model, key: Key, matrix: Float, depth: int, *, most_dep
     if current.corners:
         yield _mesh(current, matrix)
     for inner, step in current.parts:
+        # Transforms move rows (x, y, z, 1), so the inner one comes first, as a 4 x 4 matrix.
         yield from _transformed(model, inner, np.hstack([step, np.eye(4)[:, 3:]]) @ matrix, depth + 1)
 
 
@@ -280,4 +283,5 @@ def _mesh(current: _Object, matrix: Float) -> Mesh:
 
 def _rgba(text: str) -> int:
     """RGBA of ``#RRGGBB`` or ``#RRGGBBAA``, as one number."""
+    # Without an alpha channel, colours are opaque.
     return int(text.lstrip("#").ljust(8, "F")[:8], 16)

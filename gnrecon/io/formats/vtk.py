@@ -91,6 +91,7 @@ class _Source:
                 raise InputError(f"the file ends within {count} numbers of the type {kind}.")
             block, self.place = self.data[self.place : end], end
             return np.frombuffer(block, dtype.newbyteorder(">")).astype(dtype)
+        # Each number takes at least a byte; a larger count is refused before memory is allocated.
         if count > len(self.data) - self.place:
             raise InputError(f"the file ends within {count} numbers of the type {kind}.")
         words = self.data[self.place :].split(None, count)
@@ -200,6 +201,7 @@ def _array(source: _Source, words: list[str], data: _Data) -> None:
         case "SCALARS":
             columns = _count(words, 3) if len(words) > 3 else 1
             start = source.place
+            # The line LOOKUP_TABLE is optional.
             if source.words()[:1] != ["LOOKUP_TABLE"]:
                 source.place = start
             _keep(data, title, source.numbers(columns * data.count, _word(words, 2)), columns)
@@ -289,6 +291,7 @@ def triangulate_cells(counts: Int, corners: Int, strips: bool) -> Int:
     found = []
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         strip = np.stack([corners[start + k : start + count - 2 + k] for k in range(3)], axis=1)
+        # Every other triangle of a strip has the opposite orientation.
         strip[1::2] = strip[1::2, [1, 0, 2]]
         found.append(strip)
     return np.concatenate(found)

@@ -82,6 +82,7 @@ def split_head(text: str) -> tuple[list[str] | None, int | None, str]:
         comment = stripped.startswith(("#", "//", ";", "%"))
         words = _words(stripped.lstrip("#/;%"))
         if words and not comment and all(map(_is_number, words)):
+            # A line with a single whole number is the count of a PTS file.
             if len(words) == 1 and words[0].isdecimal():
                 return names, int(words[0]), text[start + len(line) :]
             return names, None, text[start:]

@@ -1,4 +1,4 @@
-"""Scans of a ball are laid on it, and those of other shapes are not, however like a ball they are."""
+"""Scans of a ball are projected onto it, and those of other shapes are not, however similar to a ball they are."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.shape_priors.ball_fit import Ball
+from gnrecon.fit.shape_priors.ball_fit import BallFit
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 
@@ -39,12 +39,12 @@ def off(samples: Samples) -> Float:
 
 
 @pytest.mark.parametrize(("count", "noise", "tilt", "most"), [(60, 0.0, 0.0, 1e-9), (2000, 0.008, 0.3, 1e-3)])
-def test_points_of_a_ball_are_laid_on_it_and_its_gaps_are_filled(
+def test_points_of_a_ball_are_projected_onto_it_and_its_gaps_are_filled(
     count: int, noise: float, tilt: float, most: float
 ) -> None:
     whole = scan(count, noise, tilt)
     for samples in (whole, replace(whole, estimated=True)):
-        ball = Ball.of(samples)
+        ball = BallFit.of(samples)
         assert ball is not None
         assert ball.radius == pytest.approx(RADIUS * FRAME.scale, rel=most)
         assert not ball.samples.estimated
@@ -67,25 +67,25 @@ def test_shapes_that_are_nearly_balls_are_left_alone() -> None:
     bump = 0.01 * np.exp(-40 * (1 - outward[:, 2]))
     noise = 0.001 * np.random.default_rng(1).standard_normal(count)
     for by in (longer, rippled, bump):
-        assert Ball.of(spoiled(count, by)) is None
-        assert Ball.of(spoiled(count, by + noise)) is None
-    assert Ball.of(spoiled(count, noise)) is not None
+        assert BallFit.of(spoiled(count, by)) is None
+        assert BallFit.of(spoiled(count, by + noise)) is None
+    assert BallFit.of(spoiled(count, noise)) is not None
 
 
 def test_what_may_go_on_as_another_shape_is_left_alone() -> None:
     ball = scan(800)
     dome = ball.points[:, 2] > CENTER[2]
-    assert Ball.of(replace(ball, points=ball.points[dome], normals=ball.normals[dome])) is None
+    assert BallFit.of(replace(ball, points=ball.points[dome], normals=ball.normals[dome])) is None
     holed = ball.points[:, 2] < CENTER[2] + 0.9 * RADIUS
-    assert Ball.of(replace(ball, points=ball.points[holed], normals=ball.normals[holed])) is not None
+    assert BallFit.of(replace(ball, points=ball.points[holed], normals=ball.normals[holed])) is not None
     stick = np.stack([np.zeros(20), np.zeros(20), np.linspace(0.85, 1.2, 20)], axis=1)
     on_a_stick = np.concatenate([ball.points, CENTER + stick]), np.concatenate([ball.normals, np.eye(3)[[0] * 20]])
-    assert Ball.of(replace(ball, points=on_a_stick[0], normals=on_a_stick[1])) is None
-    assert Ball.of(replace(ball, normals=-ball.normals)) is None
-    assert Ball.of(scan(20)) is None
-    assert Ball.of(scan(800, noise=0.1)) is None
+    assert BallFit.of(replace(ball, points=on_a_stick[0], normals=on_a_stick[1])) is None
+    assert BallFit.of(replace(ball, normals=-ball.normals)) is None
+    assert BallFit.of(scan(20)) is None
+    assert BallFit.of(scan(800, noise=0.1)) is None
     flat = ball.points * [1.0, 1.0, 0.0]
-    assert Ball.of(replace(ball, points=flat)) is None
+    assert BallFit.of(replace(ball, points=flat)) is None
 
 
 def test_the_fit_of_few_points_of_a_ball_is_a_ball() -> None:

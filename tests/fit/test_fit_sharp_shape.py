@@ -1,4 +1,4 @@
-"""Sharp shapes: samples that continue faces to their edges, and which scans are sharp."""
+"""Sharp shapes: samples that extend faces to their edges, and which scans are sharp."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.shape_priors import sharp_shape as sharp
-from gnrecon.fit.shape_priors.edge_completion import Faces
-from gnrecon.fit.shape_priors.sharp_shape import AVERAGING, Sharp
+from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
+from gnrecon.fit.shape_priors.edge_completion import EdgeCompletion
+from gnrecon.fit.shape_priors.prior_parameters import ShapePriorParameters, SharpShapeParameters
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape, has_edges
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest.orientation import oriented_normals
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
 SIDE = 0.8
+AVERAGING = BilateralFilter(SharpShapeParameters.averaging_width_radii, SharpShapeParameters.averaging_normal_scale)
 
 
 def cube(count: int, noise: float = 0.0, tilt: float = 0.0, seed: int = 0) -> Samples:
@@ -59,11 +61,11 @@ def from_edges(x: np.ndarray) -> np.ndarray:
     return SIDE - np.sort(np.abs(x), axis=1)[:, 1]
 
 
-def test_faces_of_a_cube_are_continued_to_its_edges_and_its_gaps_are_halved() -> None:
+def test_faces_of_a_cube_are_extended_to_its_edges_and_its_gaps_are_halved() -> None:
     scan = cube(600)
-    found = Sharp.of(scan)
+    found = SharpShape.of(scan)
     assert found is not None
-    assert (found.averaging, found.laid) == (None, None)
+    assert (found.averaging, found.snapped) == (None, None)
     x, normals = found.samples.points[600:], found.samples.normals[600:]
     assert (found.samples.points[:600] == scan.points).all()
     # One may go on a little where the other face has a gap, too.
@@ -78,7 +80,8 @@ def test_faces_of_a_cube_are_continued_to_its_edges_and_its_gaps_are_halved() ->
     assert nearest[1] < 0.75 * nearest[0]
     nearest = [Density(points).tree.query(places)[0].max() for points in (scan.points, found.samples.points)]
     assert nearest[1] < nearest[0]
-    assert found.belief.length == pytest.approx(sharp.EXACT[0] * Density(found.samples.points).radius)
+    radius = Density(found.samples.points).radius
+    assert found.belief.length == pytest.approx(SharpShapeParameters.exact_length_radii * radius)
 
 
 def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:
@@ -90,8 +93,8 @@ def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:
         normals = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
         # The circle as large as needed for neighbours that are as far apart as the rows.
         radius = 0.1 / angle
-        faces = Faces(radius * normals + np.stack([0 * turn, 0 * turn, height], axis=1), normals)
-        x, n, _ = faces.between()
+        faces = EdgeCompletion(radius * normals + np.stack([0 * turn, 0 * turn, height], axis=1), normals)
+        x, n, _ = faces.midpoints()
         radial = x[:, :2] / np.linalg.norm(x[:, :2], axis=1, keepdims=True)
         assert (radial * n[:, :2]).sum(axis=1) == pytest.approx(np.ones(len(x)), abs=1e-9)
         assert faces.roughness < 1e-12
@@ -102,17 +105,17 @@ def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:
 
 def test_noisy_faces_are_averaged_first() -> None:
     scan = cube(3000, noise=0.01, tilt=0.1)
-    found = Sharp.of(scan)
+    found = SharpShape.of(scan)
     assert found is not None
     assert found.averaging == AVERAGING
     assert off_cube(found.samples.points).mean() < 0.1 * off_cube(scan.points).mean()
-    assert found.laid is not None
-    assert found.laid.surfaces == 6
+    assert found.snapped is not None
+    assert found.snapped.primitives == 6
 
 
 @pytest.mark.parametrize("samples", [ball(60), ball(1500), ball(1500, 0.01), rounded(3000, 0.3)])
 def test_smooth_shapes_have_no_edges(samples: Samples) -> None:
-    assert Sharp.of(samples) is None
+    assert SharpShape.of(samples) is None
 
 
 def test_outliers_are_no_edges() -> None:
@@ -125,40 +128,40 @@ def test_outliers_are_no_edges() -> None:
     normals[out] = 0.5 * normals[out] + aside / np.linalg.norm(aside, axis=1, keepdims=True)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = smooth.points + 0.1 * (normals - smooth.normals)
-    assert sharp.has_edges(points, normals)
-    assert Sharp.of(replace(smooth, points=points, normals=normals)) is None
+    assert has_edges(points, normals)
+    assert SharpShape.of(replace(smooth, points=points, normals=normals)) is None
     plate = cube(500, seed=4)
     plate = replace(plate, points=plate.points * [1.0, 1.0, 0.02])
     sides = np.abs(plate.normals[:, 2]) < 0.5
     few = ~sides | (np.cumsum(sides) % 10 == 0)
     plate = replace(plate, points=plate.points[few], normals=plate.normals[few])
-    assert Sharp.of(plate) is not None
+    assert SharpShape.of(plate) is not None
 
 
 def test_where_two_faces_meet_in_a_fillet_nothing_is_added_beyond_it() -> None:
     """The planes on both sides of a fillet that has a few points of its own meet outside the shape."""
     samples = rounded(3000, 0.04)
-    faces = Faces(samples.points, samples.normals)
-    *_, agreed = faces.towards_edges()
-    assert agreed < sharp.AGREED
-    assert Sharp.of(samples) is None
+    faces = EdgeCompletion(samples.points, samples.normals)
+    *_, agreed = faces.edge_samples()
+    assert agreed < SharpShapeParameters.min_agreement
+    assert SharpShape.of(samples) is None
     # Without those points nothing contradicts.
     flat = np.abs(samples.normals).max(axis=1) > 1 - 1e-9
-    *_, agreed = Faces(samples.points[flat], samples.normals[flat]).towards_edges()
+    *_, agreed = EdgeCompletion(samples.points[flat], samples.normals[flat]).edge_samples()
     assert agreed == 1.0
 
 
-def test_faces_are_continued_by_the_normals_of_their_surfaces_where_normals_were_estimated() -> None:
+def test_faces_are_extended_by_the_normals_of_their_surfaces_where_normals_were_estimated() -> None:
     samples = cube(600)
     scanned = replace(samples, normals=oriented_normals(samples.points).normals, estimated=True)
 
     def exact(normals: np.ndarray) -> float:
         return float((np.abs(normals).max(axis=1) > np.cos(np.radians(5))).mean())
 
-    found = Sharp.of(scanned)
+    found = SharpShape.of(scanned)
     assert found is not None
-    assert found.laid is not None
-    assert found.laid.surfaces == 6
+    assert found.snapped is not None
+    assert found.snapped.primitives == 6
     assert found.averaging is None
     assert exact(scanned.normals) < 0.9
     assert exact(found.samples.normals) > 0.98
@@ -166,19 +169,20 @@ def test_faces_are_continued_by_the_normals_of_their_surfaces_where_normals_were
     assert off_cube(found.samples.points).max() < 0.03
 
 
-def test_round_shapes_and_many_points_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_round_shapes_and_many_points_are_left_alone() -> None:
     samples = cube(600)
-    assert Sharp.of(replace(ball(600), estimated=True)) is None
-    assert Sharp.of(replace(samples, points=samples.points[:5], normals=samples.normals[:5])) is None
-    monkeypatch.setattr(sharp, "MOST_POINTS", 599)
-    assert Sharp.of(samples) is None
+    assert SharpShape.of(replace(ball(600), estimated=True)) is None
+    assert SharpShape.of(replace(samples, points=samples.points[:5], normals=samples.normals[:5])) is None
+    few = ShapePriorParameters(sharp=SharpShapeParameters(max_points=599))
+    assert SharpShape.of(samples, few) is None
+    assert SharpShape.of(samples) is not None
 
 
 def test_points_that_are_there_twice_do_no_harm() -> None:
     samples = cube(400)
     twice = replace(samples, **{n: np.concatenate([getattr(samples, n)] * 2) for n in ("points", "normals")})
     with np.errstate(all="raise"):
-        found = Sharp.of(twice)
+        found = SharpShape.of(twice)
     assert found is None or np.isfinite(found.samples.points).all()
 
 
@@ -198,14 +202,14 @@ def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.Mon
         slope = np.linalg.norm(gradient, axis=1).clip(0.3)
         return float(np.mean(np.abs(value) / slope)) / FRAME.scale, solution.status
 
-    continued, status = error()
+    completed, status = error()
     assert "Extended faces to their sharp edges with" in status
     assert "degrees in normals" not in status
     assert ("points to 6 detected planes, cylinders and spheres" in status) == estimated
-    monkeypatch.setattr(Sharp, "of", classmethod(lambda *_: None))
+    monkeypatch.setattr(SharpShape, "of", classmethod(lambda *_: None))
     plain, status = error()
     assert "Extended" not in status
-    assert continued < 0.7 * plain
+    assert completed < 0.7 * plain
 
 
 def test_the_fit_of_a_noisy_cube_says_how_many_points_are_snapped_to_its_faces() -> None:
@@ -223,7 +227,7 @@ def test_acute_edges_are_edges_and_the_sides_of_a_sheet_are_none() -> None:
     faces = np.array([[k for k in range(4) if k != corner] for corner in range(4)])
     points = np.einsum("nk,nkd->nd", weights, corners[faces[opposite]])
     scan = Samples(points, -corners[opposite] / np.linalg.norm(corners[0]), FRAME)
-    found = Sharp.of(scan)
+    found = SharpShape.of(scan)
     assert found is not None
     # On the faces' planes, and not beyond the edges.
     heights = found.samples.points @ -corners.T / np.linalg.norm(corners[0])
@@ -232,4 +236,4 @@ def test_acute_edges_are_edges_and_the_sides_of_a_sheet_are_none() -> None:
     disc = disc[np.hypot(disc[:, 0], disc[:, 1]) < 0.8]
     disc[:, 2] = 0.01 * rng.choice([-1.0, 1.0], len(disc))
     normals = np.sign(disc[:, 2:]) * [[0.0, 0.0, 1.0]] + 0.15 * rng.standard_normal(disc.shape)
-    assert Sharp.of(Samples(disc, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)) is None
+    assert SharpShape.of(Samples(disc, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)) is None

@@ -1,4 +1,4 @@
-"""Detail by blocks: the same whatever the blocks and processes, without seams, taken up again, and within memory."""
+"""Local fields by blocks: the same for any blocks and processes, without seams, resumable, and within memory."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit import FitOptions, NeuralSDF
 from gnrecon.fit.blocks import block, workers
 from gnrecon.fit.blocks import solve as large
-from gnrecon.fit.blocks import workers as scheduled
-from gnrecon.fit.blocks.store import Work
+from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.fit_options import QUALITIES
 from gnrecon.fit.local_fields import fit_detail
@@ -44,7 +43,7 @@ FEATURES = 60
 
 
 def known(*_: object) -> Belief:
-    """Choose nothing: that is tested elsewhere."""
+    """Replace the choice, which is tested elsewhere."""
     return BELIEF
 
 
@@ -58,7 +57,7 @@ def ellipsoid() -> Samples:
 
 
 def constant_field(samples: Samples) -> NeuralSDF:
-    """A global field that knows nothing: it is constant."""
+    """A global field that is constant."""
     field = Siren((8,))
     theta = torch.zeros(field.layout.count, dtype=torch.float64)
     theta[-1] = 0.05
@@ -80,7 +79,7 @@ def fitted(
 
 @pytest.fixture(autouse=True)
 def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Length and noise as they are: choosing them is tested elsewhere."""
+    """Fix length and noise; their choice is tested elsewhere."""
     monkeypatch.setattr(large, "choose", known)
     monkeypatch.setitem(QUALITIES, "draft", FEATURES)
 
@@ -111,16 +110,14 @@ def same(one: Detail, other: Detail) -> bool:
 def test_neither_blocks_nor_processes_change_a_digit(whole: Detail, tmp_path: Path) -> None:
     with threads(2):
         _, parts = fitted(tmp_path, block_points=150)
-    blocks = len(Work(tmp_path).array("ends")) - 1
+    blocks = len(WorkFolder(tmp_path).array("ends")) - 1
     assert blocks > 8
     assert same(whole, parts)
 
 
-# Dask's own threads and sockets go when they please.
+# Dask closes its threads and sockets late.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_cluster_that_loses_a_worker_changes_no_digit(
-    whole: Detail, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_that_loses_a_worker_changes_no_digit(whole: Detail, tmp_path: Path) -> None:
     from distributed import LocalCluster
 
     killed, folder, options = [], tmp_path / "work", {"dashboard_address": None, "silence_logs": 50}
@@ -134,25 +131,24 @@ def test_a_cluster_that_loses_a_worker_changes_no_digit(
         _, parts = fitted(folder, 150, cluster.scheduler_address, kill)
         assert killed
         assert same(whole, parts)
-        # What is there is not solved again, and what cannot be solved is said.
-        monkeypatch.setattr(scheduled, "RETRIES", 0)
+        # Saved blocks are not solved again, and a block that cannot be solved is an error.
         (folder / "block-000001.npz").unlink()
         assert same(whole, fitted(folder, 150, cluster.scheduler_address)[1])
-        # Where nothing is left to do, nobody is asked.
+        # Where nothing is left to do, no scheduler is needed.
         assert same(whole, fitted(folder, 150, "tcp://127.0.0.1:9")[1])
         (folder / "block-000000.npz").unlink()
         (folder / "normals.npy").unlink()
         with pytest.raises(FitError, match=r"The cluster could not solve a block: .*normals\.npy"):
-            scheduled.solve_scheduled(Work(folder), [0], cluster.scheduler_address, ignore_progress)
+            workers.solve_on_cluster(WorkFolder(folder), [0], cluster.scheduler_address, ignore_progress, retries=0)
 
 
 def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="need a work folder"):
+    with pytest.raises(UsageError, match="needs a work folder"):
         Options(block_scheduler="tcp://127.0.0.1:9")
     assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
-    monkeypatch.setattr(scheduled, "dask_client", partial(dask_client, timeout="1s"))
+    monkeypatch.setattr(workers, "dask_client", partial(dask_client, timeout="1s"))
     with pytest.raises(UsageError, match=r"No scheduler answers at tcp://127\.0\.0\.1:9"):
-        scheduled.solve_scheduled(Work(tmp_path), [0], "tcp://127.0.0.1:9", ignore_progress)
+        workers.solve_on_cluster(WorkFolder(tmp_path), [0], "tcp://127.0.0.1:9", ignore_progress)
 
 
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
@@ -205,11 +201,11 @@ def test_what_was_solved_is_not_solved_again(whole: Detail, tmp_path: Path, monk
         )
     finished = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("block-*.npz")}
     solved: list[int] = []
-    solve = block.Blocks.solve
-    monkeypatch.setattr(block.Blocks, "solve", lambda self, number: solved.append(number) or solve(self, number))
+    solve = block.BlockSolver.solve
+    monkeypatch.setattr(block.BlockSolver, "solve", lambda self, number: solved.append(number) or solve(self, number))
     with threads(1):
         _, taken_up = fitted(tmp_path)
-    count = len(Work(tmp_path).array("ends")) - 1
+    count = len(WorkFolder(tmp_path).array("ends")) - 1
     assert 0 < len(finished) < count
     assert len(solved) == count - len(finished)
     assert {name: (tmp_path / name).stat().st_mtime_ns for name in finished} == finished
@@ -220,10 +216,10 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
     program = (
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent), *sys.path]!r}\n"
         "import time, torch; from pathlib import Path\n"
-        "from gnrecon.fit import block, large; import test_fit_large as own\n"
+        "from gnrecon.fit.blocks import solve as large; import test_fit_blocks as own\n"
         "torch.set_num_threads(1); large.choose = own.known; own.QUALITIES['draft'] = own.FEATURES\n"
-        "keep = own.Work.keep\n"
-        "own.Work.keep = lambda *arguments: (keep(*arguments), time.sleep(0.2))\n"
+        "save = own.WorkFolder.save\n"
+        "own.WorkFolder.save = lambda *arguments: (save(*arguments), time.sleep(0.2))\n"
         f"own.fitted(Path({str(tmp_path)!r}))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.DEVNULL)
@@ -242,30 +238,30 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
 
 def test_memory_holds_one_cube_and_its_neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     held: list[int] = []
-    around = block.Blocks._around
+    around = block.BlockSolver._nearby_points
 
-    def counted(self: block.Blocks, key: Int) -> Int:
+    def counted(self: block.BlockSolver, key: Int) -> Int:
         rows = around(self, key)
         held.append(len(rows))
         return rows
 
-    monkeypatch.setattr(block.Blocks, "_around", counted)
+    monkeypatch.setattr(block.BlockSolver, "_nearby_points", counted)
     monkeypatch.setattr(large, "choose", lambda *_: Belief(0.04, 1e-3, 0.05))
     with threads(1):
         _, detail = fitted(tmp_path)
-    assert isinstance(Work(tmp_path).array("points").base, np.memmap)
+    assert isinstance(WorkFolder(tmp_path).array("points").base, np.memmap)
     assert max(held) < COUNT / 6
     assert len(held) >= len(detail) > 30
 
 
 def test_cubes_see_all_of_their_points(tmp_path: Path) -> None:
     fitted(tmp_path)
-    found = block.Blocks.of(Work(tmp_path), "cpu")
+    found = block.BlockSolver.of(WorkFolder(tmp_path), "cpu")
     points, partition = found.leftover.points, found.partition
     reach = partition.reach + 2 * found.radius
     for key in found.keys[::7]:
         inside = np.flatnonzero((np.abs(points - partition.center(key)) <= reach).all(axis=1))
-        assert set(inside) <= set(found._around(key))
+        assert set(inside) <= set(found._nearby_points(key))
 
 
 def test_another_runs_folder_is_refused(tmp_path: Path) -> None:
@@ -289,6 +285,6 @@ def test_a_process_that_fails_ends_the_fit(
     program.write_text(f"#!/bin/sh\n{words}\n")
     program.chmod(0o755)
     monkeypatch.setattr(workers.sys, "executable", str(program))
-    monkeypatch.setattr(workers, "_room", lambda: 2)
+    monkeypatch.setattr(workers, "_affordable_processes", lambda: 2)
     with pytest.raises(error, match=sentence):
-        workers.solve_blocks(Work(tmp_path), [0, 1, 2], 2, "cpu", ignore_progress)
+        workers.solve_blocks(WorkFolder(tmp_path), [0, 1, 2], 2, "cpu", ignore_progress)

@@ -1,4 +1,4 @@
-"""Planes and cylinders found among points, minimal cuts, and faces continued across holes."""
+"""Planes and cylinders found among points, minimal cuts, and faces extended across holes."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import pytest
 from made_shapes import bored_plate
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.shape_priors.hole_completion import _shut_away, continued, mouths
+from gnrecon.fit.shape_priors.hole_completion import complete_holes, encloses, in_bore_opening
 from gnrecon.fit.shape_priors.min_cut import minimal_inside
-from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, Wanted, agreed, planar_share, surfaces
+from gnrecon.fit.shape_priors.primitive_detection import detect_primitives, planar_share
+from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, is_inlier
+from gnrecon.fit.shape_priors.prior_parameters import DetectionParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 
@@ -51,7 +53,8 @@ def noisy(points: Float, normals: Float, noise: float, tilt: float) -> tuple[Flo
 
 def found(points: Float, normals: Float, radius: float, off: float, sparse: bool = False) -> list[Plane | Cylinder]:
     everything, rng = np.ones(len(points), dtype=bool), np.random.default_rng(0)
-    return [one.surface for one in surfaces(points, normals, everything, radius, off, rng, Wanted(sparse=sparse))]
+    detected = detect_primitives(points, normals, everything, radius, off, rng, DetectionParameters(sparse=sparse))
+    return [one.surface for one in detected]
 
 
 def test_a_plane_and_a_bore_are_found_among_points_that_lie_on_neither() -> None:
@@ -87,7 +90,7 @@ def test_a_face_that_was_seen_from_the_side_is_found_though_its_points_are_few()
     assert upper[0].center[2] == pytest.approx(SIDE, abs=2e-3)
 
 
-def test_the_share_on_planes_tells_made_shapes_from_grown_ones() -> None:
+def test_the_share_on_planes_separates_machine_parts_from_free_form_shapes() -> None:
     def share(points: Float, normals: Float) -> float:
         return planar_share(points, normals, 0.022, 0.007, np.random.default_rng(0))
 
@@ -103,12 +106,12 @@ def test_a_cylinder_of_two_sides() -> None:
     for side in (-1.0, 1.0):
         one = Cylinder(np.array([0.1, 0.0, 5.0]), np.array([0.0, 0.0, 1.0]), 2.0, side)
         x = np.array([[3.1, 0.0, -7.0], [0.1, 1.0, 2.0]])
-        np.testing.assert_allclose(one.at(x), side * np.array([1.0, -1.0]))
+        np.testing.assert_allclose(one.signed_distance(x), side * np.array([1.0, -1.0]))
         np.testing.assert_allclose(one.normal(x), side * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
         on = np.array([[2.2, 0.0, 0.0]])
-        assert agreed(one, on, one.normal(on), 0.2).all()
-        assert not agreed(one, on, -one.normal(on), 0.2).any()
-        assert not agreed(one, on, one.normal(on), 0.05).any()
+        assert is_inlier(one, on, one.normal(on), 0.2).all()
+        assert not is_inlier(one, on, -one.normal(on), 0.2).any()
+        assert not is_inlier(one, on, one.normal(on), 0.05).any()
 
 
 def corner(size: int, hidden: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -131,16 +134,16 @@ def test_a_minimal_cut_runs_along_faces_to_a_corner_and_without_them_takes_the_s
     assert not cut[7, 7, 7]
 
 
-def test_what_a_cut_shuts_away_is_told() -> None:
+def test_cells_enclosed_by_a_cut_are_counted() -> None:
     sides = np.zeros((12, 12, 12), dtype=bool)
     seen = np.zeros_like(sides)
     seen[5:8, 5:8, 5:8] = True
-    assert not _shut_away(sides, seen)
+    assert not encloses(sides, seen)
     sides[3:10, 3:10, 3:10] = True
     sides[5:8, 5:8, 5:8] = False
-    assert _shut_away(sides, seen)
+    assert encloses(sides, seen)
     sides[5:, 6, 6] = False
-    assert not _shut_away(sides, seen)
+    assert not encloses(sides, seen)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -148,7 +151,7 @@ def test_what_a_cut_shuts_away_is_told() -> None:
 def test_faces_go_on_across_a_hole_to_edge_and_corner(middle: list[float], seed: int) -> None:
     whole = cube(2500, seed)
     points, normals = without(*whole, middle, 0.35)
-    across = continued(points, normals)
+    across = complete_holes(points, normals)
     assert across.holes == 1
     off = off_cube(across.points)
     assert (off < 1e-9).mean() > 0.97
@@ -161,7 +164,7 @@ def test_faces_go_on_across_a_hole_to_edge_and_corner(middle: list[float], seed:
 
 def test_the_samples_are_as_dense_as_the_scan() -> None:
     whole = cube(4000)
-    across = continued(*without(*whole, [SIDE, 0.0, 0.0], 0.4))
+    across = complete_holes(*without(*whole, [SIDE, 0.0, 0.0], 0.4))
     missing = 4000 - len(without(*whole, [SIDE, 0.0, 0.0], 0.3)[0])
     near = np.linalg.norm(across.points - [SIDE, 0.0, 0.0], axis=1) < 0.3
     assert 0.5 < near.sum() / missing < 1.5
@@ -171,49 +174,49 @@ def test_a_bore_of_which_a_part_was_seen_goes_on() -> None:
     points, normals = noisy(*bored(9000), 0.002, 0.05)
     on_wall = np.abs(np.hypot(points[:, 0], points[:, 1]) - BORE) < 0.01
     hidden = on_wall & (points[:, 0] > -0.15) & (np.abs(points[:, 2]) < 0.18)
-    across = continued(points[~hidden], normals[~hidden])
+    across = complete_holes(points[~hidden], normals[~hidden])
     assert across.holes
     wall = np.abs(np.hypot(across.points[:, 0], across.points[:, 1]) - BORE) < 0.01
     faces = np.abs(np.abs(across.points) - [SIDE, SIDE, HEIGHT]).min(axis=1) < 0.01
     assert (wall | faces).mean() > 0.98
-    # They fill what was hidden of the wall, and leave its mouths open.
+    # They fill what was hidden of the wall, and leave its openings free.
     apart = np.linalg.norm(points[hidden][:, None] - across.points[wall], axis=2).min(axis=1)
     assert np.quantile(apart, 0.95) < 0.06
     assert not (np.hypot(across.points[:, 0], across.points[:, 1]) < BORE - 0.02).any()
 
 
-def across_mouth(height: float) -> tuple[Float, Float]:
+def across_opening(height: float) -> tuple[Float, Float]:
     """Samples of a disk that shuts the bore of the plate."""
     angle, away = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), [0.05, 0.15, 0.25, 0.35])
     x = np.stack([away * np.cos(angle), away * np.sin(angle), np.full(angle.shape, height)], axis=-1).reshape(-1, 3)
     return x, np.broadcast_to([0.0, 0.0, np.sign(height)], x.shape)
 
 
-def test_the_mouth_of_a_bore_whose_wall_was_seen_is_told() -> None:
+def test_the_opening_of_a_bore_whose_wall_was_scanned_is_recognised() -> None:
     points, normals = bored(6000)
     seen = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > 0.05)
     points, normals = points[seen], normals[seen]
     for turn in (np.eye(3), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])):
-        shut, theirs = across_mouth(HEIGHT)
-        assert mouths(shut @ turn, theirs @ turn, points @ turn, normals @ turn).all()
-    # Of a wall that was seen at one end alone the other mouth knows nothing.
+        shut, theirs = across_opening(HEIGHT)
+        assert in_bore_opening(shut @ turn, theirs @ turn, points @ turn, normals @ turn).all()
+    # A wall that was scanned at one end only does not show the other opening.
     end = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > HEIGHT - 0.03)
-    assert mouths(*across_mouth(HEIGHT), points[end], normals[end]).all()
-    assert not mouths(*across_mouth(-HEIGHT), points[end], normals[end]).any()
-    assert mouths(np.zeros((0, 3)), np.zeros((0, 3)), points, normals).shape == (0,)
+    assert in_bore_opening(*across_opening(HEIGHT), points[end], normals[end]).all()
+    assert not in_bore_opening(*across_opening(-HEIGHT), points[end], normals[end]).any()
+    assert in_bore_opening(np.zeros((0, 3)), np.zeros((0, 3)), points, normals).shape == (0,)
 
 
-def test_the_floor_of_a_blind_bore_and_a_face_without_one_are_no_mouths() -> None:
+def test_the_floor_of_a_blind_bore_and_a_face_without_one_are_no_openings() -> None:
     points, normals = bored(6000)
     inner = np.hypot(points[:, 0], points[:, 1]) < BORE + 1e-6
-    floor, up = across_mouth(0.1)
+    floor, up = across_opening(0.1)
     above = ~inner | (points[:, 2] > 0.1)
-    assert not mouths(floor, up, points[above], normals[above]).any()
+    assert not in_bore_opening(floor, up, points[above], normals[above]).any()
     # A face with a hole that nobody saw has faces behind it, which look away from it.
     x, out = cube(6000)
     left, theirs = without(x, out, [0.0, 0.0, SIDE], 0.4)
-    patch, up = across_mouth(SIDE)
-    assert not mouths(patch, up, left, theirs).any()
+    patch, up = across_opening(SIDE)
+    assert not in_bore_opening(patch, up, left, theirs).any()
 
 
 def test_the_side_of_a_can_goes_on() -> None:
@@ -224,7 +227,7 @@ def test_the_side_of_a_can_goes_on() -> None:
     lid = lid[np.hypot(lid[:, 0], lid[:, 1]) < 0.4]
     up = np.where(rng.random((len(lid), 1)) < 0.5, -1.0, 1.0) * [0.0, 0.0, 1.0]
     points = np.concatenate([0.4 * side + height[:, None] * [0, 0, 1], lid * [1, 1, 0] + 0.7 * up])
-    across = continued(*without(points, np.concatenate([side, up]), [0.4, 0.0, 0.0], 0.3))
+    across = complete_holes(*without(points, np.concatenate([side, up]), [0.4, 0.0, 0.0], 0.3))
     assert across.holes == 1
     assert len(across) > 20
     np.testing.assert_allclose(np.hypot(across.points[:, 0], across.points[:, 1]), 0.4, atol=1e-9)
@@ -233,31 +236,31 @@ def test_the_side_of_a_can_goes_on() -> None:
 
 @pytest.mark.parametrize("scan", [cube(2500), ball(2000), without(*ball(2000), [SIDE, 0.0, 0.0], 0.3), cube(40)])
 def test_whole_shapes_and_round_ones_have_nothing_to_go_on(scan: tuple[Float, Float]) -> None:
-    across = continued(*scan)
+    across = complete_holes(*scan)
     assert len(across) == across.holes == 0
 
 
-def test_a_round_shape_with_one_flat_side_is_not_continued() -> None:
+def test_a_round_shape_with_one_flat_side_is_not_extended() -> None:
     """Across a hole in its flat side a plane would go on; but what else is flat about it?"""
     points, normals = ball(4000)
     below = points[:, 2] < -0.8 * SIDE
     points[below, 2], normals[below] = -0.8 * SIDE, [0.0, 0.0, -1.0]
     assert 0.05 < below.mean() < 0.15
-    assert not len(continued(*without(points, normals, [0.0, 0.0, -0.8 * SIDE], 0.2)))
+    assert not len(complete_holes(*without(points, normals, [0.0, 0.0, -0.8 * SIDE], 0.2)))
 
 
 def test_points_that_crowd_in_a_corner_make_no_lattice_without_end() -> None:
     points, normals = cube(3000)
     crowd = np.random.default_rng(3).uniform(0.0, 1e-4, (4000, 3)) * [1, 1, 0] + [0.1, 0.1, SIDE]
     up = np.tile([0.0, 0.0, 1.0], (len(crowd), 1))
-    assert len(continued(np.concatenate([points, crowd]), np.concatenate([normals, up]))) < 3000
+    assert len(complete_holes(np.concatenate([points, crowd]), np.concatenate([normals, up]))) < 3000
 
 
 def test_noise_is_no_hole_and_an_open_side_no_place_for_samples() -> None:
-    assert not len(continued(*noisy(*cube(2500), 0.01, 0.2)))
+    assert not len(complete_holes(*noisy(*cube(2500), 0.01, 0.2)))
     points, normals = cube(2500)
     seen = points[:, 2] > -0.5 * SIDE
-    across = continued(points[seen], normals[seen])
+    across = complete_holes(points[seen], normals[seen])
     assert across.points[:, 2].min(initial=0.0) > -1.05 * SIDE
 
 

@@ -1,4 +1,4 @@
-"""Samples spread over planes and cylinders: on them, up to where they meet, and no farther."""
+"""Samples of planes and cylinders: on them, up to where they meet, and no farther."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from made_shapes import bored_plate
 from scipy.spatial import cKDTree
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.shape_priors.resampling import MOST, spread
+from gnrecon.fit.shape_priors.prior_parameters import ResamplingParameters
+from gnrecon.fit.shape_priors.resampling import resample_primitives
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
@@ -56,8 +57,8 @@ def torus(count: int) -> Oriented:
 @pytest.mark.parametrize(("count", "seed"), [(60, 0), (60, 1), (400, 2)])
 def test_a_cube_is_covered_up_to_its_edges_and_corners(count: int, seed: int) -> None:
     points, normals = cube(count, seed)
-    samples, theirs = spread(points, normals)
-    assert 3 * count < len(samples) <= 1.2 * MOST * count
+    samples, theirs = resample_primitives(points, normals)
+    assert 3 * count < len(samples) <= 1.2 * ResamplingParameters.max_samples_per_point * count
     assert off_cube(samples).max() < 1e-9
     assert np.abs((samples * theirs).sum(axis=1) - SIDE).max() < 1e-9
     places = cube(20_000, 9)[0]
@@ -67,9 +68,9 @@ def test_a_cube_is_covered_up_to_its_edges_and_corners(count: int, seed: int) ->
     assert after[at_edges].mean() < 0.5 * before[at_edges].mean()
 
 
-def test_a_bore_has_samples_on_its_wall_and_none_in_its_mouths() -> None:
+def test_a_bore_has_samples_on_its_wall_and_none_in_its_openings() -> None:
     points, normals = bored_plate(900, SIDE, HEIGHT, BORE)
-    samples, theirs = spread(points, normals)
+    samples, theirs = resample_primitives(points, normals)
     assert len(samples) > 3000
     assert np.quantile(off_plate(samples), 0.998) < 1e-6
     assert off_plate(samples).max() < 0.5 * Density(points).radius
@@ -88,7 +89,7 @@ def test_a_thin_plate_does_not_grow_beyond_a_rim_of_which_little_was_seen() -> N
     normals[rows, axis] = rng.choice([-1.0, 1.0], 600)
     points[rows, axis] = normals[rows, axis] * half[axis]
     assert (axis < 2).sum() < 40
-    samples, _ = spread(points, normals)
+    samples, _ = resample_primitives(points, normals)
     assert len(samples) > 3000
     beyond = (np.abs(samples) - half).max(axis=1)
     assert (beyond > 1e-6).mean() < 0.02
@@ -98,7 +99,7 @@ def test_a_thin_plate_does_not_grow_beyond_a_rim_of_which_little_was_seen() -> N
 def test_an_open_side_stays_open() -> None:
     points, normals = cube(900)
     seen = points[:, 2] > -SIDE + 1e-9
-    samples, _ = spread(points[seen], normals[seen])
+    samples, _ = resample_primitives(points[seen], normals[seen])
     radius = Density(points[seen]).radius
     assert samples[:, 2].min() > -SIDE - 3 * radius
     assert (np.abs(samples[samples[:, 2] < -SIDE + 0.01]).max(axis=1) > SIDE - 1e-6).all()
@@ -106,7 +107,7 @@ def test_an_open_side_stays_open() -> None:
 
 @pytest.mark.parametrize("scan", [ball(500), torus(500), cube(20_000)])
 def test_round_shapes_and_dense_scans_get_none(scan: Oriented) -> None:
-    samples, normals = spread(*scan)
+    samples, normals = resample_primitives(*scan)
     assert samples.shape == normals.shape == (0, 3)
 
 
@@ -116,7 +117,7 @@ def test_points_that_crowd_ask_for_no_more_than_others() -> None:
     near = np.linalg.norm(crowd - SIDE, axis=1) < 0.15
     joined = np.concatenate([points, crowd[near]]), np.concatenate([normals, theirs[near]])
     assert near.sum() > 100
-    samples, _ = spread(*joined)
+    samples, _ = resample_primitives(*joined)
     assert 2000 < len(samples) < 12_000
     # One may go on a little where the other face has a gap, too.
     assert (off_cube(samples) < 1e-9).mean() > 0.999
