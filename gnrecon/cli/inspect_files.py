@@ -1,4 +1,4 @@
-"""``gnrecon info SCAN``: what is in a scan and what would trouble a fit; and what a run would do, without doing it."""
+"""The commands on files: ``gnrecon check``, ``eval`` and ``convert``."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import (
     CLOUD_WRITERS,
     all_input_files,
-    holds,
     read_any,
     read_mesh,
     read_reference,
-    unverified,
+    supports_attribute,
+    unverified_remark,
     writable,
     write_cloud,
     write_mesh,
     written_origin,
 )
-from gnrecon.io.origin import told
-from gnrecon.io.write import losses
+from gnrecon.io.origin import origin_remark
+from gnrecon.io.write import round_trip_losses
 from gnrecon.runtime.errors import ExitCode, MeshError, UsageError
 from gnrecon.runtime.files import require_files, write_text
 
 
-# ``gnrecon check MESH``: whether any mesh bounds a solid, and what is unusual about it.
 def check(path: Path, *, as_json: bool = False) -> int:
-    """Print what a mesh is, as text or as one JSON object, and return the exit code 0 where it bounds a solid.
+    """Print the findings on a mesh, as text or as one JSON object, and return the exit code 0 where it bounds a solid.
 
     Raises
     ------
@@ -43,7 +42,7 @@ def check(path: Path, *, as_json: bool = False) -> int:
     """
     findings = examine(read_mesh(path))
     if as_json:
-        # JSON knows no numbers that are not finite, such as the volume of a mesh with broken vertices.
+        # JSON has no numbers that are not finite, such as the volume of a mesh with broken vertices.
         values = {name: _plain(value) for name, value in findings.as_dict().items()}
         print(json.dumps({"file": str(path), **values}, indent=2))
     else:
@@ -57,7 +56,6 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# ``gnrecon eval MESH --reference FILE``: how far a mesh lies from the surface that it should be.
 def evaluate(
     path: Path, reference: Path, *, samples: int, seed: int, report: Path | None = None, overwrite: bool = False
 ) -> int:
@@ -90,7 +88,6 @@ def evaluate(
     return ExitCode.OK
 
 
-# ``gnrecon convert IN OUT``: any mesh or cloud in another format, unchanged; what is lost on the way is named.
 def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool = False) -> int:
     """Write what a file holds in the format that the target's extension names, and return the exit code 0.
 
@@ -123,14 +120,14 @@ def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]
     lost: list[str] = []
 
     def compare(path: Path) -> None:
-        lost.extend(losses(found, read_any(path)[0]))
+        lost.extend(round_trip_losses(found, read_any(path)[0]))
 
     if isinstance(found, Mesh) and target.suffix.lower() in writable():
-        unheld = [name for name, values in found.attributes.items() if not holds(target, name, values)]
+        unheld = [name for name, values in found.attributes.items() if not supports_attribute(target, name, values)]
         write_mesh(found, target, overwrite, compare)
         origin = written_origin(found, target)
-        lost += [] if origin is None else [told(origin)]
-        lost += unverified(target)
+        lost += [] if origin is None else [origin_remark(origin)]
+        lost += unverified_remark(target)
         lost += [f"The format has no place for {', '.join(unheld)} of the vertices; PLY has."] if unheld else []
     else:
         cloud = PointCloud(found.vertices, found.normals, found.attributes) if isinstance(found, Mesh) else found

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.field.networks import Siren
-from gnrecon.field.random_features import DEGREES_OF_FREEDOM, Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.initialisation import Spectrum
@@ -128,7 +129,9 @@ def smooth_spectrum(
 
     It is that of the detail's features, with which the length is chosen, too.
     """
-    return Spectrum(max(length, parameters.least_length_spacings * scene.coarse.spacing), DEGREES_OF_FREEDOM)
+    return Spectrum(
+        max(length, parameters.least_length_spacings * scene.coarse.spacing), FieldParameters.degrees_of_freedom
+    )
 
 
 def global_smoothness(

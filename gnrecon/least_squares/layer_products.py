@@ -208,8 +208,8 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         and only the sums have that of `like`
     size : number of columns of J
     like : tensor whose dtype and device are used
-    block_columns : columns of a block; measured, large enough for the full rate of matrix products and small enough
-        that the blocks on the diagonal waste little
+    block_columns : columns of a block; large enough for fast matrix products, and small enough that little is computed
+        above the diagonal
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
     for rows in chunks:

@@ -10,9 +10,9 @@ def test_every_reason_has_its_bar() -> None:
     bars = {bar.fact.label: bar for bar in ingest({"ingest": counts})}
     assert list(bars) == [
         "read",
-        "copies, of a scan that is there twice",
+        "in a repeated copy of the scan",
         "in isolated clusters",
-        "held out to check the fit",
+        "held out for validation",
         "fitted",
     ]
     assert bars["in isolated clusters"].width == 0.05
