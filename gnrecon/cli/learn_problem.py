@@ -31,7 +31,7 @@ from gnrecon.shape_learning import (
     learn,
     mesh_of,
 )
-from gnrecon.shape_learning.design import Design, DesignFacts, judge
+from gnrecon.shape_learning.design import Design, DesignMeasurement, measure_design
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def run_learn(
             steps=options.steps,
             seed=options.seed,
             wider=options.wider,
-            heard=(lambda found: _say(console, measurement_text(found))) if verbose else None,
+            callback=(lambda found: _say(console, measurement_text(found))) if verbose else None,
         )
         rng = np.random.default_rng(options.seed)
         if design is None:
@@ -115,7 +115,7 @@ def run_learn(
         else:
             mesh, notes = part_mesh(learned.field, design, options.resolution, options.curvature, rng)
     facts = require_sound(mesh) if design is not None or verify(mesh).closed else require_bordered(mesh)
-    design_facts = None if design is None else judge(mesh, design, rng)
+    design_facts = None if design is None else measure_design(mesh, design, rng)
     values = _report(problem, options, learned, facts, design_facts, command)
     notes += _write(output, report, mesh, values, overwrite)
     if design_facts is not None:
@@ -187,7 +187,7 @@ def _report(
     options: LearnOptions,
     learned: Learned,
     facts: MeshFacts,
-    design: DesignFacts | None,
+    design: DesignMeasurement | None,
     command: str | None,
 ) -> dict[str, Any]:
     """The report of a run, ready for JSON; losses and Chamfer distances first."""

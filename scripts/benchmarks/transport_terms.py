@@ -26,7 +26,7 @@ from gnrecon.level_set import derivative_along, sample_surface, transported
 from gnrecon.optim import Problem, StopRule
 from gnrecon.residuals import Linearised, SecondOrder, mean_curvature
 from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.shape_learning import OPTIMISERS, PROBLEMS, Drawn, Moment, ShapeProblem, Term
+from gnrecon.shape_learning import OPTIMISERS, PROBLEMS, SampledPoints, ShapeProblem, StepState, Term
 from gnrecon.shape_learning.learn import pretrained
 from gnrecon.shape_learning.result import measure
 
@@ -103,8 +103,8 @@ def still(problem: ShapeProblem) -> ShapeProblem:
     """Return the problem with surface points that do not move."""
 
     def stays(term: Term) -> Term:
-        def draw(moment: Moment) -> Drawn:
-            return replace(term.sampler(moment), on_surface=False)
+        def draw(state: StepState) -> SampledPoints:
+            return replace(term.sampler(state), on_surface=False)
 
         return replace(term, sampler=draw)
 
