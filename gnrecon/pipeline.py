@@ -154,7 +154,7 @@ def reconstruct(
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
     reference : path, Mesh, PointCloud, or another library's, optional
-        MeshedScan to measure the mesh against.
+        Known surface to measure the mesh against.
     format : str, optional
         Format of the scan's file, such as ``"ply"``; by default its extension.
     progress : Progress, optional
