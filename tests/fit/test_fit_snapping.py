@@ -105,7 +105,7 @@ def test_exact_points_stay_and_their_tilted_normals_are_righted() -> None:
     assert on.mean() > 0.9
     np.testing.assert_allclose(found.points[on], exact[0][on], atol=1e-3)
     turned = np.einsum("nd,nd->n", found.normals, exact[1])[on]
-    assert np.mean(turned > 1 - 1e-5) > 0.99  # but for some beside an edge
+    assert np.mean(turned > 1 - 1e-5) > 0.99  # except some near an edge
 
 
 def test_no_point_is_snapped_beyond_an_edge() -> None:
@@ -134,7 +134,7 @@ def test_single_points_farther_off_than_noise_is_are_snapped_too() -> None:
 
 @pytest.mark.parametrize("by", [2 * NOISE, 5 * NOISE, 10 * NOISE, 20 * NOISE])
 def test_a_face_that_bulges_is_not_flattened(by: float) -> None:
-    """Averaging knows it well; pieces of cylinders that the noise cannot rule out would be off by half of it."""
+    """Averaging keeps the bulge; pieces of cylinders, which noise does not rule out, would miss half of it."""
     exact, upper = bulged(4000, by)
     scan = noisy(exact)
     found = of(scan)
