@@ -51,7 +51,7 @@ from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
 from gnrecon.version import __version__
-from gnrecon.vertex_attributes import Sources, adorn, fitting, wanted
+from gnrecon.vertex_attributes import AttributeSources, compute_attributes, requested_names, without_unsupported
 
 _log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Reconstruction:
         """
         # Only trimming makes a mesh open, and the file is verified as the mesh was.
         bordered = not self.report["mesh"]["closed"]
-        mesh = fitting(self.mesh, Path(path), self.report["options"]["attributes"])
+        mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
         return write_mesh(mesh, path, overwrite, verify=lambda written: _verify(written, bordered))
 
     def to_trimesh(self) -> Any:
@@ -154,7 +154,7 @@ def reconstruct(
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
     reference : path, Mesh, PointCloud, or another library's, optional
-        MeshedScan to measure the mesh against.
+        Known surface to measure the mesh against.
     format : str, optional
         Format of the scan's file, such as ``"ply"``; by default its extension.
     progress : Progress, optional
@@ -227,7 +227,7 @@ def _read(run: _Run, source: Any, normals: Any, format: str | None, reference: A
         cloud, reading = read_source(source, normals, format, run.options.read_points, run.options.region())
         run.progress.advance(0.5)
         scan = ScanRead(cloud, reading, _reference(reference))
-    wanted(cloud, run.options.attributes)  # a misspelt name is refused before the work
+    requested_names(cloud, run.options.attributes)  # a misspelt name is refused before the work
     return scan
 
 
@@ -298,8 +298,10 @@ def _finish(
     with run.stages("attributes"):
         distances = surface.neighbourhood.distances(mesh.vertices)
         unsupported = invented(mesh, distances, surface.spacing)
-        sources = Sources(mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options)
-        mesh, attributes, remarks = adorn(sources, run.progress.advance)
+        sources = AttributeSources(
+            mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options
+        )
+        mesh, attributes, remarks = compute_attributes(sources, run.progress.advance)
     run.remark([*(unsupported.describe() if trimming is None else []), *remarks])
     finished = FinishedMesh(mesh, facts, unsupported, attributes, None)
     if scan.reference is not None:
