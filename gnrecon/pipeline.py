@@ -18,21 +18,21 @@ import torch
 
 from gnrecon.export import (
     Attribute,
-    Invented,
     MeshFacts,
     Metrics,
     Neighbourhood,
     Trimming,
-    invented,
+    UnsupportedArea,
     measure,
     quality,
     require_bordered,
     require_sound,
     trim,
+    unsupported_area,
     verify_file,
     vertex_error,
 )
-from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
@@ -250,7 +250,7 @@ def _run(
     if unseen is not None:
         remark(f"At {counts.held_out} points that the fit never saw: {unseen.describe()}")
     if free and options.resolution is not None:
-        options = replace(options, resolution=fine_enough(sdf, options.resolution))
+        options = replace(options, resolution=cells_for_curvature(sdf, options.resolution))
     # The field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, options.mesh(), data=sdf.data, stages=stages, advance=progress.advance)
     mesh, actions = meshed.mesh, meshed.actions
@@ -267,7 +267,7 @@ def _run(
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with stages("attributes"):
         distances = around.distances(mesh.vertices)
-        unsupported = invented(mesh, distances, spacing)
+        unsupported = unsupported_area(mesh, distances, spacing)
         sources = Sources(mesh, sdf, cloud, around, distances, samples, options)
         mesh, attributes, remarks = adorn(sources, progress.advance)
     for sentence in [*(unsupported.describe() if trimming is None else []), *remarks]:
@@ -359,7 +359,7 @@ def _out_of_memory(error: Exception) -> MemoryLimitError:
     )
 
 
-def _surface(mesh: Mesh, facts: MeshFacts, unsupported: Invented, trimming: Trimming | None) -> dict[str, Any]:
+def _surface(mesh: Mesh, facts: MeshFacts, unsupported: UnsupportedArea, trimming: Trimming | None) -> dict[str, Any]:
     """What the mesh is and what was cut off it, as plain values; an open one has no volume."""
     guarantee = "closed, oriented 2-manifold" if facts.closed else "oriented edge-manifold with borders"
     found = {**facts.as_dict(), **unsupported.as_dict(), "guarantee": guarantee, "quality": quality(mesh).as_dict()}

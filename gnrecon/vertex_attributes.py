@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
+from gnrecon.export import Attribute, Neighbourhood, curvatures, interpolate_from_samples, transfer_attributes
 from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -131,9 +131,9 @@ def _carried(sources: Sources) -> Made:
     """Whatever the scan holds of its points."""
     names = [name for name in wanted(sources.cloud, sources.options.attributes) if name in sources.cloud.attributes]
     if "distance" not in names:
-        return carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+        return transfer_attributes(sources.mesh.vertices, sources.cloud, names, sources.around)
     names.remove("distance")
-    attributes, sentences = carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+    attributes, sentences = transfer_attributes(sources.mesh.vertices, sources.cloud, names, sources.around)
     return attributes, [*sentences, "The points' attribute 'distance' gives way to the distance from the points."]
 
 
@@ -161,7 +161,7 @@ def _sigma(sources: Sources) -> Made:
         return [], ["There is no sigma, because the data does not determine the field's parameters."]
     carried = "sigma" in wanted(sources.cloud, sources.options.attributes)
     remarks = ["The points' attribute 'sigma' gives way to the standard deviation of the surface."] * carried
-    sigma = sparsely(uncertainty.sigma, sources.mesh)
+    sigma = interpolate_from_samples(uncertainty.sigma, sources.mesh)
     return [Attribute("sigma", sigma, f"Laplace approximation, {uncertainty.describe()}")], remarks
 
 

@@ -27,7 +27,7 @@ FEW = 64
 
 
 @dataclass(frozen=True)
-class _Way:
+class _Transfer:
     """How an attribute is carried: made ready, of shape (N, C); mixed, of shapes (V, K, C) and (V, K); turned back."""
 
     how: str
@@ -36,7 +36,7 @@ class _Way:
     back: Callable[[Values], Values]
 
 
-def carry(
+def transfer_attributes(
     vertices: Float, cloud: PointCloud, names: Sequence[str], around: Neighbourhood
 ) -> tuple[list[Attribute], list[str]]:
     """Return attributes of a cloud for the vertices of a mesh.
@@ -63,7 +63,7 @@ def carry(
         for name in names
         if name not in numeric
     ]
-    ways = {name: _way(name, cloud.attributes[name]) for name in numeric}
+    ways = {name: _transfer(name, cloud.attributes[name]) for name in numeric}
     sources = {name: way.ready(cloud.attributes[name].reshape(len(cloud), -1)) for name, way in ways.items()}
     mixed = {name: np.empty((len(vertices), source.shape[1]), source.dtype) for name, source in sources.items()}
     for near in around.near(vertices) if ways else ():
@@ -72,19 +72,19 @@ def carry(
     return [_attribute(name, way, mixed[name], cloud.attributes[name]) for name, way in ways.items()], lost
 
 
-def _attribute(name: str, way: _Way, mixed: Values, source: Values) -> Attribute:
+def _attribute(name: str, way: _Transfer, mixed: Values, source: Values) -> Attribute:
     values = way.back(mixed)
     shaped = values if name == "colors" else values.reshape(len(values), *source.shape[1:])
     return Attribute(name, shaped, f"{way.how} of the {COUNT} nearest points")
 
 
-def _way(name: str, values: Values) -> _Way:
+def _transfer(name: str, values: Values) -> _Transfer:
     kind = values.dtype
     if name == "colors" and values.ndim == 2 and values.shape[1] in (3, 4):
-        return _Way("weighted mean in linear light", lambda v: to_linear(as_bytes(v)), _mean, _srgb)
+        return _Transfer("weighted mean in linear light", lambda v: to_linear(as_bytes(v)), _mean, _srgb)
     if _is_label(name, values):
-        return _Way("greatest weight", lambda v: v, _vote, lambda v: v)
-    return _Way("weighted mean", lambda v: v.astype(np.float64), _mean, lambda v: _rounded(v, kind))
+        return _Transfer("greatest weight", lambda v: v, _vote, lambda v: v)
+    return _Transfer("weighted mean", lambda v: v.astype(np.float64), _mean, lambda v: _rounded(v, kind))
 
 
 def _is_label(name: str, values: Values) -> bool:
@@ -164,7 +164,7 @@ BATCH = 100_000
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class NearestPoints:
     """Nearest points of some places, with weights.
 
     Parameters
@@ -216,14 +216,14 @@ class Neighbourhood:
         apart = radii[radii > 0]
         return float(np.sqrt(np.pi / count) * np.median(apart)) if len(apart) else 0.0
 
-    def near(self, places: Float, count: int = COUNT) -> Iterator[Neighbours]:
+    def near(self, places: Float, count: int = COUNT) -> Iterator[NearestPoints]:
         """Yield the nearest points of places, of shape (V, 3), some places at a time."""
         most = self._tree.n
         for batch in slices(len(places), BATCH):
             found = self._tree.query(places[batch] - self._centre, list(range(1, min(count + 1, most) + 1)))
             distances, rows = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
             kept = slice(None, min(count, most))
-            yield Neighbours(batch, self._rows[rows[:, kept]].astype(np.int64), _weights(distances, count))
+            yield NearestPoints(batch, self._rows[rows[:, kept]].astype(np.int64), _weights(distances, count))
 
 
 def _weights(distances: Float, count: int) -> Float:

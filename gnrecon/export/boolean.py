@@ -90,7 +90,7 @@ def _mesh_of(solid: object, like: Mesh) -> Mesh | None:
     MeshError
         When manifold3d could not do what it was asked.
     """
-    error = refusal(solid)
+    error = manifold_error(solid)
     if error is not None:
         raise MeshError(f"The solid could not be cut: manifold3d says {error}.")
     mesh = from_solid(solid, like)
@@ -136,7 +136,7 @@ def from_solid(solid: Any, like: Mesh) -> Mesh:
     return Mesh(centre + size * data.vert_properties[:, :3], data.tri_verts.astype(np.int64))
 
 
-def refusal(solid: Any) -> str | None:
+def manifold_error(solid: Any) -> str | None:
     """Name of manifold3d's error, or None where it accepts the solid."""
     import manifold3d
 

@@ -61,7 +61,7 @@ TOLERANCE, MOST_STEPS = 1e-6, 500
 # Source: Desbrun, Meyer, Schroeder and Barr, Implicit fairing of irregular meshes (SIGGRAPH 1999).
 
 
-def diffused(mesh: Mesh, values: Float, width: float) -> Float:
+def diffuse(mesh: Mesh, values: Float, width: float) -> Float:
     """Return values, of shape (V,), averaged over a width, in units of the vertices, along the surface."""
     areas = vertex_areas(mesh)
     # A vertex without area would be tied to nothing.
@@ -114,7 +114,7 @@ TURN = 4.0
 # Source: Shepard, A two-dimensional interpolation function for irregularly-spaced data (1968).
 
 
-def sparsely(quantity: Callable[[Float], Float], mesh: Mesh, most: int = MOST, seed: int = 0) -> Float:
+def interpolate_from_samples(quantity: Callable[[Float], Float], mesh: Mesh, most: int = MOST, seed: int = 0) -> Float:
     """Return a positive quantity at all vertices of a mesh, of shape (V,).
 
     Parameters

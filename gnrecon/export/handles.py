@@ -83,9 +83,9 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     require_sound(mesh)
     if len(points) < 2:
         return mesh, []
-    support, rng = _Support(points), np.random.default_rng(0)
-    mesh, lengths = _cut_bare(mesh, support, rng)
-    mesh, more = _cut_unseen(mesh, support, rng)
+    support, rng = _PointSupport(points), np.random.default_rng(0)
+    mesh, lengths = _cut_uncovered_loops(mesh, support, rng)
+    mesh, more = _cut_unsupported_necks(mesh, support, rng)
     lengths += more
     if not lengths:
         return mesh, []
@@ -93,25 +93,25 @@ def remove_handles(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     return mesh, [f"Removed {handles} that no points support, of up to {max(lengths):.3g} around."]
 
 
-def _cut_bare(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tuple[Mesh, list[float]]:
+def _cut_uncovered_loops(mesh: Mesh, support: _PointSupport, rng: np.random.Generator) -> tuple[Mesh, list[float]]:
     """Cut along short loops whose points leave more bare than they may, and return the loops' lengths, too."""
     lengths: list[float] = []
     disks, sought = support.disks(mesh), np.ones(len(mesh.vertices), dtype=bool)
     for _ in range(ROUNDS):
-        bare = support.bare(mesh, disks, short_loops(mesh, BARE[-1][0] * RIM * disks, sought, rng))
-        loops = _apart(mesh, bare)
-        cut = _without(mesh, loops, support)
+        uncovered = support.uncovered(mesh, disks, short_loops(mesh, BARE[-1][0] * RIM * disks, sought, rng))
+        loops = _independent(mesh, uncovered)
+        cut = _cut_and_cap(mesh, loops, support)
         if cut is None:
             break
         lengths += [loop.length for loop in loops]
         # Those that are left lie near some that were found, which hid them or lay too near to be cut at once.
-        places = cKDTree(np.concatenate([mesh.vertices[loop.vertices] for loop in bare]))
+        places = cKDTree(np.concatenate([mesh.vertices[loop.vertices] for loop in uncovered]))
         mesh, disks = cut, support.disks(cut)
         sought = places.query(mesh.vertices)[0] <= RIM * disks
     return mesh, lengths
 
 
-def _cut_unseen(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tuple[Mesh, list[float]]:
+def _cut_unsupported_necks(mesh: Mesh, support: _PointSupport, rng: np.random.Generator) -> tuple[Mesh, list[float]]:
     """Cut along longer loops around necks that no point is near, and return the loops' lengths, too."""
     lengths: list[float] = []
     for _ in range(ROUNDS):
@@ -121,8 +121,10 @@ def _cut_unseen(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tupl
             break
         found = short_loops(mesh, UNSEEN * RIM * disks, unseen, rng)
         normals = mesh.vertex_normals()
-        loops = _apart(mesh, [loop for loop in found if unseen[loop.vertices].all() and _is_neck(mesh, normals, loop)])
-        cut = _without(mesh, loops, support)
+        loops = _independent(
+            mesh, [loop for loop in found if unseen[loop.vertices].all() and _is_neck(mesh, normals, loop)]
+        )
+        cut = _cut_and_cap(mesh, loops, support)
         if cut is None:
             break
         lengths += [loop.length for loop in loops]
@@ -130,7 +132,7 @@ def _cut_unseen(mesh: Mesh, support: _Support, rng: np.random.Generator) -> tupl
     return mesh, lengths
 
 
-class _Support:
+class _PointSupport:
     """What points tell of a surface.
 
     Parameters
@@ -153,9 +155,9 @@ class _Support:
         away, near = self._density.tree.query(mesh.vertices)
         return np.asarray(away), np.asarray(self._density.disks[near])
 
-    def lonely(self, mesh: Mesh) -> Mask:
+    def unsupported(self, mesh: Mesh) -> Mask:
         """Return which vertices, of shape (V,), have no point near on a surface that looks as theirs does."""
-        vertex, upon = self._upon(mesh)
+        vertex, upon = self._on_surface(mesh)
         away, near = self._density.tree.query(mesh.vertices, k=min(AROUND, len(vertex)))
         looks = np.abs(np.einsum("vi,vki->vk", mesh.vertex_normals(), self._normals[near]))
         held = (away < NEAR * self._density.disks[near]) & upon[near] & (looks > ALIKE)
@@ -172,23 +174,23 @@ class _Support:
         spread = around - around.mean(axis=1, keepdims=True)
         return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0])
 
-    def bare(self, mesh: Mesh, disks: Float, loops: Sequence[Loop]) -> list[Loop]:
+    def uncovered(self, mesh: Mesh, disks: Float, loops: Sequence[Loop]) -> list[Loop]:
         """Return the loops that are short, and whose points leave more bare than they may."""
         if not loops:
             return []
-        vertex, upon = self._upon(mesh)
+        vertex, upon = self._on_surface(mesh)
         places, normals = cKDTree(mesh.vertices[vertex[upon]]), mesh.vertex_normals()[vertex[upon]]
         kept = []
         for loop in loops:
             disk = float(disks[loop.vertices].mean())
-            limit = next((bare for length, bare in BARE if loop.length <= length * RIM * disk), None)
+            limit = next((uncovered for length, uncovered in BARE if loop.length <= length * RIM * disk), None)
             if limit is not None:
                 near = np.unique(np.concatenate(places.query_ball_point(mesh.vertices[loop.vertices], NEAR * disk)))
-                if _gap(mesh.vertices[loop.vertices], normals[near.astype(np.int64)]) > limit:
+                if _uncovered_angle(mesh.vertices[loop.vertices], normals[near.astype(np.int64)]) > limit:
                     kept.append(loop)
         return kept
 
-    def _upon(self, mesh: Mesh) -> tuple[Int, Mask]:
+    def _on_surface(self, mesh: Mesh) -> tuple[Int, Mask]:
         """Return the vertex nearest to each point, and which points lie on the surface; both of shape (N,)."""
         away, vertex = cKDTree(mesh.vertices).query(self._density.points)
         return vertex, away < UPON * self._density.disks
@@ -200,7 +202,7 @@ def _is_neck(mesh: Mesh, normals: Float, loop: Loop) -> bool:
     return float(((ring - ring.mean(axis=0)) * normals[loop.vertices]).sum()) > 0
 
 
-def _gap(ring: Float, normals: Float) -> float:
+def _uncovered_angle(ring: Float, normals: Float) -> float:
     """Return the largest angle about a ring's axis into which no normal looks, of shapes (L, 3) and (N, 3)."""
     arms = ring - ring.mean(axis=0)
     axis = np.cross(arms, np.roll(arms, -1, axis=0)).sum(axis=0)
@@ -211,7 +213,7 @@ def _gap(ring: Float, normals: Float) -> float:
     return widest_gap(normals[np.abs(normals @ axis) < ASIDE], axis)
 
 
-def _apart(mesh: Mesh, loops: Sequence[Loop]) -> list[Loop]:
+def _independent(mesh: Mesh, loops: Sequence[Loop]) -> list[Loop]:
     """Return the shortest loops that have no neighbours in common and together do not take the surface apart."""
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     table = csr_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(mesh.vertices),) * 2)
@@ -219,26 +221,26 @@ def _apart(mesh: Mesh, loops: Sequence[Loop]) -> list[Loop]:
     basis: list[int] = []
     kept = []
     for loop in loops:
-        word = loop.word
+        signature = loop.signature
         for one in basis:
-            word = min(word, word ^ one)
+            signature = min(signature, signature ^ one)
         around = np.append(loop.vertices, table[loop.vertices].indices)
-        if word == 0 or used[around].any():
+        if signature == 0 or used[around].any():
             continue
         used[around] = True
-        basis = sorted([*basis, word], reverse=True)
+        basis = sorted([*basis, signature], reverse=True)
         kept.append(loop)
         if len(kept) == TOGETHER:
             break
     return kept
 
 
-def _without(mesh: Mesh, loops: Sequence[Loop], support: _Support) -> Mesh | None:
+def _cut_and_cap(mesh: Mesh, loops: Sequence[Loop], support: _PointSupport) -> Mesh | None:
     """Return the mesh cut along loops and closed again, or None where there are none, or it would not be sound."""
     if not loops:
         return None
-    closed, reach = _capped(mesh, loops)
-    smooth = _laid_out(closed, reach, support.lonely(closed))
+    closed, reach = _cap_loops(mesh, loops)
+    smooth = _fair(closed, reach, support.unsupported(closed))
     try:
         require_sound(smooth)
     except MeshError:
@@ -246,7 +248,7 @@ def _without(mesh: Mesh, loops: Sequence[Loop], support: _Support) -> Mesh | Non
     return smooth
 
 
-def _capped(mesh: Mesh, loops: Sequence[Loop]) -> tuple[Mesh, Float]:
+def _cap_loops(mesh: Mesh, loops: Sequence[Loop]) -> tuple[Mesh, Float]:
     """Return the mesh cut along loops and closed by fans, and the length of the loop of each fan, of shape (C,).
 
     The fans' middles are the last vertices.
@@ -281,7 +283,7 @@ def _capped(mesh: Mesh, loops: Sequence[Loop]) -> tuple[Mesh, Float]:
     return Mesh(np.concatenate([vertices, middles]), faces, normals, attributes), reach
 
 
-def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
+def _fair(mesh: Mesh, reach: Float, unsupported: Mask) -> Mesh:
     """Return a mesh whose caps, and what lies around them, lie smoothly.
 
     Of all layouts that keep the other vertices it has the least sum of squares of each vertex's offset from the mean of
@@ -297,7 +299,7 @@ def _laid_out(mesh: Mesh, reach: Float, lonely: Mask) -> Mesh:
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     away = np.linalg.norm(mesh.vertices[start] - mesh.vertices[end], axis=1)
     caps = np.arange(size - len(reach), size)
-    loose = lonely.copy()
+    loose = unsupported.copy()
     loose[mesh.faces[(mesh.faces >= caps[0]).any(axis=1)]] = True
     along = loose[start] & loose[end]
     paths = csr_array((away, (start, end)), shape=(size, size))

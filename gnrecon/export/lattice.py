@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export.project import SignedDistance, knows_blocks, sdf_around
+from gnrecon.export.project import SignedDistance, evaluates_blocks, sdf_around
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.parallel import slices
@@ -89,14 +89,14 @@ class Lattice:
         MeshError
             When the field is not finite somewhere.
         """
-        return self._closed(self._asked(np.clip(nodes, 0, self.cells), advance), nodes, slope)
+        return self._closed_at_box(self._evaluate(np.clip(nodes, 0, self.cells), advance), nodes, slope)
 
-    def together(self, nodes: int) -> int:
+    def blocks_per_batch(self, nodes: int) -> int:
         """Return how many blocks of so many nodes the field is asked for at once."""
-        return max(1, self.batch // (PER_BLOCK if knows_blocks(self.field) else nodes))
+        return max(1, self.batch // (PER_BLOCK if evaluates_blocks(self.field) else nodes))
 
     def values_of_blocks(self, corners: Int, offsets: Int, slope: float) -> Float:
-        """Return what `values` does, of shape (N, K), at K offsets from the corners of blocks, as many as `together`.
+        """Return what `values` does, of shape (N, K), at K offsets from N corners, at most `blocks_per_batch` of them.
 
         Parameters
         ----------
@@ -119,10 +119,10 @@ class Lattice:
         out[within] = sdf_around(self.field, self.world(corners[within]), apart)
         if not within.all():
             clipped = np.minimum(nodes[~within], self.cells).reshape(-1, 3)
-            out[~within] = self._asked(clipped).reshape(-1, len(offsets))
-        return self._closed(out, nodes, slope)
+            out[~within] = self._evaluate(clipped).reshape(-1, len(offsets))
+        return self._closed_at_box(out, nodes, slope)
 
-    def _asked(self, nodes: npt.NDArray[np.floating] | Int, advance: ProgressCallback = ignore_progress) -> Float:
+    def _evaluate(self, nodes: npt.NDArray[np.floating] | Int, advance: ProgressCallback = ignore_progress) -> Float:
         """Return the field in file units, of shape (N,), at lattice coordinates of shape (N, 3)."""
         out = np.empty(len(nodes))
         for rows in slices(len(nodes), self.batch):
@@ -130,7 +130,7 @@ class Lattice:
             advance(rows.stop / len(nodes))
         return out
 
-    def _closed(self, values: Float, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
+    def _closed_at_box(self, values: Float, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
         """Return the field in cells over its slope, closed at the box, by its values in file units."""
         if not np.isfinite(values).all():
             count = np.count_nonzero(~np.isfinite(values))

@@ -29,7 +29,7 @@ Values = npt.NDArray[np.float32]
 Item = TypeVar("Item", np.int32, np.float32)
 
 
-class Growing(Generic[Item]):
+class GrowingArray(Generic[Item]):
     """An array to which rows are appended; it grows by half, so that a row costs the same however many there are."""
 
     def __init__(self, first: npt.NDArray[Item]) -> None:
@@ -52,7 +52,7 @@ class Growing(Generic[Item]):
         return np.arange(start, self._count, dtype=np.int32)
 
 
-class Leaves:
+class LeafStore:
     """Values at the nodes of a lattice, where they are known, else a sign.
 
     Parameters
@@ -66,9 +66,9 @@ class Leaves:
     def __init__(self, chunks: Int, limit: float) -> None:
         self._index: Rows = np.full(chunks + 1, OUTSIDE, dtype=np.int32)
         uniform = np.array([OUTSIDE, INSIDE], dtype=np.int32)[:, None, None, None]
-        self._tables = Growing(np.broadcast_to(uniform, (FIRST, SIDE, SIDE, SIDE)))
+        self._tables = GrowingArray(np.broadcast_to(uniform, (FIRST, SIDE, SIDE, SIDE)))
         signs = np.array([limit, -limit], dtype=np.float32)[:, None, None, None]
-        self._store = Growing(np.broadcast_to(signs, (FIRST, LEAF, LEAF, LEAF)))
+        self._store = GrowingArray(np.broadcast_to(signs, (FIRST, LEAF, LEAF, LEAF)))
 
     def __len__(self) -> int:
         """How many leaves have values."""
@@ -85,7 +85,7 @@ class Leaves:
         for offset in itertools.product(range(size // LEAF), repeat=3):
             self._point(blocks * (size // LEAF) + offset, np.full(len(blocks), INSIDE, dtype=np.int32))
 
-    def keep(self, leaves: Int, values: Values) -> None:
+    def store(self, leaves: Int, values: Values) -> None:
         """Keep the values, of shape (N, 4, 4, 4), at the lower corners of the cells of leaves of shape (N, 3)."""
         self._point(leaves, self._store.append(values))
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaf_storage import CHUNK, Values
 from gnrecon.export.project import SignedDistance
-from gnrecon.export.sparse_grid import Band, narrow_band
+from gnrecon.export.sparse_grid import NarrowBand, narrow_band
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
@@ -76,11 +76,11 @@ def extract(
             f"The field has no zero level among the {' x '.join(str(n + 1) for n in lattice.cells)} points of its box, "
             f"so there is no surface to mesh."
         )
-    return _stitched(lattice, pieces)
+    return _stitch(lattice, pieces)
 
 
 @dataclass(frozen=True)
-class Piece:
+class ChunkMesh:
     """The surface within one chunk.
 
     Parameters
@@ -93,11 +93,11 @@ class Piece:
     """
 
     names: Int
-    places: Float
+    positions: Float
     faces: npt.NDArray[np.int32]
 
 
-def _march_all(band: Band, advance: ProgressCallback) -> list[Piece]:
+def _march_all(band: NarrowBand, advance: ProgressCallback) -> list[ChunkMesh]:
     pieces = []
     chunks = band.leaves.mixed_chunks()
     for number, chunk in enumerate(chunks, 1):
@@ -109,7 +109,7 @@ def _march_all(band: Band, advance: ProgressCallback) -> list[Piece]:
     return pieces
 
 
-def _march(band: Band, chunk: Int) -> Piece | None:
+def _march(band: NarrowBand, chunk: Int) -> ChunkMesh | None:
     """Run marching cubes on one chunk; None where nothing crosses."""
     from skimage import measure
 
@@ -122,13 +122,13 @@ def _march(band: Band, chunk: Int) -> Piece | None:
     # Rounding along the edge's own axis must go down, across it to the node that the coordinate already is.
     nodes = np.floor(rough).astype(np.int64)
     axis = np.where(on_axis.sum(axis=1) == 1, on_axis.argmax(axis=1), 3)
-    places = rough.astype(np.float64)
+    positions = rough.astype(np.float64)
     edges = np.flatnonzero(axis < 3)
-    places[edges, axis[edges]] = nodes[edges, axis[edges]] + _crossings(values, nodes[edges], axis[edges])
+    positions[edges, axis[edges]] = nodes[edges, axis[edges]] + _crossings(values, nodes[edges], axis[edges])
     nodes += chunk * CHUNK
     sides = band.lattice.cells + 1
     names = ((nodes[:, 0] * sides[1] + nodes[:, 1]) * sides[2] + nodes[:, 2]) * 4 + axis
-    return Piece(names, places + chunk * CHUNK, faces.astype(np.int32))
+    return ChunkMesh(names, positions + chunk * CHUNK, faces.astype(np.int32))
 
 
 def _crossings(values: Values, nodes: Int, axis: Int) -> Float:
@@ -139,7 +139,7 @@ def _crossings(values: Values, nodes: Int, axis: Int) -> Float:
     return crossings
 
 
-def _stitched(lattice: Lattice, pieces: list[Piece]) -> Mesh:
+def _stitch(lattice: Lattice, pieces: list[ChunkMesh]) -> Mesh:
     """Join the pieces by the names of their vertices; the list is emptied, because both would take twice the memory."""
     _, first, inverse = np.unique(
         np.concatenate([piece.names for piece in pieces]), return_index=True, return_inverse=True
@@ -150,7 +150,7 @@ def _stitched(lattice: Lattice, pieces: list[Piece]) -> Mesh:
     while pieces:
         piece = pieces.pop(0)
         rows = slice(start, start + len(piece.names))
-        vertices[inverse[rows]] = lattice.world(piece.places)
+        vertices[inverse[rows]] = lattice.world(piece.positions)
         faces[done : done + len(piece.faces)] = inverse[rows][piece.faces]
         done, start = done + len(piece.faces), rows.stop
     return Mesh(vertices, faces)

@@ -16,7 +16,13 @@ import numpy as np
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.export.project import sdf_and_gradient
-from gnrecon.export.resolution import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
+from gnrecon.export.resolution import (
+    MOST_REFINED,
+    Fineness,
+    measure_fineness,
+    projected_chord_error,
+    refined_resolution,
+)
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -54,7 +60,7 @@ class MeshedField(SignedDistance, Protocol):
         ...
 
 
-def fine_enough(sdf: NeuralSDF, cells: int) -> int:
+def cells_for_curvature(sdf: NeuralSDF, cells: int) -> int:
     """Return the cells, or up to 224 so that faces are no farther off the surface than the field itself may be.
 
     How much of the shape the smooth global field leaves over to the detail at the data tells how far it is off between
@@ -125,7 +131,7 @@ def mesh_field(
     """
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
-        mesh, fast, cells, dropped = _extracted(field, options, data, box, advance)
+        mesh, fast, cells, dropped = _extract_until_accurate(field, options, data, box, advance)
     with stages("project"):
         mesh = project(mesh, field, steps=2, rough=None if fast is field else fast, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
@@ -139,10 +145,10 @@ def mesh_field(
         if data is not None and not options.keep_handles:
             mesh, cut = remove_handles(mesh, data)
         fineness = measure_fineness(mesh, field, cells, box)
-    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *_said(fineness, options)])
+    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *_resolution_sentences(fineness, options)])
 
 
-def _extracted(
+def _extract_until_accurate(
     field: MeshedField, options: MeshOptions, data: Float | None, box: Float, advance: ProgressCallback
 ) -> tuple[Mesh, SignedDistance, int, list[str]]:
     """Extract, and again with more cells until the error is small enough.
@@ -153,18 +159,18 @@ def _extracted(
     while True:
         # How often is not known before: each attempt gets half of what is left of the stage.
         end = 1.0 if options.max_error is None else (begin + 1.0) / 2
-        fast = field if data is None else _coarse(field, data, cells)
+        fast = field if data is None else _single_precision_field(field, data, cells)
         mesh = extract(fast, resolution=cells, bounds=box, data=data, advance=part(advance, begin, end))
         mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
         if options.max_error is None or cells >= MOST_REFINED:
             return mesh, fast, cells, dropped
-        error = error_once_projected(mesh, field, cells, box)
+        error = projected_chord_error(mesh, field, cells, box)
         if error <= SAFE * options.max_error:
             return mesh, fast, cells, dropped
-        cells, begin = min(finer(cells, error, SAFE * options.max_error), MOST_REFINED), end
+        cells, begin = min(refined_resolution(cells, error, SAFE * options.max_error), MOST_REFINED), end
 
 
-def _said(fineness: Fineness, options: MeshOptions) -> list[str]:
+def _resolution_sentences(fineness: Fineness, options: MeshOptions) -> list[str]:
     """Tell what became of an edge length or a greatest error that was asked for."""
     if options.edge_length is None and options.max_error is None:
         return []
@@ -175,7 +181,7 @@ def _said(fineness: Fineness, options: MeshOptions) -> list[str]:
     return said
 
 
-def _coarse(field: MeshedField, data: Float, resolution: int) -> SignedDistance:
+def _single_precision_field(field: MeshedField, data: Float, resolution: int) -> SignedDistance:
     """Return the field in single precision where vertices and normals come out well enough by it; projection by the
     field's own values makes the vertices exact.
 

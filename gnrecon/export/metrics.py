@@ -85,7 +85,7 @@ def measure(
 
 
 @dataclass(frozen=True)
-class Samples:
+class SurfaceSamples:
     """Points of shape (N, 3), in file units, with unit normals of the surface there, if it has any."""
 
     points: Float
@@ -93,14 +93,14 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class _Gap:
+class _Distances:
     """Distances of shape (N,) from samples to a target, and the mean |cosine| of the normals there."""
 
     distances: Float
     consistency: float | None
 
 
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Samples:
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> SurfaceSamples:
     """Draw `count` points on a mesh, uniformly by area, with the normals of their faces."""
     vectors = mesh.face_vectors
     areas = np.linalg.norm(vectors, axis=1)
@@ -111,27 +111,27 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Samples:
     root, along = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
     points = np.einsum("ij,ijk->ik", weights, mesh.corners[faces])
-    return Samples(points, vectors[faces] / areas[faces, None])
+    return SurfaceSamples(points, vectors[faces] / areas[faces, None])
 
 
-def _samples_of_cloud(cloud: PointCloud) -> Samples:
+def _samples_of_cloud(cloud: PointCloud) -> SurfaceSamples:
     if cloud.normals is None:
-        return Samples(cloud.points, None)
+        return SurfaceSamples(cloud.points, None)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return Samples(cloud.points, cloud.normals / lengths)
+    return SurfaceSamples(cloud.points, cloud.normals / lengths)
 
 
-def _to_surface(samples: Samples, mesh: Mesh) -> _Gap:
+def _to_surface(samples: SurfaceSamples, mesh: Mesh) -> _Distances:
     distances, faces = nearest_on_surface(mesh, samples.points)
     vectors = mesh.face_vectors[faces]
     lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return _Gap(distances, _consistency(samples.normals, vectors / lengths))
+    return _Distances(distances, _consistency(samples.normals, vectors / lengths))
 
 
-def _to_points(samples: Samples, target: Samples) -> _Gap:
+def _to_points(samples: SurfaceSamples, target: SurfaceSamples) -> _Distances:
     distances, rows = cKDTree(target.points).query(samples.points)
     normals = None if target.normals is None else target.normals[rows]
-    return _Gap(distances, _consistency(samples.normals, normals))
+    return _Distances(distances, _consistency(samples.normals, normals))
 
 
 def _consistency(ours: Float | None, theirs: Float | None) -> float | None:
@@ -140,7 +140,7 @@ def _consistency(ours: Float | None, theirs: Float | None) -> float | None:
     return float(np.abs(np.einsum("ij,ij->i", ours, theirs)).mean())
 
 
-def _summary(there: _Gap, back: _Gap, radius: float, samples: int, is_cloud: bool) -> Metrics:
+def _summary(there: _Distances, back: _Distances, radius: float, samples: int, is_cloud: bool) -> Metrics:
     """Put the numbers together; `there` leads from the reference to the mesh, `back` the other way."""
     threshold = F_SCORE_SHARE * radius
     precision, recall = (float((gap.distances <= threshold).mean()) for gap in (back, there))
@@ -271,7 +271,7 @@ def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:
         share of its spacing.
     """
     if isinstance(reference, Mesh):
-        feet = Surface(reference).nearest(mesh.vertices)[0]
+        feet = SurfaceQuery(reference).nearest(mesh.vertices)[0]
     else:
         feet = reference.points[cKDTree(reference.points).query(mesh.vertices)[1]]
     away = mesh.vertices - feet
@@ -301,7 +301,7 @@ def ray_scene(vertices: Float, faces: Int) -> Any:
     return scene
 
 
-class Surface:
+class SurfaceQuery:
     """A mesh with faces, ready for many queries.
 
     Parameters
@@ -344,5 +344,5 @@ class Surface:
 
 def nearest_on_surface(mesh: Mesh, points: Float, batch: int = 1_000_000) -> tuple[Float, Int]:
     """Distance to a surface, in its units, and the nearest face, for points of shape (N, 3)."""
-    feet, faces = Surface(mesh, batch).nearest(points)
+    feet, faces = SurfaceQuery(mesh, batch).nearest(points)
     return np.linalg.norm(points - feet, axis=1), faces

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from gnrecon.export.boolean import centre_and_size
-from gnrecon.export.metrics import Surface
+from gnrecon.export.metrics import SurfaceQuery
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
@@ -57,8 +57,8 @@ class OffsetField:
             )
 
     @cached_property
-    def _surface(self) -> Surface:
-        return Surface(self.mesh)
+    def _surface(self) -> SurfaceQuery:
+        return SurfaceQuery(self.mesh)
 
     def single(self) -> OffsetField:
         """Return this field, which is fast as it is."""

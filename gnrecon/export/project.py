@@ -83,9 +83,9 @@ def project(
     value = np.empty(len(moved))
     gradient = np.empty_like(moved)
     for rows in slices(len(moved), batch):
-        moved[rows], value[rows], gradient[rows] = newton(mesh.vertices[rows], field, steps, limit, rough)
+        moved[rows], value[rows], gradient[rows] = newton_project(mesh.vertices[rows], field, steps, limit, rough)
         advance(rows.stop / len(moved))
-    back = _undo_turned(mesh, moved)
+    back = _vertices_to_restore(mesh, moved)
     moved[back] = mesh.vertices[back]
     result = Mesh(moved, mesh.faces)
     normals = result.vertex_normals()
@@ -106,7 +106,7 @@ def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     return lengths.reshape(-1)
 
 
-def newton(
+def newton_project(
     start: Float, field: SignedDistance, steps: int, limit: float, rough: SignedDistance | None = None
 ) -> tuple[Float, Float, Float]:
     """Points of shape (N, 3) after Newton steps no farther than `limit` from `start`, with value and gradient there.
@@ -118,7 +118,7 @@ def newton(
     if rough is not None and steps:
         value = field.sdf(points)
     for _ in range(steps):
-        rows, trial = _steps(points, value, gradient, start, limit, field.bounds)
+        rows, trial = _newton_steps(points, value, gradient, start, limit, field.bounds)
         if not len(rows):
             break
         trial_value = field.sdf(trial)
@@ -132,7 +132,7 @@ def newton(
     return points, value, gradient
 
 
-def _steps(
+def _newton_steps(
     points: Float, value: Float, gradient: Float, start: Float, limit: float, bounds: Float
 ) -> tuple[Int, Float]:
     """Rows that may take a Newton step, of shape (S,), and where it leads them, of shape (S, 3)."""
@@ -146,7 +146,7 @@ def _steps(
     return rows[near], trial[near]
 
 
-def _undo_turned(mesh: Mesh, moved: Float) -> Mask:
+def _vertices_to_restore(mesh: Mesh, moved: Float) -> Mask:
     """Which vertices must stay, of shape (V,), so that no face turns over or collapses.
 
     Every round returns at least one more vertex, and a face whose three vertices have stayed is as before, so it ends.
@@ -157,13 +157,13 @@ def _undo_turned(mesh: Mesh, moved: Float) -> Mask:
         again = np.zeros_like(back)
         for rows in slices(len(mesh.faces)):
             faces = mesh.faces[rows]
-            again[faces[_spoilt(area_vectors(mesh.vertices, faces), area_vectors(now, faces))]] = True
+            again[faces[_flipped_or_collapsed(area_vectors(mesh.vertices, faces), area_vectors(now, faces))]] = True
         if not (again & ~back).any():
             return back
         back |= again
 
 
-def _spoilt(old: Float, new: Float) -> Mask:
+def _flipped_or_collapsed(old: Float, new: Float) -> Mask:
     """Which faces, of shape (F,), have turned over or collapsed, by their old and new area vectors."""
     along = np.einsum("ij,ij->i", old, new)
     before, after = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
@@ -207,7 +207,7 @@ def sdf_and_gradient(field: SignedDistance, points: Float) -> tuple[Float, Float
     return value, gradient
 
 
-def knows_blocks(field: SignedDistance) -> bool:
+def evaluates_blocks(field: SignedDistance) -> bool:
     """Return whether a field makes distances around centres faster than one by one, by a method ``sdf_around``."""
     return hasattr(field, "sdf_around")
 
@@ -215,7 +215,7 @@ def knows_blocks(field: SignedDistance) -> bool:
 def sdf_around(field: SignedDistance, centers: Float, offsets: Float) -> Float:
     """Return the distance, of shape (N, K), at K offsets, of shape (K, 3), from each of the centres, of shape (N, 3).
 
-    A field that knows blocks, see `knows_blocks`, is asked for them.
+    A field that knows blocks, see `evaluates_blocks`, is asked for them.
     """
     around = getattr(field, "sdf_around", None)
     if around is None:
@@ -227,7 +227,7 @@ def sdf_around(field: SignedDistance, centers: Float, offsets: Float) -> Float:
 # Where a mesh of vertices on a surface is farthest from it: at the centres of its faces and the midpoints of edges.
 
 
-def between(corners: Float) -> Float:
+def face_sample_points(corners: Float) -> Float:
     """Return the centres and then the sides' midpoints, of shape (4 F, 3), of faces given by corners of (F, 3, 3)."""
     midpoints = (corners + np.roll(corners, -1, axis=1)) / 2
     return np.concatenate([corners.mean(axis=1), midpoints.reshape(-1, 3)])

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.export.boolean import from_meshlab, from_solid, refusal, to_meshlab, to_solid
+from gnrecon.export.boolean import from_meshlab, from_solid, manifold_error, to_meshlab, to_solid
 from gnrecon.export.mesh_statistics import Edges, corner_fans, face_components, split_vertices, submesh
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.verify import require_sound, verify
@@ -40,24 +40,24 @@ def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
     MeshError
         When no attempt gives a sound mesh; the sentence names what is still wrong.
     """
-    failure = _failure(mesh)
+    failure = _soundness_error(mesh)
     if failure is None:
         return mesh, []
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
         raise MeshError(failure)
-    tidy, actions = _tidy(mesh)
-    result, sewing = _sewn(tidy)
+    tidy, actions = _clean_faces(mesh)
+    result, sewing = _sew(tidy)
     if result is None:
         patched, patching = _patch(tidy)
-        tidy, tidying = _tidy(patched)
-        result, sewing = _sewn(tidy)
+        tidy, tidying = _clean_faces(patched)
+        result, sewing = _sew(tidy)
         actions += patching + tidying
     if result is None:
-        raise MeshError(f"Repair was not enough: {str(_failure(tidy)).replace('The', 'the', 1)}")
+        raise MeshError(f"Repair was not enough: {str(_soundness_error(tidy)).replace('The', 'the', 1)}")
     return _with_normals_of(result, mesh), actions + sewing
 
 
-def _failure(mesh: Mesh) -> str | None:
+def _soundness_error(mesh: Mesh) -> str | None:
     """Why a mesh is not sound, or None."""
     try:
         require_sound(mesh)
@@ -66,10 +66,10 @@ def _failure(mesh: Mesh) -> str | None:
     return None
 
 
-def _tidy(mesh: Mesh) -> tuple[Mesh, list[str]]:
+def _clean_faces(mesh: Mesh) -> tuple[Mesh, list[str]]:
     """Drop faces that bound nothing, split touching fans, turn an inside-out mesh round."""
     actions = []
-    keep = _bounding(mesh)
+    keep = _useful_faces(mesh)
     if not keep.any():
         raise MeshError("The mesh has no face that could bound anything.")
     if not keep.all():
@@ -87,7 +87,7 @@ def _tidy(mesh: Mesh) -> tuple[Mesh, list[str]]:
     return tidy, actions
 
 
-def _bounding(mesh: Mesh) -> Mask:
+def _useful_faces(mesh: Mesh) -> Mask:
     """Which faces, of shape (F,), are left without collapsed ones, repetitions and fins.
 
     A fin hangs on an edge that has two faces without it, and has an open edge itself.
@@ -118,7 +118,7 @@ def _split_fans(mesh: Mesh, edges: Edges) -> Mesh:
     return Mesh(mesh.vertices[origin], faces.reshape(-1, 3), normals)
 
 
-def _set_apart(mesh: Mesh) -> Mesh:
+def _separate_coincident(mesh: Mesh) -> Mesh:
     """Move vertices that lie on one another a little into their own faces, so that no format joins them again."""
     _, place, count = np.unique(mesh.vertices, axis=0, return_inverse=True, return_counts=True)
     shared = count[place.reshape(-1)] > 1
@@ -132,17 +132,17 @@ def _set_apart(mesh: Mesh) -> Mesh:
     )
 
 
-def _sewn(mesh: Mesh) -> tuple[Mesh | None, list[str]]:
+def _sew(mesh: Mesh) -> tuple[Mesh | None, list[str]]:
     """A mesh as it is if it is sound, else with its edges sewn and paired by manifold3d; None where that fails too."""
-    apart = _set_apart(mesh)
-    if _failure(apart) is None:
+    apart = _separate_coincident(mesh)
+    if _soundness_error(apart) is None:
         return apart, []
     solid = to_solid(mesh, merge=True)
-    if refusal(solid) is not None or solid.is_empty():
+    if manifold_error(solid) is not None or solid.is_empty():
         return None, []
-    sewn, tidying = _tidy(from_solid(solid, mesh))
-    sewn = _set_apart(sewn)
-    if _failure(sewn) is not None:
+    sewn, tidying = _clean_faces(from_solid(solid, mesh))
+    sewn = _separate_coincident(sewn)
+    if _soundness_error(sewn) is not None:
         return None, []
     change = f"{len(mesh.faces)} faces became {len(sewn.faces)}"
     return sewn, [f"Sewed open and crowded edges with manifold3d; {change}.", *tidying]
@@ -218,27 +218,27 @@ def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     UsageError
         When there are no points.
     """
-    labels, stays, actions = _judged(mesh, points)
+    labels, stays, actions = _vote(mesh, points)
     if stays.all():
         return mesh, []
     parts = [submesh(mesh, labels == label) for label in np.flatnonzero(stays)]
-    oriented = [_oriented(part, [other for other in parts if other is not part]) for part in parts]
+    oriented = [_orient_component(part, [other for other in parts if other is not part]) for part in parts]
     turned = sum(new is not old for new, old in zip(oriented, parts, strict=True))
     if turned:
         actions.append(f"Turned {turned} components round, because the shell around them was dropped.")
-    return _joined(oriented), actions
+    return _concatenate(oriented), actions
 
 
-def drop_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
+def drop_stray_components(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     """Drop the same components of a mesh that may have borders; those that stay keep their sides.
 
     Parameters, what is returned and what is raised are those of `remove_stray`.
     """
-    labels, stays, actions = _judged(mesh, points)
+    labels, stays, actions = _vote(mesh, points)
     return (mesh, []) if stays.all() else (submesh(mesh, stays[labels]), actions)
 
 
-def _judged(mesh: Mesh, points: Float) -> tuple[Int, Mask, list[str]]:
+def _vote(mesh: Mesh, points: Float) -> tuple[Int, Mask, list[str]]:
     """Return each face's component, which components stay, and a sentence about those that do not."""
     if not len(points):
         raise UsageError("There are no points to tell stray components by.")
@@ -259,7 +259,7 @@ def _judged(mesh: Mesh, points: Float) -> tuple[Int, Mask, list[str]]:
     return labels, stays, [said] if dropped else []
 
 
-def _oriented(part: Mesh, others: list[Mesh]) -> Mesh:
+def _orient_component(part: Mesh, others: list[Mesh]) -> Mesh:
     """Turn a component round where its volume's sign does not fit the number of others around it."""
     outer = sum(_encloses(other, part.vertices[0]) for other in others) % 2 == 0
     if (part.volume > 0) == outer:
@@ -284,7 +284,7 @@ def _encloses(shell: Mesh, point: Float) -> bool:
     return bool(abs(half.sum() / (2 * np.pi)) > 0.5)
 
 
-def _joined(parts: list[Mesh]) -> Mesh:
+def _concatenate(parts: list[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     normals = [part.normals for part in parts if part.normals is not None]

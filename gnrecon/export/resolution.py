@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gnrecon.export.project import SignedDistance, between, project, side_lengths
+from gnrecon.export.project import SignedDistance, face_sample_points, project, side_lengths
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
@@ -114,30 +114,30 @@ def chord_error(mesh: Mesh, field: SignedDistance, bounds: Float, cell: float) -
         The box in which the mesh was extracted.
     cell : float, file units
     """
-    corners = mesh.vertices[_some(mesh.faces)]
+    corners = mesh.vertices[_sampled_faces(mesh.faces)]
     inner = ((corners > bounds[0] + cell) & (corners < bounds[1] - cell)).all(axis=(1, 2))
     corners = corners[inner]
     if not len(corners):
         return 0.0
-    points = between(corners)
+    points = face_sample_points(corners)
     slopes = np.linalg.norm(field.gradient(points), axis=1)
     distances = np.abs(field.sdf(points)) / np.maximum(slopes, np.finfo(np.float64).tiny)
     return float(np.quantile(distances, QUANTILE, method="higher"))
 
 
-def error_once_projected(mesh: Mesh, field: SignedDistance, resolution: int, bounds: Float) -> float:
+def projected_chord_error(mesh: Mesh, field: SignedDistance, resolution: int, bounds: Float) -> float:
     """Return what the chord error will be once the mesh is projected, projecting only the faces that are looked at."""
-    used, inverse = np.unique(_some(mesh.faces), return_inverse=True)
+    used, inverse = np.unique(_sampled_faces(mesh.faces), return_inverse=True)
     part = Mesh(mesh.vertices[used], inverse.reshape(-1, 3))
     return measure_fineness(project(part, field, steps=2), field, resolution, bounds).chord_error
 
 
-def _some(faces: Int) -> Int:
+def _sampled_faces(faces: Int) -> Int:
     """At most so many faces as are looked at, spread evenly over the list."""
     return faces[:: max(1, -(-len(faces) // _FACES))]
 
 
-def finer(resolution: int, error: float, wanted: float) -> int:
+def refined_resolution(resolution: int, error: float, wanted: float) -> int:
     """Return the resolution at which a chord error is expected to be below the one that is wanted."""
     factor = _SPARE * math.sqrt(error / wanted)
     # The square law holds once the cells are small beside the features: far leaps are not to be trusted.

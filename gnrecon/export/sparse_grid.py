@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnrecon.export.lattice import Lattice
-from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
+from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, LeafStore, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
@@ -43,7 +43,7 @@ _CHILDREN = np.stack(np.meshgrid(*3 * [np.arange(2)], indexing="ij"), axis=-1).r
 
 
 @dataclass(frozen=True)
-class Blocks:
+class CellBlocks:
     """Cubes of `size` cells a side.
 
     Parameters
@@ -75,16 +75,16 @@ class Blocks:
         """Which have a node of the lattice, of shape (N,)."""
         return np.asarray((self.places * self.size <= lattice.cells).all(axis=1))
 
-    def split(self) -> Blocks:
+    def split(self) -> CellBlocks:
         """The eight children of each, one parent's after the other's."""
-        return Blocks(self.size // 2, (self.places[:, None] * 2 + _CHILDREN).reshape(-1, 3))
+        return CellBlocks(self.size // 2, (self.places[:, None] * 2 + _CHILDREN).reshape(-1, 3))
 
-    def __getitem__(self, rows: slice | Mask) -> Blocks:
-        return Blocks(self.size, self.places[rows])
+    def __getitem__(self, rows: slice | Mask) -> CellBlocks:
+        return CellBlocks(self.size, self.places[rows])
 
 
 @dataclass(frozen=True)
-class Coarse:
+class CoarseGrid:
     """The coarse blocks of a whole box.
 
     Parameters
@@ -100,14 +100,14 @@ class Coarse:
         The median of the gradient's length where the surface may pass.
     """
 
-    blocks: Blocks
+    blocks: CellBlocks
     grid: tuple[int, ...]
     values: Float
     steepest: float
     typical: float
 
     @classmethod
-    def of(cls, lattice: Lattice) -> Coarse:
+    def of(cls, lattice: Lattice) -> CoarseGrid:
         """Evaluate the field at the centres of coarse blocks, and its gradient at some of them.
 
         Raises
@@ -120,7 +120,7 @@ class Coarse:
             size *= 2
         grid = lattice.cells // size + 1
         places = np.stack(np.meshgrid(*map(np.arange, grid), indexing="ij"), axis=-1).reshape(-1, 3)
-        blocks = Blocks(size, places)
+        blocks = CellBlocks(size, places)
         values = lattice.values(blocks.centers, 1.0)
         nearest = np.argsort(np.abs(values), kind="stable")[:_SAMPLES]
         spread = np.arange(0, len(values), -(-len(values) // _SAMPLES))
@@ -131,7 +131,9 @@ class Coarse:
         return cls(blocks, tuple(grid), values, float(np.percentile(slopes, 99.5)), typical)
 
 
-def search(lattice: Lattice, coarse: Coarse, leaves: Leaves, data: Float | None) -> Iterator[tuple[float, Int]]:
+def candidate_leaves(
+    lattice: Lattice, coarse: CoarseGrid, leaves: LeafStore, data: Float | None
+) -> Iterator[tuple[float, Int]]:
     """Yield the leaves, of shape (N, 3), that may hold a zero, by parts, each with the share of the work done after it.
 
     Parameters
@@ -152,16 +154,16 @@ def search(lattice: Lattice, coarse: Coarse, leaves: Leaves, data: Float | None)
     blocks, values = coarse.blocks, coarse.values
     kept = blocks.may_vanish(values, coarse.steepest)
     if data is not None:
-        kept[kept] = _near(data, blocks[kept], lattice)
+        kept[kept] = _near_data(data, blocks[kept], lattice)
     slopes = _slopes(lattice, blocks, kept, (1, *coarse.grid))
     kept &= blocks.may_vanish(values, slopes)
     leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
     blocks, slopes = blocks[kept], slopes[kept]
     for rows in slices(len(slopes), BATCH):
-        yield rows.stop / len(slopes), _descend(lattice, leaves, blocks[rows], slopes[rows])
+        yield rows.stop / len(slopes), _subdivide(lattice, leaves, blocks[rows], slopes[rows])
 
 
-def _descend(lattice: Lattice, leaves: Leaves, blocks: Blocks, slopes: Float) -> Int:
+def _subdivide(lattice: Lattice, leaves: LeafStore, blocks: CellBlocks, slopes: Float) -> Int:
     """Leaves within the given blocks, in which slopes of shape (N,) were measured."""
     while blocks.size > LEAF:
         blocks = blocks.split()
@@ -172,13 +174,13 @@ def _descend(lattice: Lattice, leaves: Leaves, blocks: Blocks, slopes: Float) ->
             kept &= blocks.may_vanish(values, slopes)
             slopes = slopes[kept]
         else:
-            kept &= np.abs(values) <= MARGIN * _variation(values)
+            kept &= np.abs(values) <= MARGIN * _corner_variation(values)
         leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
         blocks = blocks[kept]
     return blocks.places
 
 
-def _slopes(lattice: Lattice, blocks: Blocks, chosen: Mask, shape: tuple[int, ...]) -> Float:
+def _slopes(lattice: Lattice, blocks: CellBlocks, chosen: Mask, shape: tuple[int, ...]) -> Float:
     """Greatest slopes in the chosen blocks, of shape (N,), by the gradients at their centres and at neighbouring ones.
 
     `shape` arranges the blocks as grids of neighbours, of shape (G, A, B, C). From a centre to a corner the gradient
@@ -196,7 +198,7 @@ def _slopes(lattice: Lattice, blocks: Blocks, chosen: Mask, shape: tuple[int, ..
     return np.asarray(np.nan_to_num(slopes).reshape(-1), dtype=np.float64)
 
 
-def _variation(values: Float) -> Float:
+def _corner_variation(values: Float) -> Float:
     """By how much the field varies from the centre of a block to its corners, from the centres of eight siblings.
 
     Along each axis that is half of the greatest difference between siblings, whose centres lie a block's length apart.
@@ -206,7 +208,7 @@ def _variation(values: Float) -> Float:
     return np.asarray(0.5 * steps).repeat(8)
 
 
-def _near(data: Float, blocks: Blocks, lattice: Lattice) -> Mask:
+def _near_data(data: Float, blocks: CellBlocks, lattice: Lattice) -> Mask:
     """Which blocks, of shape (N,), have data within their reach, or lie at the border of the box."""
     from scipy.spatial import cKDTree
 
@@ -232,14 +234,14 @@ LOCATED = 0.1
 
 # The narrow band: only the lattice nodes near the zero level are evaluated.
 #
-# `search` names the leaves through which the zero level may pass; those are evaluated node by node, all others have but
-# a sign. What the search misses is found by propagation: as long as a cell with a sign change has a corner that was not
-# evaluated, the leaves of its corners are. Every node thus has exactly one sign, evaluated or not, and marching cubes
-# over all of them cannot leave a hole. Memory grows with the surface: about 6 nodes for each vertex.
+# `candidate_leaves` yields the leaves through which the zero level may pass. They are evaluated node by node; all
+# others have only a sign. What that search misses is found by propagation: while a cell with a sign change has a corner that
+# was not evaluated, the leaves of its corners are. So every node has exactly one sign, evaluated or not, and marching
+# cubes over all of them cannot leave a hole. Memory grows with the surface: about 6 nodes for each vertex.
 
 
 @dataclass(frozen=True)
-class Band:
+class NarrowBand:
     """Node values around the zero level, in cells divided by the typical slope.
 
     Parameters
@@ -252,25 +254,25 @@ class Band:
 
     lattice: Lattice
     slope: float
-    leaves: Leaves
+    leaves: LeafStore
 
     def values(self, leaves: Int) -> Values:
         """The field at the nodes of leaves, of shape (N, 3): clear, of shape (N, K)."""
-        return self.clear(self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope))
+        return self.clamp(self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope))
 
-    def clear(self, values: Float) -> Values:
+    def clamp(self, values: Float) -> Values:
         """Return values over the slope, of any shape, clear of zero and of bounded magnitude."""
-        clear = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
-        return np.clip(clear, -LIMIT, LIMIT).astype(np.float32)
+        clamp = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
+        return np.clip(clamp, -LIMIT, LIMIT).astype(np.float32)
 
     def evaluate(self, leaves: Int, advance: ProgressCallback = ignore_progress) -> None:
         """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
-        for rows in slices(len(leaves), self.lattice.together(len(_NODES))):
+        for rows in slices(len(leaves), self.lattice.blocks_per_batch(len(_NODES))):
             advance(rows.start / len(leaves))
             some = leaves[rows]
-            self.leaves.keep(some, self.values(some).reshape(-1, LEAF, LEAF, LEAF))
+            self.leaves.store(some, self.values(some).reshape(-1, LEAF, LEAF, LEAF))
 
-    def missing(self, chunk: Int) -> Int:
+    def unevaluated_leaves(self, chunk: Int) -> Int:
         """Leaves, of shape (N, 3), that hold an unevaluated corner of a cell with a sign change in this chunk."""
         rows = self.leaves.rows(chunk)
         if (rows >= FIRST).all() or (rows == OUTSIDE).all() or (rows == INSIDE).all():
@@ -287,7 +289,7 @@ class Band:
         return np.unique(np.argwhere(wanted) // LEAF, axis=0) + chunk * SIDE
 
 
-def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCallback = ignore_progress) -> Band:
+def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCallback = ignore_progress) -> NarrowBand:
     """Evaluate the field where its zero level may pass.
 
     Parameters
@@ -303,23 +305,23 @@ def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCa
     MeshError
         When the field is not finite somewhere.
     """
-    coarse = Coarse.of(lattice)
+    coarse = CoarseGrid.of(lattice)
     advance(LOCATED)
     # A field that is constant at all samples has no slope there; any positive number keeps the division defined.
-    band = Band(lattice, max(coarse.typical, 1e-6), Leaves(-(-(lattice.cells + 1) // CHUNK), LIMIT))
+    band = NarrowBand(lattice, max(coarse.typical, 1e-6), LeafStore(-(-(lattice.cells + 1) // CHUNK), LIMIT))
     done = LOCATED
-    for share, leaves in search(lattice, coarse, band.leaves, data):
+    for share, leaves in candidate_leaves(lattice, coarse, band.leaves, data):
         begin, done = done, LOCATED + (1.0 - LOCATED) * share
         band.evaluate(leaves, part(advance, begin, done))
     _propagate(band)
     return band
 
 
-def _propagate(band: Band) -> None:
+def _propagate(band: NarrowBand) -> None:
     """Evaluate further leaves until every corner of every cell with a sign change has its own value."""
     queue = band.leaves.mixed_chunks()
     while len(queue):
-        found = [band.missing(chunk) for chunk in queue]
+        found = [band.unevaluated_leaves(chunk) for chunk in queue]
         leaves = np.unique(np.concatenate(found), axis=0)
         if not len(leaves):
             return

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gnrecon.export.curvature import diffused, vertex_areas
+from gnrecon.export.curvature import diffuse, vertex_areas
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
@@ -90,20 +90,20 @@ def trim(mesh: Mesh, distances: Float, reach: float) -> tuple[Mesh, Trimming]:
         When nothing would be left.
     """
     areas = vertex_areas(mesh)
-    smooth = diffused(mesh, distances, WIDTH * reach)
-    near, filled = _without_small(mesh, smooth <= reach, areas, HOLE * reach**2, of=False)
-    near, crumbs = _without_small(mesh, near, areas, CRUMB * reach**2, of=True)
+    smooth = diffuse(mesh, distances, WIDTH * reach)
+    near, filled = _absorb_small_patches(mesh, smooth <= reach, areas, HOLE * reach**2, of=False)
+    near, crumbs = _absorb_small_patches(mesh, near, areas, CRUMB * reach**2, of=True)
     if not near.any():
         raise UsageError(
             f"Trimming at {reach:.6g} leaves nothing: the surface lies {distances.min():.6g} or more from every point."
         )
     if near.all():
         return mesh, Trimming(reach, 0.0, 0, filled)
-    result = cut_along(mesh, near, smooth, reach)
+    result = cut_at_level(mesh, near, smooth, reach)
     return result, Trimming(reach, 1 - result.area / mesh.area, crumbs, filled)
 
 
-def _without_small(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:
+def _absorb_small_patches(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:
     """Change sides of vertex patches on the side `of` with less than an area; whole components and the largest stay."""
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     same = near[start] == near[end]
@@ -122,7 +122,7 @@ def _without_small(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool)
     return np.where(small[labels], not of, near), int(small.sum())
 
 
-def cut_along(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
+def cut_at_level(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
     """The part of a mesh around its near vertices, ending where the distance is the reach."""
     flags = near[mesh.faces]
     count = flags.sum(axis=1)
@@ -133,7 +133,7 @@ def cut_along(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
     ends, which = np.unique(np.sort(np.stack([a, b, a, c], axis=1).reshape(-1, 2), axis=1), axis=0, return_inverse=True)
     low, high = ends.T
     share = np.clip((reach - distances[low]) / (distances[high] - distances[low]), CLEAR, 1 - CLEAR)
-    full = _with_points_between(mesh, low, high, share)
+    full = _with_edge_points(mesh, low, high, share)
     ab, ac = (len(near) + which.reshape(-1, 2)).T
     tip = count[single] == 1
     corners = full.vertices
@@ -150,18 +150,18 @@ def cut_along(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
     return used(full, np.concatenate(pieces))
 
 
-def _with_points_between(mesh: Mesh, low: Int, high: Int, share: Float) -> Mesh:
+def _with_edge_points(mesh: Mesh, low: Int, high: Int, share: Float) -> Mesh:
     """The mesh with further vertices, each at a share of the way between two."""
-    vertices = _between(mesh.vertices, low, high, share)
+    vertices = _interpolated_rows(mesh.vertices, low, high, share)
     normals = None
     if mesh.normals is not None:
-        normals = _between(mesh.normals, low, high, share)
+        normals = _interpolated_rows(mesh.normals, low, high, share)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    attributes = {name: _between(values, low, high, share) for name, values in mesh.attributes.items()}
+    attributes = {name: _interpolated_rows(values, low, high, share) for name, values in mesh.attributes.items()}
     return Mesh(vertices, mesh.faces, normals, attributes)
 
 
-def _between(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt.NDArray[Any]:
+def _interpolated_rows(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt.NDArray[Any]:
     """The values followed by those between two rows: interpolated numbers, and the nearer row of what is no number."""
     if values.dtype.kind == "f":
         weight = share.reshape(-1, *[1] * (values.ndim - 1))
@@ -190,7 +190,7 @@ ON = 1e-9
 # that the mesh was extracted on, no face crosses them and the border lies in them exactly.
 
 
-def clip(mesh: Mesh, bounds: Float) -> Mesh:
+def clip_to_box(mesh: Mesh, bounds: Float) -> Mesh:
     """Return the part of an oriented 2-manifold within a box; it has no faces where nothing is inside.
 
     Parameters
@@ -209,7 +209,7 @@ def clip(mesh: Mesh, bounds: Float) -> Mesh:
             beyond = sign * (mesh.vertices[:, axis] - bounds[side, axis])
             near = beyond <= tolerance
             if not near.all():
-                mesh = cut_along(mesh, near, beyond, 0.0)
+                mesh = cut_at_level(mesh, near, beyond, 0.0)
     return mesh
 
 
@@ -227,7 +227,7 @@ NOTABLE = 0.03
 
 
 @dataclass(frozen=True)
-class Invented:
+class UnsupportedArea:
     """The part of a surface that no data supports.
 
     Parameters
@@ -254,7 +254,7 @@ class Invented:
         ]
 
 
-def invented(mesh: Mesh, distances: Float, spacing: float) -> Invented:
+def unsupported_area(mesh: Mesh, distances: Float, spacing: float) -> UnsupportedArea:
     """Return which share of a surface is invented.
 
     Parameters
@@ -268,4 +268,4 @@ def invented(mesh: Mesh, distances: Float, spacing: float) -> Invented:
     beyond = SPACINGS * spacing
     areas = np.linalg.norm(mesh.face_vectors, axis=1)
     far = distances[mesh.faces].mean(axis=1) > beyond
-    return Invented(float(areas[far].sum() / max(areas.sum(), np.finfo(np.float64).tiny)), beyond)
+    return UnsupportedArea(float(areas[far].sum() / max(areas.sum(), np.finfo(np.float64).tiny)), beyond)

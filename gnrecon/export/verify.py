@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.export.boolean import refusal, to_meshlab, to_solid
+from gnrecon.export.boolean import manifold_error, to_meshlab, to_solid
 from gnrecon.export.mesh_statistics import Edges, face_components, split_vertices
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
@@ -103,7 +103,7 @@ def require_sound(mesh: Mesh) -> MeshFacts:
     facts = _facts_of_finite(mesh)
     failed = failures(facts)
     if not failed:
-        error = refusal(to_solid(mesh, merge=False))
+        error = manifold_error(to_solid(mesh, merge=False))
         failed = [f"is refused by manifold3d ({error})"] if error else []
     if failed:
         raise MeshError(f"The mesh {failed[0]}.")
@@ -239,7 +239,7 @@ def examine(mesh: Mesh) -> Findings:
     failed = failures(facts)
     if broken:
         failed = [f"has {broken} vertices that are not finite", *failed]
-    if not failed and (error := refusal(to_solid(mesh, merge=False))):
+    if not failed and (error := manifold_error(to_solid(mesh, merge=False))):
         failed = [f"is refused by manifold3d ({error})"]
     return Findings(
         facts=facts,

@@ -18,7 +18,7 @@ from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.colors import to_linear as to_light
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.rendering.rays import Camera, View, draw_points, shade, sky_share, to_bytes, to_linear
+from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, shade, to_bytes, to_linear
 from gnrecon.runtime.errors import UsageError
 
 CLAY, SLATE = (230, 208, 180), (86, 120, 164)
@@ -132,7 +132,7 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
     coarse = np.zeros_like(hit)
     coarse[::SUPERSAMPLING, ::SUPERSAMPLING] = hit[::SUPERSAMPLING, ::SUPERSAMPLING]
     places = rays[coarse][:, :3] + distance[coarse][:, None] * rays[coarse][:, 3:]
-    small = sky_share(scene, places, normals[coarse[hit]], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
+    small = ambient_occlusion(scene, places, normals[coarse[hit]], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
     sky = small.repeat(SUPERSAMPLING, 0).repeat(SUPERSAMPLING, 1)[: hit.shape[0], : hit.shape[1]]
     image = _background(camera)
     image[hit] = shade(normals, color, camera.axes, sky[hit])

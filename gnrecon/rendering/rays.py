@@ -163,10 +163,10 @@ def shade(normals: Float, color: Float, axes: Float, sky: Float | float) -> Floa
     return result
 
 
-def open_sky(scene: Any, points: Float, normals: Float, reach: float, directions: Float) -> Float:
+def sky_visibility(scene: Any, points: Float, normals: Float, reach: float, directions: Float) -> Float:
     """Share of the sky, of shape (N,), that surface points with unit normals see in directions of shape (D, 3).
 
-    The other parameters are those of `sky_share`.
+    The other parameters are those of `ambient_occlusion`.
     """
     from open3d import core
 
@@ -185,7 +185,7 @@ def open_sky(scene: Any, points: Float, normals: Float, reach: float, directions
     return share
 
 
-def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float) -> Float:
+def ambient_occlusion(scene: Any, points: Float, normals: Float, hit: Any, reach: float) -> Float:
     """Share of the sky seen from surface points, as an image, smoothed over about a pixel.
 
     Parameters
@@ -199,7 +199,7 @@ def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float)
         How near something must be to cover the sky.
     """
     image = np.zeros(hit.shape)
-    image[hit] = open_sky(scene, points, normals, reach, sphere_directions())
+    image[hit] = sky_visibility(scene, points, normals, reach, sphere_directions())
     # Averaging over the surface's own pixels alone keeps the outline free of a halo.
     smooth = gaussian_filter(image, 1.2) / np.maximum(gaussian_filter(hit.astype(np.float64), 1.2), 1e-9)
     return np.asarray(smooth)
@@ -236,7 +236,7 @@ PASSES = 6
 # How much of the sky each vertex of a mesh sees, for viewers that cannot cast rays themselves.
 
 
-def vertex_sky(mesh: Mesh) -> Float:
+def vertex_ambient_occlusion(mesh: Mesh) -> Float:
     """Return the share of the sky that each vertex sees, of shape (V,), from 0 to 1, smoothed over its neighbours."""
     centre, size = centre_and_size(mesh)
     unit = (mesh.vertices - centre) / size
@@ -246,7 +246,7 @@ def vertex_sky(mesh: Mesh) -> Float:
     rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(TURNS, 4)))
     for turn, rotation in enumerate(rotations):
         part = slice(turn, None, TURNS)
-        share[part] = open_sky(scene, unit[part], normals[part], REACH, rotation.apply(sphere_directions()))
+        share[part] = sky_visibility(scene, unit[part], normals[part], REACH, rotation.apply(sphere_directions()))
     start, end = mesh.faces[:, [0, 1, 2]].reshape(-1), mesh.faces[:, [1, 2, 0]].reshape(-1)
     own = np.arange(len(share))
     rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.export import extract, project
-from gnrecon.export.trim import clip
+from gnrecon.export.trim import clip_to_box
 from gnrecon.field import Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -86,7 +86,7 @@ def mesh_of(field: LearnedField, shown: Box, resolution: int) -> Mesh:
     grow = (cells * cell - sides) / 2 + MARGIN * cell
     outer = np.stack([shown.lower - grow, shown.upper + grow])
     whole = extract(field, resolution=int(cells.max()) + 2 * MARGIN, bounds=outer)
-    mesh = clip(whole, np.stack([shown.lower, shown.upper]))
+    mesh = clip_to_box(whole, np.stack([shown.lower, shown.upper]))
     if not len(mesh.faces):
         raise MeshError("The field has no zero level in the box that is shown, so there is no surface to mesh.")
     return project(mesh, field)

@@ -12,10 +12,11 @@ from analytic_fields import UTM, Field, torus
 
 from gnrecon.export import SignedDistance
 from gnrecon.export import mesh_field as meshing
-from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
 from gnrecon.export.mesh_options import MeshOptions
 from gnrecon.export.resolution import chord_error
 from gnrecon.ingest.noise import neighbour_spacing
+from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError
 
@@ -83,7 +84,7 @@ def test_a_resolution_and_an_edge_length_exclude_each_other() -> None:
         MeshOptions(resolution=128, edge_length=0.5)
     box = np.array([[0.0, 0, 0], [1, 1, 1]])
     assert MeshOptions().cells(box) == 256
-    assert MeshOptions(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
+    assert Options(edge_length=0.5).for_scan(np.zeros((9, 3)), box).resolution is None
     with pytest.raises(UsageError, match="possible"):
         MeshOptions(edge_length=1e-9).cells(np.array([[0.0, 0, 0], [1, 1, 1]]))
 
@@ -96,20 +97,20 @@ def test_single_precision_serves_where_values_and_gradients_agree(shift: float, 
 
     cell = 2.2 / 50
     field, data = Double(torus()), np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3))
-    assert (meshing._coarse(field, data, 50) is not field) == kept
+    assert (meshing._single_precision_field(field, data, 50) is not field) == kept
 
 
 def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
     box, plane = np.array([[0.0, 0, 0], [1, 1, 0.2]]), np.stack(np.meshgrid(range(60), range(60), [0.0]), -1)
     points = plane.reshape(-1, 3) / 60
     spacing = neighbour_spacing(points)
-    assert MeshOptions().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
+    assert Options().for_scan(points, box).resolution == math.ceil(3.0 / spacing)
     assert 128 < math.ceil(3.0 / spacing) < 256
-    assert MeshOptions().for_scan(points[::7], box).resolution == 128
-    assert MeshOptions().for_scan(points[:5], box).resolution == 128
-    assert MeshOptions().for_scan(points, 3 * box).resolution == 256
-    assert MeshOptions().for_scan(np.zeros((9, 3)), box).resolution == 256
-    assert MeshOptions(resolution=50).for_scan(points, box).resolution == 50
+    assert Options().for_scan(points[::7], box).resolution == 128
+    assert Options().for_scan(points[:5], box).resolution == 128
+    assert Options().for_scan(points, 3 * box).resolution == 256
+    assert Options().for_scan(np.zeros((9, 3)), box).resolution == 256
+    assert Options(resolution=50).for_scan(points, box).resolution == 50
 
 
 def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
@@ -125,7 +126,7 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
         cells = result.report["fineness"]["resolution"]
         assert result.report["options"]["resolution"] == cells
         found[noise] = cells
-        by_points = MeshOptions().for_scan(scan, box).resolution
+        by_points = Options().for_scan(scan, box).resolution
         assert by_points is not None
         assert cells >= by_points
         if noise == 0.0:
@@ -133,8 +134,8 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
             x = result.mesh.vertices[result.mesh.faces].mean(axis=1)
             off = np.hypot(np.hypot(x[:, 0], x[:, 1]) - 3, x[:, 2]) - 1
             assert np.abs(off).mean() < 3e-4
-            assert fine_enough(result.sdf, 200) == max(200, cells)
-            assert fine_enough(replace(result.sdf, detail=None), 128) == 128
+            assert cells_for_curvature(result.sdf, 200) == max(200, cells)
+            assert cells_for_curvature(replace(result.sdf, detail=None), 128) == 128
     assert found[0.0] > found[0.02] == 128
     assert reconstruct(points, normals, quality="draft", resolution=60).report["fineness"]["resolution"] == 60
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from analytic_fields import Field, sphere, torus, union
 
-from gnrecon.export import Neighbourhood, extract, invented, require_bordered, require_sound, trim, verify_file
+from gnrecon.export import Neighbourhood, extract, require_bordered, require_sound, trim, unsupported_area, verify_file
 from gnrecon.export.mesh_statistics import Edges, split_vertices
 from gnrecon.export.trim import CLEAR
 from gnrecon.geometry.mesh import Mesh
@@ -66,14 +66,14 @@ def test_invented_area_of_half_a_sphere(rng: np.random.Generator) -> None:
     points = points_on_sphere(20_000, rng)
     upper = points[points[:, 2] > 0]
     mesh, around = ball(), Neighbourhood(upper)
-    found = invented(mesh, around.distances(mesh.vertices), around.spacing())
+    found = unsupported_area(mesh, around.distances(mesh.vertices), around.spacing())
     # Each of 20,000 points has its share of the sphere to itself.
     spacing = np.sqrt(4 * np.pi * RADIUS**2 / 20_000)
     assert around.spacing() == pytest.approx(spacing, rel=0.03)
     assert found.invented_beyond == pytest.approx(3 * spacing, rel=0.03)
     assert found.invented_area_share == pytest.approx((RADIUS - 3 * spacing) / (2 * RADIUS), abs=0.02)
     assert "--trim 3s" in found.describe()[0]
-    whole = invented(mesh, Neighbourhood(points).distances(mesh.vertices), spacing)
+    whole = unsupported_area(mesh, Neighbourhood(points).distances(mesh.vertices), spacing)
     assert whole.invented_area_share < 1e-3
     assert whole.describe() == []
 

@@ -15,11 +15,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gnrecon.export.boolean import centre_and_size, from_meshlab, from_solid, refusal, to_meshlab, to_solid
-from gnrecon.export.metrics import Surface, nearest_on_surface
-from gnrecon.export.project import SignedDistance, between, project
+from gnrecon.export.boolean import centre_and_size, from_meshlab, from_solid, manifold_error, to_meshlab, to_solid
+from gnrecon.export.metrics import SurfaceQuery, nearest_on_surface
+from gnrecon.export.project import SignedDistance, face_sample_points, project
 from gnrecon.export.remeshing.edge_table import unit
-from gnrecon.export.remeshing.remesh import creased, settled
+from gnrecon.export.remeshing.remesh import move_vertices, with_creases
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
@@ -71,7 +71,7 @@ def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30
         autoclean=False,
     )
     fewer = from_meshlab(work, mesh)
-    return project(settled(creased(fewer, field, angle), fewer.vertices, field, angle).mesh(), field)
+    return project(move_vertices(with_creases(fewer, field, angle), fewer.vertices, field, angle).mesh(), field)
 
 
 def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
@@ -102,15 +102,15 @@ def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
         raise UsageError(f"The tolerance is {tolerance} file units, but must be positive.")
     distance = tolerance
     for _ in range(ATTEMPTS):
-        simple = collapsed(mesh, distance)
-        moved = max(_farthest(mesh, simple), _farthest(simple, mesh))
+        simple = simplify_by_collapses(mesh, distance)
+        moved = max(_max_distance(mesh, simple), _max_distance(simple, mesh))
         if moved <= tolerance:
             return Mesh(simple.vertices, simple.faces, unit(field.gradient(simple.vertices)))
         distance *= SMALLER * tolerance / moved
     raise MeshError(f"The surface would have moved by {moved:.3g}.")
 
 
-def collapsed(mesh: Mesh, tolerance: float) -> Mesh:
+def simplify_by_collapses(mesh: Mesh, tolerance: float) -> Mesh:
     """Return a mesh as manifold3d simplifies it, by collapses of a tolerance each, in the unit of the vertices.
 
     Raises
@@ -120,15 +120,15 @@ def collapsed(mesh: Mesh, tolerance: float) -> Mesh:
     """
     _, size = centre_and_size(mesh)
     solid = to_solid(mesh, merge=False).simplify(tolerance / size)
-    error = refusal(solid)
+    error = manifold_error(solid)
     if error is not None or solid.is_empty():
         raise MeshError(f"manifold3d left nothing of the mesh ({error or 'within the tolerance it is flat'}).")
     return from_solid(solid, mesh)
 
 
-def _farthest(one: Mesh, other: Mesh) -> float:
+def _max_distance(one: Mesh, other: Mesh) -> float:
     """Greatest distance to a mesh from another one's vertices, edge midpoints and face centres."""
-    points = np.concatenate([other.vertices, between(other.corners)])
+    points = np.concatenate([other.vertices, face_sample_points(other.corners)])
     return float(nearest_on_surface(one, points)[0].max())
 
 
@@ -144,7 +144,7 @@ DENSITY = 2.3
 # for millions of faces. Nothing is promised of the copy's topology.
 
 
-def lighten(mesh: Mesh, faces: int) -> Mesh:
+def decimate_by_clustering(mesh: Mesh, faces: int) -> Mesh:
     """Return the mesh with at most `faces` faces, its normals and attributes interpolated.
 
     A mesh that has so few is returned as it is.
@@ -152,11 +152,11 @@ def lighten(mesh: Mesh, faces: int) -> Mesh:
     if len(mesh.faces) <= faces:
         return mesh
     means, triangles = _clustered(mesh, faces)
-    vertices, nearest = Surface(mesh).nearest(means)
+    vertices, nearest = SurfaceQuery(mesh).nearest(means)
     corners, weights = mesh.faces[nearest], barycentric(mesh.corners[nearest], vertices)
     normals = interpolate(mesh.vertex_normals(), corners, weights)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return Mesh(vertices, triangles, normals, _carried(mesh.attributes, corners, weights))
+    return Mesh(vertices, triangles, normals, _interpolated_attributes(mesh.attributes, corners, weights))
 
 
 def _clustered(mesh: Mesh, faces: int) -> tuple[Float, Int]:
@@ -204,7 +204,7 @@ def interpolate(values: Values, corners: Int, weights: Float) -> Float:
     return mixed
 
 
-def _carried(attributes: Mapping[str, Values], corners: Int, weights: Float) -> dict[str, Values]:
+def _interpolated_attributes(attributes: Mapping[str, Values], corners: Int, weights: Float) -> dict[str, Values]:
     """Interpolated attributes in their own types; whole numbers are rounded."""
     carried: dict[str, Values] = {}
     for name, values in attributes.items():

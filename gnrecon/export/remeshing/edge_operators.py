@@ -17,12 +17,12 @@ from scipy.sparse import coo_array
 from gnrecon.export.remeshing.edge_table import (
     CORNER,
     SMOOTH,
+    CreasedSurface,
     EdgeTable,
-    Surface,
     area_vectors,
     face_normals,
+    independent_rings,
     ranks,
-    rings_apart,
     unit,
 )
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -50,7 +50,7 @@ class _Collapses:
         return _Collapses(self.gone[mask], self.kept[mask], self.place[mask], self.normal[mask])
 
 
-def collapse_short(surface: Surface, length: Float) -> tuple[Surface, Float]:
+def collapse_short(surface: CreasedSurface, length: Float) -> tuple[CreasedSurface, Float]:
     """Collapse edges shorter than 4/5 of the target length, of shape (V,), where that is safe.
 
     Returns
@@ -63,19 +63,19 @@ def collapse_short(surface: Surface, length: Float) -> tuple[Surface, Float]:
     for _ in range(ROUNDS):
         edges = EdgeTable.of(surface.faces)
         names = edges.ends @ np.array([size, 1])
-        wanted = _wanted(surface, edges, length) & ~np.isin(names, refused)
+        wanted = _collapsible(surface, edges, length) & ~np.isin(names, refused)
         chosen = _independent(surface, edges, wanted)
         if not len(chosen):
             break
-        collapses = _directed(surface, edges.ends[chosen])
+        collapses = _collapse_targets(surface, edges.ends[chosen])
         good = _keeps_topology(edges, chosen, size) & _keeps_shape(surface, collapses, length)
         refused = np.union1d(refused, names[chosen[~good]])
-        surface = _apply(surface, collapses.only(good))
+        surface = _collapse(surface, collapses.only(good))
     used = np.unique(surface.faces)
     return surface.compact(), length[used]
 
 
-def _wanted(surface: Surface, edges: EdgeTable, length: Float) -> Mask:
+def _collapsible(surface: CreasedSurface, edges: EdgeTable, length: Float) -> Mask:
     """Which edges are too short and may collapse as far as creases are concerned."""
     a, b = edges.ends.T
     short = np.linalg.norm(surface.vertices[a] - surface.vertices[b], axis=1) < SHORT * np.minimum(length[a], length[b])
@@ -85,7 +85,7 @@ def _wanted(surface: Surface, edges: EdgeTable, length: Float) -> Mask:
     return wanted
 
 
-def _in_crease_triangle(surface: Surface, edges: EdgeTable) -> Mask:
+def _in_crease_triangle(surface: CreasedSurface, edges: EdgeTable) -> Mask:
     """Which edges have a face whose other two edges are creases: a collapse would lay these on each other."""
     sides = [
         surface.is_crease(np.sort(np.stack([edges.ends[:, end], edges.opposite[:, face]], axis=1), axis=1))
@@ -95,15 +95,15 @@ def _in_crease_triangle(surface: Surface, edges: EdgeTable) -> Mask:
     return (sides[0] & sides[1]) | (sides[2] & sides[3])
 
 
-def _independent(surface: Surface, edges: EdgeTable, wanted: Mask) -> Int:
+def _independent(surface: CreasedSurface, edges: EdgeTable, wanted: Mask) -> Int:
     """Numbers of wanted edges that touch no common face, the shortest first."""
     rows = np.flatnonzero(wanted)
     ends = edges.ends[rows]
     lengths = np.linalg.norm(surface.vertices[ends[:, 0]] - surface.vertices[ends[:, 1]], axis=1)
-    return rows[rings_apart(ends, ranks(lengths), surface.faces, len(surface.vertices))]
+    return rows[independent_rings(ends, ranks(lengths), surface.faces, len(surface.vertices))]
 
 
-def _directed(surface: Surface, ends: Int) -> _Collapses:
+def _collapse_targets(surface: CreasedSurface, ends: Int) -> _Collapses:
     """Decide for each edge, of shape (N, 2), which end stays, and where."""
     kinds = surface.kinds()[ends]
     kept = np.where(kinds[:, 0] > kinds[:, 1], ends[:, 0], ends[:, 1])
@@ -124,13 +124,13 @@ def _keeps_topology(edges: EdgeTable, chosen: Int, size: int) -> Mask:
     return safe
 
 
-def _keeps_shape(surface: Surface, collapses: _Collapses, length: Float) -> Mask:
+def _keeps_shape(surface: CreasedSurface, collapses: _Collapses, length: Float) -> Mask:
     """Whether no face turns from what it should be, unless it was turned already, and no edge becomes too long."""
     count = len(collapses.gone)
     owner = np.full(len(surface.vertices), -1, dtype=np.int64)
     owner[collapses.gone] = owner[collapses.kept] = np.arange(count)
     owners = owner[surface.faces].max(axis=1)
-    after = _apply(surface, collapses, drop=False)
+    after = _collapse(surface, collapses, drop=False)
     changed = np.flatnonzero(owners >= 0)
     faces = after.faces[changed]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
@@ -149,7 +149,7 @@ def _keeps_shape(surface: Surface, collapses: _Collapses, length: Float) -> Mask
     return good
 
 
-def _apply(surface: Surface, collapses: _Collapses, *, drop: bool = True) -> Surface:
+def _collapse(surface: CreasedSurface, collapses: _Collapses, *, drop: bool = True) -> CreasedSurface:
     """Rename the vanishing vertices; `drop` removes the faces and creases that have lost an edge."""
     names = np.arange(len(surface.vertices))
     names[collapses.gone] = collapses.kept
@@ -157,10 +157,10 @@ def _apply(surface: Surface, collapses: _Collapses, *, drop: bool = True) -> Sur
     vertices[collapses.kept], normals[collapses.kept] = collapses.place, collapses.normal
     faces, creases = names[surface.faces], names[surface.creases]
     if not drop:
-        return Surface(vertices, normals, faces, surface.creases)
+        return CreasedSurface(vertices, normals, faces, surface.creases)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     creases = np.unique(np.sort(creases[creases[:, 0] != creases[:, 1]], axis=1), axis=0)
-    return Surface(vertices, normals, faces, creases)
+    return CreasedSurface(vertices, normals, faces, creases)
 
 
 LONG = 4.0 / 3.0
@@ -176,7 +176,7 @@ PASSES = 12
 # pieces of neighbours always fit. With two split edges, the remaining quadrilateral is cut along its shorter diagonal.
 
 
-def split_long(surface: Surface, length: Float) -> tuple[Surface, Float]:
+def split_long(surface: CreasedSurface, length: Float) -> tuple[CreasedSurface, Float]:
     """Halve edges that are longer than 4/3 of the target length, of shape (V,), until none is.
 
     Returns
@@ -196,7 +196,9 @@ def split_long(surface: Surface, length: Float) -> tuple[Surface, Float]:
     return surface, length
 
 
-def split(surface: Surface, edges: EdgeTable, marked: Mask, points: Float, centres: Float | None = None) -> Surface:
+def split(
+    surface: CreasedSurface, edges: EdgeTable, marked: Mask, points: Float, centres: Float | None = None
+) -> CreasedSurface:
     """Split the marked edges, a mask of shape (E,), at the given points, of shape (M, 3), in the edges' order.
 
     The new vertices follow the old ones in the same order. Where `centres` is given, of shape (T, 3), each of the T
@@ -221,7 +223,9 @@ def split(surface: Surface, edges: EdgeTable, marked: Mask, points: Float, centr
         parts += _fans(corner[full], middle[full], len(vertices) + np.arange(len(centres)))
         vertices = np.concatenate([vertices, centres])
         normals.append(unit(surface.normals[corner[full]].sum(axis=1)))
-    return Surface(vertices, np.concatenate(normals), np.concatenate(parts), _split_creases(surface, edges, marked))
+    return CreasedSurface(
+        vertices, np.concatenate(normals), np.concatenate(parts), _split_creases(surface, edges, marked)
+    )
 
 
 def _middles(edges: EdgeTable, marked: Mask, faces: int, first: int) -> Int:
@@ -256,7 +260,7 @@ def _fans(corner: Int, middle: Int, centre: Int) -> list[Int]:
     return [np.stack([ring[:, k], ring[:, (k + 1) % 6], centre], 1) for k in range(6)]
 
 
-def _split_creases(surface: Surface, edges: EdgeTable, marked: Mask) -> Int:
+def _split_creases(surface: CreasedSurface, edges: EdgeTable, marked: Mask) -> Int:
     """Creases with the split ones replaced by their halves, whose new vertex has the higher number."""
     ends, middles = edges.ends[marked], len(surface.vertices) + np.arange(np.count_nonzero(marked))
     cut = surface.is_crease(ends)

@@ -18,7 +18,7 @@ SMOOTH, CREASE, CORNER = 0, 1, 2
 
 
 @dataclass(frozen=True)
-class Surface:
+class CreasedSurface:
     """A closed, oriented 2-manifold with creases.
 
     Parameters
@@ -45,12 +45,12 @@ class Surface:
         """Return vertices and faces as a mesh without normals."""
         return Mesh(self.vertices, self.faces)
 
-    def compact(self) -> Surface:
+    def compact(self) -> CreasedSurface:
         """Return the surface without vertices that no face uses, the others in their order."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
         names = np.cumsum(used) - 1
-        return Surface(self.vertices[used], self.normals[used], names[self.faces], names[self.creases])
+        return CreasedSurface(self.vertices[used], self.normals[used], names[self.faces], names[self.creases])
 
     def is_crease(self, ends: Int) -> Mask:
         """Which edges, of shape (E, 2) with the lower vertex first, are creases; of shape (E,)."""
@@ -105,7 +105,7 @@ def unit(vectors: Float) -> Float:
     return units
 
 
-def face_normals(surface: Surface) -> Float:
+def face_normals(surface: CreasedSurface) -> Float:
     """Unit normals that the faces should have, of shape (F, 3): the mean of the field's at their smooth vertices.
 
     These are right where a face is a sliver or turned over, and on either side of a crease. A face whose vertices all
@@ -131,7 +131,7 @@ def ranks(order_by: Float) -> Int:
     return rank
 
 
-def apart(members: Int, rank: Int, count: int) -> Mask:
+def independent_set(members: Int, rank: Int, count: int) -> Mask:
     """Which candidates, with vertices `members` of shape (N, K) among `count`, share no vertex with a lower rank."""
     best = np.full(count, len(rank), dtype=np.int64)
     for column in members.T:
@@ -140,7 +140,7 @@ def apart(members: Int, rank: Int, count: int) -> Mask:
     return chosen
 
 
-def rings_apart(members: Int, rank: Int, faces: Int, count: int) -> Mask:
+def independent_rings(members: Int, rank: Int, faces: Int, count: int) -> Mask:
     """Which candidates, with vertices `members` of shape (N, K), touch no face that one of lower rank touches."""
     best = np.full(count, len(rank), dtype=np.int64)
     for column in members.T:

@@ -15,11 +15,11 @@ from gnrecon.export.project import SignedDistance
 from gnrecon.export.remeshing.edge_table import (
     CREASE,
     SMOOTH,
+    CreasedSurface,
     EdgeTable,
-    Surface,
-    apart,
     area_vectors,
     face_normals,
+    independent_set,
     ranks,
     unit,
 )
@@ -35,32 +35,34 @@ SHARP = np.radians(20.0)
 ROUNDS = 8
 
 
-def flip_for_valence(surface: Surface) -> Surface:
+def flip_for_valence(surface: CreasedSurface) -> CreasedSurface:
     """Flip edges as long as that brings the vertices' numbers of neighbours nearer to six."""
     for _ in range(ROUNDS):
         edges = EdgeTable.of(surface.faces)
         before, after = _least_angles(surface, edges)
         gain = _valence_gain(surface, edges)
-        chosen = _chosen(surface, edges, (gain > 0) & (after > np.minimum(before, SHARP)), gain.astype(np.float64))
+        chosen = _independent_flips(
+            surface, edges, (gain > 0) & (after > np.minimum(before, SHARP)), gain.astype(np.float64)
+        )
         if not len(chosen):
             break
-        surface = _flipped(surface, edges, chosen)
+        surface = _flip(surface, edges, chosen)
     return surface
 
 
-def flip_for_angles(surface: Surface) -> Surface:
+def flip_for_angles(surface: CreasedSurface) -> CreasedSurface:
     """Flip edges as long as the least angle of the two faces grows."""
     for _ in range(ROUNDS):
         edges = EdgeTable.of(surface.faces)
         before, after = _least_angles(surface, edges)
-        chosen = _chosen(surface, edges, after > before + 1e-6, after - before)
+        chosen = _independent_flips(surface, edges, after > before + 1e-6, after - before)
         if not len(chosen):
             break
-        surface = _flipped(surface, edges, chosen)
+        surface = _flip(surface, edges, chosen)
     return surface
 
 
-def _valence_gain(surface: Surface, edges: EdgeTable) -> Int:
+def _valence_gain(surface: CreasedSurface, edges: EdgeTable) -> Int:
     """By how much the sum of squared deviations from the ideal valence falls, of shape (E,)."""
     valence = np.bincount(edges.ends.reshape(-1), minlength=len(surface.vertices))
     off = valence - 6
@@ -69,7 +71,7 @@ def _valence_gain(surface: Surface, edges: EdgeTable) -> Int:
     return gain
 
 
-def _least_angles(surface: Surface, edges: EdgeTable) -> tuple[Float, Float]:
+def _least_angles(surface: CreasedSurface, edges: EdgeTable) -> tuple[Float, Float]:
     """Least angle of the two faces of each edge, now and with the other diagonal, of shape (E,), radians."""
     a, b = edges.ends.T
     c, d = edges.opposite.T
@@ -87,15 +89,15 @@ def _least_angle(vertices: Float, a: Int, b: Int, c: Int) -> Float:
     return angles
 
 
-def _chosen(surface: Surface, edges: EdgeTable, useful: Mask, gain: Float) -> Int:
+def _independent_flips(surface: CreasedSurface, edges: EdgeTable, useful: Mask, gain: Float) -> Int:
     """Numbers of useful edges that may be flipped at once."""
     rows = np.flatnonzero(useful & ~surface.is_crease(edges.ends))
-    rows = rows[_safe(surface, edges, rows)]
+    rows = rows[_safe_flips(surface, edges, rows)]
     members = np.concatenate([edges.ends[rows], edges.opposite[rows]], axis=1)
-    return rows[apart(members, ranks(-gain[rows]), len(surface.vertices))]
+    return rows[independent_set(members, ranks(-gain[rows]), len(surface.vertices))]
 
 
-def _safe(surface: Surface, edges: EdgeTable, rows: Int) -> Mask:
+def _safe_flips(surface: CreasedSurface, edges: EdgeTable, rows: Int) -> Mask:
     """Whether the other diagonal is new, three edges stay at each end, and the faces look the right way."""
     size = np.array([len(surface.vertices), 1])
     new = np.sort(edges.opposite[rows], axis=1) @ size
@@ -115,7 +117,7 @@ def _diagonal_faces(edges: EdgeTable, rows: Int) -> tuple[Int, Int]:
     return np.stack([d, b, c], axis=1), np.stack([c, a, d], axis=1)
 
 
-def _flipped(surface: Surface, edges: EdgeTable, rows: Int) -> Surface:
+def _flip(surface: CreasedSurface, edges: EdgeTable, rows: Int) -> CreasedSurface:
     faces = surface.faces.copy()
     for side, new in enumerate(_diagonal_faces(edges, rows)):
         faces[edges.faces[rows, side]] = new
@@ -135,7 +137,7 @@ RELAX_TURN = 0.5
 # Spreading a surface's vertices evenly, along the surface and along its creases.
 
 
-def relaxed(surface: Surface) -> Float:
+def relax(surface: CreasedSurface) -> Float:
     """Places to which smooth vertices and those of creases move, of shape (V, 3); corners stay.
 
     Smooth vertices go to the area-weighted middle of their faces, in the tangent plane (Botsch and Kobbelt, 2004);
@@ -149,7 +151,7 @@ def relaxed(surface: Surface) -> Float:
     )
 
 
-def _to_middle_of_faces(surface: Surface) -> Float:
+def _to_middle_of_faces(surface: CreasedSurface) -> Float:
     vertices, faces = surface.vertices, surface.faces
     areas = area_vectors(vertices, faces)
     size = np.linalg.norm(areas, axis=1)
@@ -167,7 +169,7 @@ def _to_middle_of_faces(surface: Surface) -> Float:
     return places
 
 
-def _to_middle_of_crease(surface: Surface, kinds: Int) -> Float:
+def _to_middle_of_crease(surface: CreasedSurface, kinds: Int) -> Float:
     vertices = surface.vertices
     both = np.concatenate([surface.creases, surface.creases[:, ::-1]])
     both = both[kinds[both[:, 0]] == CREASE]
@@ -181,7 +183,7 @@ def _to_middle_of_crease(surface: Surface, kinds: Int) -> Float:
     return places
 
 
-def on_creases(surface: Surface, field: SignedDistance, angle: float) -> Float:
+def snap_to_creases(surface: CreasedSurface, field: SignedDistance, angle: float) -> Float:
     """Places of the vertices, of shape (V, 3), with those of creases where the sides meet, unless that is far off."""
     kinds = surface.kinds()
     rows = np.flatnonzero(kinds != SMOOTH)
@@ -202,7 +204,7 @@ def on_creases(surface: Surface, field: SignedDistance, angle: float) -> Float:
     return places
 
 
-def guarded(surface: Surface, moved: Float) -> Surface:
+def without_flips(surface: CreasedSurface, moved: Float) -> CreasedSurface:
     """The surface over moved vertices, of shape (V, 3), without the moves that would turn a face over.
 
     Every round returns at least one more vertex, and a face whose three vertices have stayed is as before, so it ends.
@@ -220,5 +222,5 @@ def guarded(surface: Surface, moved: Float) -> Surface:
         back |= again
 
 
-def _cosines(vertices: Float, surface: Surface, should: Float) -> Float:
+def _cosines(vertices: Float, surface: CreasedSurface, should: Float) -> Float:
     return np.asarray(np.einsum("ij,ij->i", unit(area_vectors(vertices, surface.faces)), should))

@@ -102,7 +102,7 @@ def refine(
     mesh, actions = repair(mesh)
     steps = _steps(field, options)
     for number, step in enumerate(steps, start=1):
-        mesh, sentences = _take(step, mesh)
+        mesh, sentences = _apply_step(step, mesh)
         actions += sentences
         advance(number / len(steps))
     return mesh, actions
@@ -138,7 +138,7 @@ def _sharpened(mesh: Mesh, field: SignedDistance, angle: float) -> Mesh:
     return mesh if sharp is mesh else project(sharp, field)
 
 
-def _take(step: _Step, mesh: Mesh) -> tuple[Mesh, list[str]]:
+def _apply_step(step: _Step, mesh: Mesh) -> tuple[Mesh, list[str]]:
     """The mesh after a step, or as it was where no strength gives a sound mesh of the same topology."""
     failure = ""
     for strength in step.strengths:

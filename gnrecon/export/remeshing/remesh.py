@@ -12,10 +12,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.export.project import SignedDistance, newton, project
+from gnrecon.export.project import SignedDistance, newton_project, project
 from gnrecon.export.remeshing.edge_operators import collapse_short, split_long
-from gnrecon.export.remeshing.edge_table import SMOOTH, EdgeTable, Surface, unit
-from gnrecon.export.remeshing.flip_and_relax import flip_for_angles, flip_for_valence, guarded, on_creases, relaxed
+from gnrecon.export.remeshing.edge_table import SMOOTH, CreasedSurface, EdgeTable, unit
+from gnrecon.export.remeshing.flip_and_relax import (
+    flip_for_angles,
+    flip_for_valence,
+    relax,
+    snap_to_creases,
+    without_flips,
+)
 from gnrecon.export.remeshing.sharpen import crease_edges
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -55,33 +61,33 @@ def remesh(mesh: Mesh, field: SignedDistance, length: float, *, adaptive: bool =
     """
     if not 0 < length < np.inf:
         raise UsageError(f"The edge length is {length} file units, but must be positive.")
-    surface = creased(mesh, field, angle)
+    surface = with_creases(mesh, field, angle)
     for _ in range(ROUNDS):
-        lengths = bent_lengths(surface, length, angle) if adaptive else even_lengths(surface, length)
+        lengths = adaptive_lengths(surface, length, angle) if adaptive else uniform_lengths(surface, length)
         surface, lengths = split_long(surface, lengths)
         surface, lengths = collapse_short(surface, lengths)
         surface = flip_for_valence(surface)
-        surface = settled(surface, relaxed(surface), field, angle)
+        surface = move_vertices(surface, relax(surface), field, angle)
     return project(flip_for_angles(surface).mesh(), field)
 
 
-def creased(mesh: Mesh, field: SignedDistance, angle: float) -> Surface:
+def with_creases(mesh: Mesh, field: SignedDistance, angle: float) -> CreasedSurface:
     """The mesh as a surface whose creases are the edges where the field turns by more than `angle` degrees."""
     edges = EdgeTable.of(mesh.faces)
     normals = unit(field.gradient(mesh.corners.mean(axis=1)))
     creases = edges.ends[crease_edges(normals, edges, angle)]
-    return Surface(mesh.vertices, unit(field.gradient(mesh.vertices)), mesh.faces, creases).compact()
+    return CreasedSurface(mesh.vertices, unit(field.gradient(mesh.vertices)), mesh.faces, creases).compact()
 
 
-def settled(surface: Surface, places: Float, field: SignedDistance, angle: float) -> Surface:
+def move_vertices(surface: CreasedSurface, places: Float, field: SignedDistance, angle: float) -> CreasedSurface:
     """Move vertices to `places`, of shape (V, 3), from there onto creases and the zero level, where no face turns over.
 
     What would turn a face stays where it was, and with it on the zero level if it was there.
     """
-    places = on_creases(replace(surface, vertices=places), field, angle)
+    places = snap_to_creases(replace(surface, vertices=places), field, angle)
     edges = np.linalg.norm(np.diff(places[surface.faces], axis=1), axis=2)
-    points, _, gradient = newton(places, field, STEPS, 0.5 * float(np.median(edges)))
-    moved = guarded(surface, points)
+    points, _, gradient = newton_project(places, field, STEPS, 0.5 * float(np.median(edges)))
+    moved = without_flips(surface, points)
     stayed = (moved.vertices != points).any(axis=1)
     return replace(moved, normals=np.where(stayed[:, None], surface.normals, unit(gradient)))
 
@@ -108,12 +114,12 @@ SWEEPS = 12
 # it.
 
 
-def even_lengths(surface: Surface, length: float) -> Float:
+def uniform_lengths(surface: CreasedSurface, length: float) -> Float:
     """The same target length at every vertex, of shape (V,)."""
     return np.full(len(surface.vertices), length)
 
 
-def bent_lengths(surface: Surface, length: float, angle: float) -> Float:
+def adaptive_lengths(surface: CreasedSurface, length: float, angle: float) -> Float:
     """Target lengths at the vertices, of shape (V,): `length` where flat, down to an eighth of it where curved.
 
     Edges at creases, and those that turn by more than `angle` degrees, say

@@ -13,7 +13,7 @@ import numpy as np
 
 from gnrecon.export.project import SignedDistance
 from gnrecon.export.remeshing.edge_operators import split
-from gnrecon.export.remeshing.edge_table import EdgeTable, Surface, area_vectors, unit
+from gnrecon.export.remeshing.edge_table import CreasedSurface, EdgeTable, area_vectors, unit
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 
@@ -56,13 +56,13 @@ def sharpen(mesh: Mesh, field: SignedDistance, *, angle: float = 30.0) -> Mesh:
     full = mesh.faces[sides == 3]
     middles = mesh.vertices[full].mean(axis=1)
     centres, at_corner = _crease_points(mesh, full, middles, field, angle)
-    surface = Surface(mesh.vertices, normals, mesh.faces, np.empty((0, 2), dtype=np.int64))
+    surface = CreasedSurface(mesh.vertices, normals, mesh.faces, np.empty((0, 2), dtype=np.int64))
     plain = np.concatenate([mesh.vertices, mesh.vertices[edges.ends[marked]].mean(axis=1), middles])
     result = split(surface, edges, marked, points[better], np.where(at_corner[:, None], centres, middles))
-    return Mesh(_unfolded(result, plain, len(normals)), result.faces)
+    return Mesh(_undo_folds(result, plain, len(normals)), result.faces)
 
 
-def _unfolded(surface: Surface, plain: Float, old: int) -> Float:
+def _undo_folds(surface: CreasedSurface, plain: Float, old: int) -> Float:
     """Vertices, of shape (V, 3), with those in their `plain` places that would fold a face over.
 
     Near corners a chamfer's two sides may meet beyond the third. In plain places, in the middle of what was split, no
@@ -123,7 +123,7 @@ ROUNDS = 3
 # drawn nearer to it and the planes taken again, so that creases between curved surfaces are met too.
 
 
-def feet(points: Float, field: SignedDistance, steps: int = 2) -> tuple[Float, Float]:
+def newton_feet(points: Float, field: SignedDistance, steps: int = 2) -> tuple[Float, Float]:
     """Points of shape (N, 3) brought to the zero level by Newton steps, and the field's unit gradients there."""
     gradient = field.gradient(points)
     for _ in range(steps):
@@ -158,10 +158,10 @@ def meeting_points(points: Float, owners: Int, sides: Float, field: SignedDistan
     -------
     array of shape (N, 3)
     """
-    places, normals = feet(sides, field)
+    places, normals = newton_feet(sides, field)
     for _ in range(ROUNDS):
         points = points + _least_squares(points, owners, places, normals, angle)
-        nearer, new = feet(points[owners] + NEARER * (places - points[owners]), field)
+        nearer, new = newton_feet(points[owners] + NEARER * (places - points[owners]), field)
         # Past the crease the normal is the other side's: then the plane from farther away is the better one.
         same = np.einsum("ij,ij->i", normals, new) > np.cos(np.radians(angle) / 2)
         places = np.where(same[:, None], nearer, places)

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.peers import oriented
 from benchmarks.problem import Problem
-from gnrecon.export.metrics import Surface
+from gnrecon.export.metrics import SurfaceQuery
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.ingest import oriented_normals
@@ -20,7 +20,7 @@ def true_normals(problem: Problem) -> Float | None:
     """Return the outward unit normals of a scan: its own, or the true surface's next to it; None where neither is."""
     normals = problem.scan.normals
     if normals is None and isinstance(problem.truth, Mesh):
-        _, faces = Surface(problem.truth).nearest(problem.scan.points)
+        _, faces = SurfaceQuery(problem.truth).nearest(problem.scan.points)
         normals = problem.truth.face_vectors[faces]
     return None if normals is None else normals / np.linalg.norm(normals, axis=1, keepdims=True)
 

@@ -17,8 +17,8 @@ from benchmarks.provenance import provenance
 from benchmarks.refine.shapes import SHAPES
 from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
 from gnrecon.export.boolean import centre_and_size, from_meshlab, to_meshlab
-from gnrecon.export.project import between
-from gnrecon.export.remeshing.decimate import collapsed
+from gnrecon.export.project import face_sample_points
+from gnrecon.export.remeshing.decimate import simplify_by_collapses
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import ExitCode
@@ -74,7 +74,7 @@ def compare(name: str, field: SignedDistance, length: float, cells: int) -> list
         "remeshed by gnrecon": ours(RefineOptions(remesh=length)),
         "collapsed by pymeshlab": lambda given: pymeshlab_collapse(given, faces),
         "fewer faces by gnrecon": ours(RefineOptions(faces=faces)),
-        "simplified by manifold3d": lambda given: collapsed(given, cell / 4),
+        "simplified by manifold3d": lambda given: simplify_by_collapses(given, cell / 4),
         "simplified by gnrecon": ours(RefineOptions(simplify=cell / 4)),
     }
     return [{"field": name, "method": method} | measured(work, mesh, field) for method, work in methods.items()]
@@ -91,7 +91,7 @@ def measured(work: Work, mesh: Mesh, field: SignedDistance) -> dict[str, Any]:
         "least_angle": angles["min"],
         "angle_p1": angles["p1"],
         "vertices_off": float(np.abs(field.sdf(made.vertices)).max()),
-        "between_off": float(np.abs(field.sdf(between(made.corners))).max()),
+        "between_off": float(np.abs(field.sdf(face_sample_points(made.corners))).max()),
         "cpu_seconds": seconds,
     }
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.export import Neighbourhood, carry
+from gnrecon.export import Neighbourhood, transfer_attributes
 from gnrecon.export.attributes import COUNT
 from gnrecon.geometry.colors import to_linear, to_srgb
 from gnrecon.geometry.point_cloud import PointCloud
@@ -17,7 +17,7 @@ UTM = np.array([431234.5, 5412345.25, 312.0])
 
 def values(vertices: np.ndarray, points: np.ndarray, **attributes: np.ndarray) -> dict[str, np.ndarray]:
     cloud = PointCloud(points, None, attributes)
-    made, sentences = carry(vertices, cloud, list(attributes), Neighbourhood(points))
+    made, sentences = transfer_attributes(vertices, cloud, list(attributes), Neighbourhood(points))
     assert sentences == []
     assert all(one.origin.endswith("nearest points") for one in made)
     return {one.name: one.values for one in made}
@@ -107,7 +107,7 @@ def test_few_and_coinciding_points_suffice(count: int, copies: int, seed: int) -
 
 def test_text_is_left_behind_and_said_to_be() -> None:
     cloud = PointCloud(np.eye(3), None, {"name": np.array(["a", "b", "c"])})
-    made, sentences = carry(np.eye(3), cloud, ["name"], Neighbourhood(cloud.points))
+    made, sentences = transfer_attributes(np.eye(3), cloud, ["name"], Neighbourhood(cloud.points))
     assert made == []
     assert sentences == ["The points' attribute 'name' holds no numbers, so it is not carried over."]
 

@@ -9,7 +9,7 @@ from skimage.measure import marching_cubes
 
 from gnrecon.export import extract, project, require_sound, verify
 from gnrecon.export.lattice import Lattice
-from gnrecon.export.marching_cubes import Growing, Leaves
+from gnrecon.export.leaf_storage import GrowingArray, LeafStore
 from gnrecon.export.sparse_grid import NUDGE, narrow_band
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import MeshError, UsageError
@@ -234,12 +234,12 @@ def test_cost_grows_with_the_surface() -> None:
 
 
 def test_leaves_keep_what_they_are_told() -> None:
-    leaves = Leaves(np.array([2, 1, 3]), 8.0)
+    leaves = LeafStore(np.array([2, 1, 3]), 8.0)
     assert not len(leaves.mixed_chunks())
     leaves.mark_inside(np.array([[0, 0, 1]]), 32)
     leaves.mark_inside(np.array([[2, 0, 0]]), 16)
     values = np.arange(2 * 64, dtype=np.float32).reshape(2, 4, 4, 4)
-    leaves.keep(np.array([[8, 1, 0], [3, 3, 3]]), values)
+    leaves.store(np.array([[8, 1, 0], [3, 3, 3]]), values)
     assert len(leaves) == 2
     first, second = (leaves.nodes(leaves.rows(np.array(chunk))) for chunk in ((0, 0, 0), (1, 0, 0)))
     assert np.array_equal(first[12:16, 12:16, 12:16], values[1])
@@ -252,7 +252,7 @@ def test_leaves_keep_what_they_are_told() -> None:
 
 
 def test_rows_are_appended_to_what_grows() -> None:
-    rows = Growing(np.zeros((1, 2), dtype=np.int32))
+    rows = GrowingArray(np.zeros((1, 2), dtype=np.int32))
     for count in (1, 5, 1, 300):
         start = len(rows.rows)
         new = np.full((count, 2), count, dtype=np.int32)
