@@ -13,6 +13,7 @@ import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gnrecon import deprecated_paths
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.runtime.errors import Cancelled, FitError, GnreconError, InputError, MeshError, OutputError, UsageError
@@ -145,8 +146,12 @@ __all__ = [
 # A library is silent unless the program that uses it asks for its log.
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
+deprecated_paths.install()
+
 
 def __getattr__(name: str) -> Any:
+    if f"{__name__}.{name}" in deprecated_paths.MOVED:
+        return import_module(f"{__name__}.{name}")
     if name not in _ROOM_OF:
         raise AttributeError(f"module 'gnrecon' has no attribute {name!r}")
     value = getattr(import_module(_ROOM_OF[name]), name)

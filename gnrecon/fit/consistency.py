@@ -36,7 +36,7 @@ OWN = 2
 """Tells this chance from the fit's own, which has the same seed, so that normals that stay leave the fit as it is."""
 
 
-def reconciled(samples: Samples, rows: Int, options: FitOptions) -> tuple[Samples, float]:
+def flip_contradicted_normals(samples: Samples, rows: Int, options: FitOptions) -> tuple[Samples, float]:
     """Return the samples with the contradicted normals turned around, and their share in [0, 1].
 
     Parameters
@@ -94,7 +94,7 @@ LEAST_POINTS = 100
 # of the scan do, and by more than they are apart.
 
 
-def outlying(value: Float, density: Density) -> Mask:
+def find_outliers(value: Float, density: Density) -> Mask:
     """Return which points are off the surface, of shape (N,).
 
     Parameters

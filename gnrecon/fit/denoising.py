@@ -39,7 +39,7 @@ NOISY = 0.05
 
 
 @dataclass(frozen=True)
-class Told:
+class LocalData:
     """What a fit of the detail is told.
 
     Parameters
@@ -56,12 +56,12 @@ class Told:
     averaging: Averaging | None = None
 
     @classmethod
-    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> Told:
+    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> LocalData:
         """Return what faces that were continued to their edges tell by themselves, beside a global field."""
         return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
 
 
-def told(
+def choose_local_data(
     sdf: NeuralSDF,
     samples: Samples,
     held: Mask,
@@ -69,7 +69,7 @@ def told(
     rng: np.random.Generator,
     device: str,
     outliers: bool = False,
-) -> Told:
+) -> LocalData:
     """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
 
     A clean scan is not averaged, and its belief is what its points tell by themselves.
@@ -89,13 +89,13 @@ def told(
     trials = Trials.draw(leftover, held, radius, rng, device, features)
     clean = None if outliers else trials.clean()
     if clean is not None:
-        return Told(samples, leftover, clean)
+        return LocalData(samples, leftover, clean)
     choice = trials.choice()
     # Outliers that are left have no part in the noise that evidence tells.
     plain = choice.belief if outliers else choice.best
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
     if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
-        return Told(samples, leftover, plain)
+        return LocalData(samples, leftover, plain)
 
     def with_kept(averaging: Averaging) -> Trials:
         points, normals = samples.points.copy(), samples.normals.copy()
@@ -106,12 +106,12 @@ def told(
 
     found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
     if found is None:
-        return Told(samples, leftover, plain)
+        return LocalData(samples, leftover, plain)
     averaging, better = found
     points, normals = averaging.of(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
     _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
-    return Told(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
+    return LocalData(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
 
 
 def _best(

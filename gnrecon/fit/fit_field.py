@@ -13,7 +13,7 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.single_network import fit_deep, fit_wide
-from gnrecon.fit.two_level import fit_adaptive
+from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
@@ -57,7 +57,7 @@ def fit(
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
     if options.adaptive:
-        sdf, fitted = fit_adaptive(samples, options, rng, advance, folder, scheduler)
+        sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler)
     elif folder is not None:
         raise UsageError("A work folder serves the default fit alone, not one network (--widths, --steps).")
     else:

@@ -1,9 +1,9 @@
-"""Detail for a scan: what a global field leaves over is fitted in overlapping cubes, each by one linear solve.
+"""Local fields: the residuals of the global field are fitted in overlapping cubes, each by one linear solve.
 
-A scan holds far more detail than one network can learn in reasonable time, and detail is local: the surface here says
-nothing of the surface there. So a smooth global field gives the sign and closes holes, and each cube corrects it near
-the data (`patch`) with a length and noise that the data itself chose (`choose`). The cubes are blended smoothly
-(`field.partition`), so that the field stays one smooth function.
+A scan holds far more detail than one network can learn in reasonable time, and detail is local: the surface in one
+place does not depend on the surface in another. So a smooth global field gives the sign and closes holes, and each cube
+corrects it near the data (`local_solve`), with a length scale and noise that validation points chose
+(`model_selection`). The cubes are blended by a partition of unity (`field.partition_of_unity`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from torch import Tensor
 
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
-from gnrecon.fit.denoising import Told
+from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.model_selection import Leftover, Volume
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.fit.regularised import Shaping
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import CoarseDistance
@@ -31,47 +32,33 @@ from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 _log = logging.getLogger(__name__)
 
 ShapingFor = Callable[[float], Shaping]
-"""Gives what is asked of the surface for features of a length, in radii."""
-
-CELL = 5.0
-"""Edge of a cube, in lengths."""
-
-BEYOND = 2.0
-"""How far a cube's data reaches beyond it, in radii of a point's disk."""
-
-VOLUME, CLEAR = 400, 3.5
-"""Samples of the volume a cube, and how far from the data they lie at least, in radii of a point's disk."""
-
-LEAST_POINTS = 4
-CHOSEN = 0.2
-"""Share of the time after which length and noise are chosen."""
-
-LONGER = 4.0
-"""How much longer a cube's length may be, where points are sparse, than that of the whole scan."""
+"""Returns the curvature penalties for features of a length scale, in radii."""
 
 
 def fit_detail(
     sdf: NeuralSDF,
-    told: Told,
+    data: LocalData,
     features: int,
     rng: np.random.Generator,
     device: str,
     advance: ProgressCallback = ignore_progress,
     shape: ShapingFor | None = None,
+    *,
+    parameters: LocalFieldParameters = LocalFieldParameters(),
 ) -> Detail:
-    """Return what to add to a global field.
+    """Return the local fields that are added to a global field.
 
     Parameters
     ----------
     sdf : the global field, in the samples' frame
-    told : the samples, what the field leaves over at them, and what is believed about them
+    data : the samples, the residuals of the global field at them, and their length scale and noise
     features : number of features a cube
     rng : draws features and samples of the volume
     device : a torch device
-    advance : told of the share that is done
-    shape : gives what is asked of the surface besides, for the length of the detail
+    advance : called with the share that is done
+    shape : gives the curvature penalties for the length scale of the local fields
     """
-    samples, leftover, belief = told.samples, told.leftover, told.belief
+    samples, leftover, belief = data.samples, data.leftover, data.belief
     _log.info(
         "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",
         belief.length,
@@ -81,19 +68,27 @@ def fit_detail(
     )
     coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
     shaping = None if shape is None else shape(belief.length)
-    return _Cubes.of(leftover, belief, features, rng, device, shaping).detail(sdf, coarse, rng, advance)
+    cubes = _Cubes.of(leftover, belief, features, rng, device, shaping, parameters)
+    return cubes.detail(sdf, coarse, rng, part(advance, parameters.selection_time_share, 1.0))
 
 
-def cube_length(belief: Belief, disks: Float, radius: float) -> float:
-    """Return the length of a cube: longer where its points lie farther apart.
+def cube_length(
+    belief: Belief,
+    disks: Float,
+    radius: float,
+    *,
+    most_length_stretch: float = LocalFieldParameters.most_length_stretch,
+) -> float:
+    """Return the length scale of a cube: longer where its points lie farther apart.
 
     Parameters
     ----------
     belief : of the whole scan
     disks : array of shape (N,), radii of the disks that the cube's points stand for
     radius : their median in the whole scan
+    most_length_stretch : most that a cube's length scale may exceed the scan's
     """
-    return belief.length * min(max(float(np.median(disks) / radius), 1.0), LONGER)
+    return belief.length * min(max(float(np.median(disks) / radius), 1.0), most_length_stretch)
 
 
 @dataclass(frozen=True)
@@ -106,6 +101,7 @@ class _Cubes:
     partition: Partition
     device: str
     shaping: Shaping | None
+    parameters: LocalFieldParameters
 
     @classmethod
     def of(
@@ -116,14 +112,15 @@ class _Cubes:
         rng: np.random.Generator,
         device: str,
         shaping: Shaping | None,
+        parameters: LocalFieldParameters,
     ) -> _Cubes:
         """Return the cubes of a belief's length, each of `count` features."""
         like = torch.zeros(0, dtype=torch.float64, device=device)
-        cell = CELL * belief.length
+        cell = parameters.cube_edge_lengths * belief.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(leftover.points.min(axis=0) - 0.137 * cell, cell)
         features = Features.draw(count, rng, like)
-        return cls(leftover, belief, features, partition, device, shaping)
+        return cls(leftover, belief, features, partition, device, shaping, parameters)
 
     def detail(
         self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: ProgressCallback
@@ -131,20 +128,21 @@ class _Cubes:
         """Fit all cubes that hold data."""
         keys, _ = self.partition.members(self.leftover.points)
         volumes = self._volumes(sdf, coarse, keys, rng)
-        reach = self.partition.reach + BEYOND * self.leftover.density.radius
+        reach = self.partition.reach + self.parameters.data_margin_disk_radii * self.leftover.density.radius
         radius, disks = self.leftover.density.radius, self.leftover.density.disks
 
         def solved(number: int) -> tuple[float, Tensor] | None:
             """Return the length and amplitudes of a cube, or None where it holds too few points."""
             center = self.partition.center(keys[number])
             rows = self.leftover.within(center, reach)
-            if len(rows) < LEAST_POINTS:
+            if len(rows) < self.parameters.least_points:
                 return None
-            length = cube_length(self.belief, disks[rows], radius)
+            stretch = self.parameters.most_length_stretch
+            length = cube_length(self.belief, disks[rows], radius, most_length_stretch=stretch)
             patch = self.leftover.patch(rows, center, volumes[number], self.device)
             return length, self._solved(PatchSystem(patch, self.features, length, patch.size), length, center)
 
-        cubes = abreast(solved, range(len(keys)), self.device, part(advance, CHOSEN, 1.0))
+        cubes = abreast(solved, range(len(keys)), self.device, advance)
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
@@ -159,16 +157,16 @@ class _Cubes:
 
     def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
         """Return samples of each cube that lie clear of the data, with bounds that the coarse distance sets."""
-        centers = self.partition.center(keys)
-        x = centers[:, None, :] + self.partition.reach * rng.uniform(-1.0, 1.0, (len(keys), VOLUME, 3))
-        cube = np.repeat(np.arange(len(keys)), VOLUME)
+        centers, count = self.partition.center(keys), self.parameters.volume_samples
+        x = centers[:, None, :] + self.partition.reach * rng.uniform(-1.0, 1.0, (len(keys), count, 3))
+        cube = np.repeat(np.arange(len(keys)), count)
         x = x.reshape(-1, 3)
         inside = ((x > sdf.box.lower) & (x < sdf.box.upper)).all(axis=1)
         x, cube = x[inside], cube[inside]
-        clear, signed, distance, certain = coarse.at(x, CLEAR)
+        clear, signed, distance, certain = coarse.at(x, self.parameters.clearance_disk_radii)
         x, cube = x[clear], cube[clear]
         if self.shaping is not None:
-            signed = self.shaping.told(x, signed)
+            signed = self.shaping.volume_distances(x, signed)
         own = sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
         ends = np.searchsorted(cube, np.arange(1, len(keys)))
         parts = (np.split(values, ends) for values in (x, own, signed, certain, distance))

@@ -134,11 +134,11 @@ class Shaping:
         """Values of the global field at the points of the free space, of shape (Q,)."""
         return self.sdf.sdf(self.sdf.frame.to_world(self.free.points)) / self.sdf.frame.scale
 
-    def told(self, x: Float, signed: Float) -> Float:
+    def volume_distances(self, x: Float, signed: Float) -> Float:
         """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
         if not any(one.holes for one in self.wanted):
             return signed
-        return self.sheet.told(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
+        return self.sheet.volume_distances(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
 
     def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
         """Return what is asked of the surface at some of its points.
@@ -212,7 +212,7 @@ def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.ran
 def _volume(shaping: Shaping, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
     """Return points of the volume, of shape (Q, 3), and what their signed distances should be, of shape (Q,)."""
     x, distance = scene.volume(count, rng)
-    return x, shaping.told(x, distance)
+    return x, shaping.volume_distances(x, distance)
 
 
 def _linear_part(sdf: NeuralSDF, terms: Sequence[Term], amplitudes: Tensor) -> tuple[FieldProblem, Tensor, Tensor]:
@@ -289,7 +289,7 @@ class Sheet:
         kept = _joined(points, far == 0.0, JOINED * np.sqrt(scanned / count))
         return cls(points[kept], far[kept])
 
-    def told(self, x: Float, signed: Float, value: Float, density: Density) -> Float:
+    def volume_distances(self, x: Float, signed: Float, value: Float, density: Density) -> Float:
         """Return coarse signed distances, with those to the far part where it is nearer than all scanned points.
 
         Parameters

@@ -1,11 +1,13 @@
-"""The fit of any scan by default: a smooth global field, and detail that the data itself asks for.
+"""The default fit: a smooth global field, and local fields that correct it near the data.
 
-Both are sine features with output weights that solve linear systems, one Gauss-Newton step each, which is exact because
-the field is linear in them (variable projection). The global field, of at most `COARSE_POINTS` points and long
-features, gives sign, free space and the closing of holes; it is kept smooth, because what it learned of the noise no
-detail could take back. Some points are left out of it, on which length and noise of the detail are chosen (`choose`),
-so that clean scans are interpolated and noisy ones smoothed, without a setting. Then the detail is solved (`detail`).
-What is asked of the surface besides (`regulariser`) bends both, the global field before the detail.
+Both are sums of sine features whose output weights solve linear least-squares problems: one Gauss-Newton step, which is
+exact because the field is linear in the weights (variable projection). The steps, in the order of `fit_two_level`:
+
+1. Prepare the data: snap a ball, turn contradicted normals around, extend faces to sharp edges and across holes.
+2. Fit the global field (`global_field`), without validation points; leave out outliers and fit it again.
+3. Apply the curvature penalties, if any, to the global field (`regularised`).
+4. Choose length scale and noise on the validation points (`denoising`, `model_selection`), then fit the local fields
+   (`local_fields`), or those of a large scan by blocks (`blocks.solve`).
 """
 
 from __future__ import annotations
@@ -15,17 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit.blocks.solve import LARGE, fit_large
-from gnrecon.fit.consistency import outlying, reconciled
-from gnrecon.fit.denoising import Told, told
+from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
+from gnrecon.fit.denoising import LocalData, choose_local_data
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import GlobalField, fit_global
-from gnrecon.fit.local_fields import CHOSEN, ShapingFor, fit_detail
+from gnrecon.fit.local_fields import ShapingFor, fit_detail
+from gnrecon.fit.parameters import FitParameters
 from gnrecon.fit.regularised import Free, Shaping, bend_global
 from gnrecon.fit.shape_priors.ball_fit import Ball
 from gnrecon.fit.shape_priors.hole_completion import Continued, continued
 from gnrecon.fit.shape_priors.sharp_shape import Sharp
+from gnrecon.fit.summary import FitSummary, describe
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
@@ -33,103 +38,34 @@ from gnrecon.optim import Solution
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
 
-COARSE_POINTS = 5000
-"""Most points that the global field sees."""
 
-HELD_SHARE, HELD_MOST = 6, 2000
-"""One point in so many is left out of the global field; up to so many where the detail is not solved by blocks."""
-
-SHARE = 0.25
-"""Share of the time after which the global field is there."""
-
-
-@dataclass(frozen=True)
-class _Task:
-    """What is fitted.
-
-    Parameters
-    ----------
-    samples : of the scan, and those that continue its faces to their edges and across holes
-    held : mask of shape (N,), of samples that the global field does not see
-    rows : of those that it sees
-    sharp : the faces, where they are continued to their edges
-    across : samples that were added across holes
-    """
-
-    samples: Samples
-    held: Mask
-    rows: Int
-    sharp: Sharp | None
-    across: Continued
-
-    @classmethod
-    def of(cls, samples: Samples, sharp: Sharp | None, by_blocks: bool, rng: np.random.Generator) -> _Task:
-        """Draw what is held out of a scan, whose faces may be continued."""
-        if sharp is not None:
-            samples = sharp.samples
-        order = rng.permutation(len(samples))
-        # Left-out points must lie near each other, so that those around a place tell of it alone.
-        out = len(samples) // HELD_SHARE if by_blocks else min(len(samples) // HELD_SHARE, HELD_MOST)
-        held: Mask = np.zeros(len(samples), dtype=bool)
-        held[order[:out]] = True
-        across = Continued.none() if sharp is None else sharp.across
-        return cls(samples, held, np.sort(order[out:][:COARSE_POINTS]), sharp, across)
-
-    def continued(self, rng: np.random.Generator) -> _Task:
-        """Return the task with samples across the holes; a scan whose faces are continued to their edges has them."""
-        if self.sharp:
-            return self
-        across = continued(self.samples.points, self.samples.normals, not self.samples.estimated)
-        if not len(across):
-            return self
-        points, normals = across.joined(self.samples.points, self.samples.normals)
-        held = np.concatenate([self.held, np.zeros(len(across), dtype=bool)])
-        # As many of them as of the points that are not held out.
-        share = len(self.rows) / max(len(self.samples) - int(self.held.sum()), 1)
-        seen = len(self.samples) + np.flatnonzero(rng.random(len(across)) < share)
-        rows = np.concatenate([self.rows, seen])
-        return _Task(replace(self.samples, points=points, normals=normals), held, rows, None, across)
-
-    def without(self, off: Mask) -> _Task:
-        """Return what is left without some samples, of a scan whose faces are not continued."""
-        kept = ~off
-        seen = np.zeros(len(off), dtype=bool)
-        seen[self.rows] = True
-        rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
-        return _Task(rest, self.held[kept], np.flatnonzero(seen[kept]), None, Continued.none())
-
-    def told(self, sdf: NeuralSDF, options: FitOptions, rng: np.random.Generator, outliers: bool) -> Told:
-        """Return what the samples tell beside a global field; `outliers` says whether some were found among them."""
-        if self.sharp is not None:
-            return Told.of_faces(sdf, self.sharp)
-        return told(sdf, self.samples, self.held, options.features, rng, options.device, outliers)
-
-
-def fit_adaptive(
+def fit_two_level(
     samples: Samples,
     options: FitOptions,
     rng: np.random.Generator,
     advance: ProgressCallback = ignore_progress,
     folder: str | Path | None = None,
     scheduler: str | None = None,
+    *,
+    parameters: FitParameters = FitParameters(),
 ) -> tuple[NeuralSDF, Solution]:
-    """Fit a global field and its detail; `advance` is told of the share that is done.
+    """Fit a global field and local fields.
 
-    The detail of a large scan is solved by blocks (`large`), whose work is kept in a folder where one is given; then a
-    Dask cluster can solve them, too.
+    An interrupt (Ctrl-C) while the local fields are solved leaves the global field.
 
-    The points of a ball are laid on it first (`ball`), and the faces of a sharp shape are continued to their edges
-    (`sharp`), planes and cylinders of any across its holes (`holes`).
-
-    Normals that were estimated are turned around where a first field contradicts them, and points that lie off the
-    surface of their neighbours are left out.
-
-    An interrupt (Ctrl-C) while the detail is solved leaves the global field.
+    Parameters
+    ----------
+    samples : points and normals in the unit ball
+    options : choices of the fit
+    rng : draws validation points, features and volume samples
+    advance : called with the share that is done
+    folder : where the work is kept; the local fields are then solved by blocks, as those of a large scan always are
+    scheduler : address of a Dask scheduler that solves the blocks
 
     Raises
     ------
     UsageError
-        When regularisers are asked for of a fit by blocks.
+        When curvature penalties are requested for a fit by blocks.
     FitError
         When a linear system cannot be solved.
     """
@@ -139,97 +75,191 @@ def fit_adaptive(
             f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; "
             "thin the scan with --max-points."
         )
-    edges = not (by_blocks or options.regularisers)
-    ball = Ball.of(samples) if edges else None
-    scanned = len(samples)
-    samples = samples if ball is None else ball.samples
-    sharp = Sharp.of(samples) if edges and not samples.estimated else None
-    task = _Task.of(samples, sharp, by_blocks, rng)
-    turned, left_out = 0.0, 0
-    if samples.estimated:
-        samples, turned = reconciled(samples, task.rows, options)
-        sharp = Sharp.of(samples) if edges else None
-        task = replace(task, samples=samples) if sharp is None else _Task.of(samples, sharp, by_blocks, rng)
-    whole = task
-    closes = not options.regularisers  # which say themselves how holes are closed
-    task = task.continued(rng) if closes else task
-    first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, 0.0, SHARE / 2))
-    if not by_blocks:  # of so many points, distances alone tell the outliers
-        off = outlying(first.sdf.sdf(samples.frame.to_world(samples.points)), Density(samples.points))
-        left_out = int(off.sum())
-        if left_out:
-            samples = replace(samples, points=samples.points[~off], normals=samples.normals[~off])
-            task = _Task.of(samples, Sharp.of(samples), by_blocks, rng) if task.sharp else whole.without(off)
-            task = task.continued(rng) if closes else task
-            first = fit_global(task.samples, task.held, task.rows, options, rng, part(advance, SHARE / 2, SHARE))
-    sdf = first.sdf
-    shape = None
-    if options.regularisers:
-        sdf, shape = _shaped(first, task.samples, options, rng)
-    rest = part(advance, SHARE, 1.0)
-    known = None
+    steps = _Steps(options, by_blocks, rng, parameters)
+    share = parameters.two_level.global_time_share
+    ball = steps.detect_ball(samples)
+    data, flipped_share = steps.prepare(samples if ball is None else ball.samples)
+    data, first, outliers = steps.fit_global(data, part(advance, 0.0, share))
+    sdf, shaping = steps.apply_penalties(first, data)
     try:
-        if by_blocks:
-            detail = fit_large(sdf, task.samples, task.held, options, rng, folder, rest, scheduler)
-        else:
-            known = task.told(sdf, options, rng, left_out > 0)
-            rest(CHOSEN)
-            detail = fit_detail(sdf, known, options.features, rng, options.device, rest, shape)
+        rest = part(advance, share, 1.0)
+        detail, averaging_width = steps.fit_local(sdf, data, shaping, outliers > 0, rest, folder, scheduler)
     except KeyboardInterrupt:
-        status = "Interrupted before the detail was solved: this is the smooth global field alone."
+        status = "Interrupted before the local fields were solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
-    chosen = detail.as_dict(samples.frame.scale)
-    also = f" Turned {100 * turned:.2g} % of the normals around, which a first field contradicted." if turned else ""
-    also += f" Left out {left_out} points that lie off the surface of their neighbours." if left_out else ""
-    if known is not None and known.averaging is not None:
-        also += f" Averaged noisy points over {known.averaging.width:g} of their disks' radii, where normals agree."
-    if ball is not None:
-        also += (
-            f" Laid {scanned} points on a ball of radius {ball.radius:.6g}, from which their noise cannot tell them, "
-            f"and filled its gaps by {len(ball.samples) - scanned} samples."
-        )
-    if task.sharp is not None:
-        also += _laid(task.sharp)
-        also += f" Continued faces to their edges by {len(task.samples) - len(samples) - len(task.across)} samples."
-    if task.across.holes:
-        also += f" Continued planes and cylinders across {_holes(task.across.holes)} by {len(task.across)} samples."
-    if task.sharp is None:
-        beside = f"noise {chosen['position_noise']:.2g} in position and {chosen['angle_noise']:.2g} degrees in normals"
-    else:
-        beside = "as short as its sharp faces can tell apart"
-    status = (
-        f"Solved the global field and {chosen['cubes']} cubes of detail exactly; chosen from the data: features of "
-        f"length {chosen['length']:.3g}, {beside}.{also}{_asked(options)}"
+    summary = replace(
+        _summary(detail, data, options),
+        flipped_share=flipped_share,
+        outliers=outliers,
+        averaging_width=averaging_width,
+        ball_radius=None if ball is None else ball.radius,
+        ball_points=len(samples),
+        ball_samples=0 if ball is None else len(ball.samples) - len(samples),
     )
-    return replace(sdf, detail=detail), replace(first.solution, status=status, method="Exact linear least squares.")
+    solution = replace(first.solution, status=describe(summary), method="Exact linear least squares.")
+    return replace(sdf, detail=detail), solution
 
 
-def _laid(sharp: Sharp) -> str:
-    """Return a sentence about points that were laid on surfaces, after a blank, or nothing."""
-    if sharp.laid is None:
-        return ""
-    laid = sharp.laid
-    return (
-        f" Laid {int(laid.on.sum())} points on {laid.surfaces} planes, cylinders and spheres, "
-        "from which the noise cannot tell them."
+@dataclass(frozen=True)
+class _Data:
+    """What the fields are fitted to.
+
+    Parameters
+    ----------
+    scan : the points of the scan that are used
+    samples : these, and samples that extend its faces to their edges and across holes
+    held_out : mask of shape (N,), of the samples that the global field does not see: the validation points
+    seen : rows of the samples that it sees
+    sharp : the extended faces of a shape with sharp edges, or None
+    across : samples that were added across holes
+    """
+
+    scan: Samples
+    samples: Samples
+    held_out: Mask
+    seen: Int
+    sharp: Sharp | None
+    across: Continued
+
+    def across_holes(self, rng: np.random.Generator) -> _Data:
+        """Return the data with samples across the holes; a shape with sharp edges has them already."""
+        if self.sharp is not None:
+            return self
+        across = continued(self.samples.points, self.samples.normals, not self.samples.estimated)
+        if not len(across):
+            return self
+        points, normals = across.joined(self.samples.points, self.samples.normals)
+        held_out = np.concatenate([self.held_out, np.zeros(len(across), dtype=bool)])
+        # The global field sees the same share of them as of the points that are not held out.
+        share = len(self.seen) / max(len(self.samples) - int(self.held_out.sum()), 1)
+        added = len(self.samples) + np.flatnonzero(rng.random(len(across)) < share)
+        samples = replace(self.samples, points=points, normals=normals)
+        return _Data(self.scan, samples, held_out, np.concatenate([self.seen, added]), None, across)
+
+    def without(self, outliers: Mask) -> _Data:
+        """Return the data without some points, of a scan to which no samples were added."""
+        kept = ~outliers
+        seen = np.zeros(len(outliers), dtype=bool)
+        seen[self.seen] = True
+        rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
+        return _Data(rest, rest, self.held_out[kept], np.flatnonzero(seen[kept]), None, Continued.none())
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The steps of one fit, with what all of them need."""
+
+    options: FitOptions
+    by_blocks: bool
+    rng: np.random.Generator
+    parameters: FitParameters
+
+    @property
+    def _finds_edges(self) -> bool:
+        """Whether balls and sharp edges are looked for."""
+        return not (self.by_blocks or self.options.regularisers)
+
+    def detect_ball(self, samples: Samples) -> Ball | None:
+        """Return the samples snapped to a ball, or None of any other shape."""
+        return Ball.of(samples) if self._finds_edges else None
+
+    def prepare(self, scan: Samples) -> tuple[_Data, float]:
+        """Return the data with faces extended to sharp edges, and the share of normals that were turned around."""
+        sharp = Sharp.of(scan) if self._finds_edges and not scan.estimated else None
+        data = self._draw(scan, sharp)
+        if not scan.estimated:
+            return data, 0.0
+        scan, flipped_share = flip_contradicted_normals(scan, data.seen, self.options)
+        sharp = Sharp.of(scan) if self._finds_edges else None
+        data = replace(data, scan=scan, samples=scan) if sharp is None else self._draw(scan, sharp)
+        return data, flipped_share
+
+    def fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField, int]:
+        """Return the completed data, the global field, and the number of outliers that were left out of both."""
+        completed, first = self._fit_global(data, part(advance, 0.0, 0.5))
+        # Of large scans, the distances of ingest have found the outliers.
+        if self.by_blocks:
+            return completed, first, 0
+        scan = data.scan
+        outliers = find_outliers(first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points))
+        if not outliers.any():
+            return completed, first, 0
+        if data.sharp is None:
+            data = data.without(outliers)
+        else:
+            scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
+            data = self._draw(scan, Sharp.of(scan))
+        return *self._fit_global(data, part(advance, 0.5, 1.0)), int(outliers.sum())
+
+    def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, ShapingFor | None]:
+        """Return the global field after curvature penalties, and what gives those of a local length scale, if any."""
+        penalties = self.options.regularisers
+        if not penalties:
+            return first.sdf, None
+        density = Density(data.samples.points)
+        free = Free.of(first.scene, self.rng)
+        shaping = Shaping.of(penalties, first.sdf, density, free, first.length, self.rng)
+        bent = bend_global(shaping, first.scene, self.options, self.rng)
+        return bent, lambda length: Shaping.of(penalties, bent, density, free, length, self.rng)
+
+    def fit_local(
+        self,
+        sdf: NeuralSDF,
+        data: _Data,
+        shaping: ShapingFor | None,
+        outliers: bool,
+        advance: ProgressCallback,
+        folder: str | Path | None,
+        scheduler: str | None,
+    ) -> tuple[Detail, float | None]:
+        """Return the local fields, and the width over which points were averaged for them, in disk radii, or None."""
+        options, rng = self.options, self.rng
+        if self.by_blocks:
+            return fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler), None
+        if data.sharp is not None:
+            local = LocalData.of_faces(sdf, data.sharp)
+        else:
+            local = choose_local_data(
+                sdf, data.samples, data.held_out, options.features, rng, options.device, outliers=outliers
+            )
+        advance(self.parameters.local_fields.selection_time_share)
+        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, shaping)
+        return detail, None if local.averaging is None else local.averaging.width
+
+    def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
+        """Return the data with samples across holes, and the global field that is fitted to them."""
+        # A fit with curvature penalties closes holes by them.
+        completed = data if self.options.regularisers else data.across_holes(self.rng)
+        seen = completed.samples, completed.held_out, completed.seen
+        return completed, fit_global(*seen, self.options, self.rng, advance)
+
+    def _draw(self, scan: Samples, sharp: Sharp | None) -> _Data:
+        """Draw the validation points and those that the global field sees."""
+        limits = self.parameters.two_level
+        samples = scan if sharp is None else sharp.samples
+        order = self.rng.permutation(len(samples))
+        # By blocks, validation points must lie so densely that those around a place describe that place alone.
+        count = len(samples) // limits.validation_one_in
+        count = count if self.by_blocks else min(count, limits.most_validation_points)
+        held_out: Mask = np.zeros(len(samples), dtype=bool)
+        held_out[order[:count]] = True
+        seen = np.sort(order[count:][: limits.global_field_points])
+        return _Data(scan, samples, held_out, seen, sharp, Continued.none() if sharp is None else sharp.across)
+
+
+def _summary(detail: Detail, data: _Data, options: FitOptions) -> FitSummary:
+    """Return the part of the summary that the final data and the local fields determine."""
+    chosen = detail.as_dict(data.scan.frame.scale)
+    snapped = None if data.sharp is None else data.sharp.laid
+    return FitSummary(
+        cubes=len(detail),
+        length=chosen["length"],
+        position_noise=chosen["position_noise"],
+        angle_noise=chosen["angle_noise"],
+        snapped_points=0 if snapped is None else int(snapped.on.sum()),
+        primitives=0 if snapped is None else snapped.surfaces,
+        edge_samples=None if data.sharp is None else len(data.samples) - len(data.scan) - len(data.across),
+        hole_samples=len(data.across),
+        holes=data.across.holes,
+        regularisers=options.regularisers,
     )
-
-
-def _holes(count: int) -> str:
-    return "one hole" if count == 1 else f"{count} holes"
-
-
-def _asked(options: FitOptions) -> str:
-    """Return a sentence about what was asked of the surface besides, after a blank, or nothing."""
-    asked = ", ".join(f"{one.name} ({one.weight:g})" for one in options.regularisers)
-    return f" Asked of the surface besides, with its weight: {asked}." if asked else ""
-
-
-def _shaped(
-    first: GlobalField, samples: Samples, options: FitOptions, rng: np.random.Generator
-) -> tuple[NeuralSDF, ShapingFor]:
-    """Return the global field bent to the regularisers, and how the detail is to heed them."""
-    density, wanted = Density(samples.points), options.regularisers
-    free = Free.of(first.scene, rng)
-    bent = bend_global(Shaping.of(wanted, first.sdf, density, free, first.length, rng), first.scene, options, rng)
-    return bent, lambda shorter: Shaping.of(wanted, bent, density, free, shorter, rng)

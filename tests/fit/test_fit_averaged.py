@@ -9,7 +9,7 @@ import pytest
 
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import denoising as averaged
-from gnrecon.fit.denoising import NOISY, Told, _best, has_edges, told
+from gnrecon.fit.denoising import NOISY, LocalData, _best, choose_local_data, has_edges
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Choice, Leftover
 from gnrecon.fit.shape_priors.bilateral_filter import Averaging
@@ -95,7 +95,7 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
     samples = ball(300, 0.0, np.random.default_rng(4))
     leftover = Leftover(samples.points, samples.normals, np.zeros(300), samples.normals)
 
-    def result(position: float, estimated: bool) -> Told | None:
+    def result(position: float, estimated: bool) -> LocalData | None:
         """What is told of a noise, in radii of a point's disk; None where averaging was tried."""
         choice = Choice(Belief(0.1, position * leftover.density.radius, 0.1), np.zeros((2, 2)))
 
@@ -112,7 +112,7 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
         tried: list[bool] = []
         field: NeuralSDF = None  # type: ignore[assignment]
         given = replace(samples, estimated=estimated)
-        found = told(field, given, np.zeros(300, dtype=bool), 300, np.random.default_rng(0), "cpu")
+        found = choose_local_data(field, given, np.zeros(300, dtype=bool), 300, np.random.default_rng(0), "cpu")
         assert found.samples is given
         assert found.belief is choice.belief
         assert found.averaging is None

@@ -92,9 +92,7 @@ def test_the_fit_of_few_points_of_a_ball_is_a_ball() -> None:
     sdf, solution = fit(scan(80), FitOptions(quality="draft"))
     places = FRAME.to_world(CENTER + RADIUS * directions(2000, 3))
     assert np.abs(sdf.sdf(places)).max() < 2e-5 * FRAME.scale
-    assert (
-        "Laid 80 points on a ball of radius 16, from which their noise cannot tell them, and filled" in solution.status
-    )
-    # What is asked of the surface besides says itself how it goes on between the points.
+    assert "Snapped 80 points to a ball of radius 16. Filled gaps of the ball with" in solution.status
+    # A curvature penalty decides how the surface goes on between the points.
     _, smoothed = fit(scan(80), FitOptions(quality="draft", smooth="strain=1e-6"))
     assert "ball" not in smoothed.status

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.fit.consistency import reconciled
+from gnrecon.fit.consistency import flip_contradicted_normals
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.two_level import fit_adaptive
+from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 
@@ -38,7 +38,7 @@ def test_a_patch_on_the_wrong_side_is_turned_around(rng: np.random.Generator) ->
     right = sphere(900, rng)
     patch = np.linalg.norm(right.points - right.points[0], axis=1) < 0.15
     assert 2 < patch.sum() < 20
-    found, share = reconciled(turned(right, patch), np.arange(900), OPTIONS)
+    found, share = flip_contradicted_normals(turned(right, patch), np.arange(900), OPTIONS)
     assert np.array_equal(found.normals, right.normals)
     assert share == pytest.approx(patch.mean())
 
@@ -46,7 +46,7 @@ def test_a_patch_on_the_wrong_side_is_turned_around(rng: np.random.Generator) ->
 @pytest.mark.parametrize("shape", [sphere, plate])
 def test_right_normals_stay(shape: type, rng: np.random.Generator) -> None:
     right = shape(900, rng)
-    found, share = reconciled(right, np.arange(900), OPTIONS)
+    found, share = flip_contradicted_normals(right, np.arange(900), OPTIONS)
     assert np.array_equal(found.normals, right.normals)
     assert share == 0
 
@@ -58,5 +58,5 @@ def test_the_default_fit_turns_estimates(rng: np.random.Generator) -> None:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     right = replace(ball, points=ball.points * [1.0, 1.0, 0.8], normals=normals)
     wrong = turned(right, np.linalg.norm(right.points - right.points[0], axis=1) < 0.3)
-    status = fit_adaptive(wrong, OPTIONS, np.random.default_rng(0))[1].status
-    assert "of the normals around, which a first field contradicted." in status
+    status = fit_two_level(wrong, OPTIONS, np.random.default_rng(0))[1].status
+    assert "of the normals around: a first field contradicts them." in status

@@ -271,7 +271,7 @@ def test_a_fit_closes_a_corner_that_nobody_saw(tilt: float, most: float) -> None
     points, normals = noisy(*without(*whole, middle, 0.35), 0.002 if tilt else 0.0, tilt)
     hidden = whole[0][np.linalg.norm(whole[0] - middle, axis=1) < 0.3]
     sdf, solution = fit(Samples(points, normals, FRAME), FitOptions())
-    assert "Continued planes and cylinders across one hole" in solution.status
+    assert "Extended planes and cylinders across 1 hole with" in solution.status
     assert np.abs(sdf.sdf(FRAME.to_world(hidden))).mean() < most * FRAME.scale
 
 

@@ -22,11 +22,12 @@ from gnrecon.fit.blocks import block, workers
 from gnrecon.fit.blocks import solve as large
 from gnrecon.fit.blocks import workers as scheduled
 from gnrecon.fit.blocks.store import Work
-from gnrecon.fit.denoising import Told
+from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.fit_options import QUALITIES
-from gnrecon.fit.local_fields import CHOSEN, fit_detail
+from gnrecon.fit.local_fields import fit_detail
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Leftover
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
@@ -124,7 +125,7 @@ def test_a_cluster_that_loses_a_worker_changes_no_digit(
     with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **options) as cluster:
 
         def kill(share: float) -> None:
-            if not killed and share > CHOSEN:
+            if not killed and share > LocalFieldParameters.selection_time_share:
                 killed.append(cluster.workers[0].pid)
                 os.kill(killed[0], signal.SIGKILL)
 
@@ -155,7 +156,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    found = Told(samples, Leftover.of(sdf, samples), known())
+    found = LocalData(samples, Leftover.of(sdf, samples), known())
     single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)

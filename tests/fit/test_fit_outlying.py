@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.consistency import LEAST, LEAST_POINTS, MOST, outlying
+from gnrecon.fit.consistency import LEAST, LEAST_POINTS, MOST, find_outliers
 from gnrecon.geometry.signed_distance import Density
 
 COUNT = 1000
@@ -25,7 +25,7 @@ def field(x: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("noise", [0.0, 0.002, 0.01])
 def test_points_of_a_scan_are_kept(noise: float) -> None:
     x = ball(noise, np.random.default_rng(0))
-    assert not outlying(field(x), Density(x)).any()
+    assert not find_outliers(field(x), Density(x)).any()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002, 0.01])
@@ -34,23 +34,23 @@ def test_points_off_the_surface_are_found(noise: float) -> None:
     x = ball(noise, rng)
     off = rng.permutation(COUNT)[: int(2 * LEAST * COUNT)]
     x[off] *= 1 + rng.choice([-0.3, 0.3], (len(off), 1))
-    found = outlying(field(x), Density(x))
+    found = find_outliers(field(x), Density(x))
     np.testing.assert_array_equal(np.flatnonzero(found), np.sort(off))
 
 
 def test_a_single_one_is_chance() -> None:
     x = ball(0.0, np.random.default_rng(2))
     x[0] *= 1.2
-    assert not outlying(field(x), Density(x)).any()
+    assert not find_outliers(field(x), Density(x)).any()
 
 
 def test_many_are_no_outliers() -> None:
     x = ball(0.0, np.random.default_rng(3))
     x[: int(1.5 * MOST * COUNT)] *= 1.2
-    assert not outlying(field(x), Density(x)).any()
+    assert not find_outliers(field(x), Density(x)).any()
 
 
 def test_few_points_have_no_usual_difference() -> None:
     x = ball(0.0, np.random.default_rng(4))[: LEAST_POINTS - 1]
     x[0] *= 1.5
-    assert not outlying(field(x), Density(x)).any()
+    assert not find_outliers(field(x), Density(x)).any()

@@ -135,6 +135,8 @@ def test_a_sheet_knows_what_is_far() -> None:
     density = Density(samples.points[top])
     sheet = Sheet(samples.points, (samples.points[:, 2] > 0.95).astype(float))
     x = np.array([[0, 0, 1.2], [0, 0, 0.7], [0, 0, -1.3]])
-    told = sheet.told(x, np.full(3, 9.0), np.array([0.1, -0.1, 0.1]), density)
+    told = sheet.volume_distances(x, np.full(3, 9.0), np.array([0.1, -0.1, 0.1]), density)
     assert told == pytest.approx([0.2, -0.3, 9.0], abs=0.02)
-    assert Sheet(samples.points, np.zeros(600)).told(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(9.0)
+    assert Sheet(samples.points, np.zeros(600)).volume_distances(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(
+        9.0
+    )

@@ -199,20 +199,20 @@ def test_the_fit_of_a_sparse_cube_is_sharper_and_says_so(monkeypatch: pytest.Mon
         return float(np.mean(np.abs(value) / slope)) / FRAME.scale, solution.status
 
     continued, status = error()
-    assert "Continued faces to their edges by" in status
+    assert "Extended faces to their sharp edges with" in status
     assert "degrees in normals" not in status
-    assert ("points on 6 planes, cylinders and spheres" in status) == estimated
+    assert ("points to 6 detected planes, cylinders and spheres" in status) == estimated
     monkeypatch.setattr(Sharp, "of", classmethod(lambda *_: None))
     plain, status = error()
-    assert "Continued" not in status
+    assert "Extended" not in status
     assert continued < 0.7 * plain
 
 
-def test_the_fit_of_a_noisy_cube_says_how_many_points_are_laid_on_its_faces() -> None:
+def test_the_fit_of_a_noisy_cube_says_how_many_points_are_snapped_to_its_faces() -> None:
     _, solution = fit(cube(1500, noise=0.01), FitOptions(quality="draft"))
-    found = re.search(r"Laid (\d+) points on 6 planes, cylinders and spheres", solution.status)
+    found = re.search(r"Snapped ([\d,]+) points to 6 detected planes, cylinders and spheres", solution.status)
     assert found is not None
-    assert 1450 < int(found[1]) <= 1500
+    assert 1450 < int(found[1].replace(",", "")) <= 1500
 
 
 def test_acute_edges_are_edges_and_the_sides_of_a_sheet_are_none() -> None:

@@ -20,9 +20,10 @@ from gnrecon.field.partition_of_unity import OFFSETS, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, Work
 from gnrecon.fit.blocks.tree import Codes, Dipoles, morton
-from gnrecon.fit.local_fields import BEYOND, CLEAR, LEAST_POINTS, VOLUME, cube_length
+from gnrecon.fit.local_fields import cube_length
 from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.model_selection import Leftover, Volume
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Box, is_certain, side_of
 
@@ -121,9 +122,9 @@ class Blocks:
     def _cube(self, key: Int) -> tuple[float, Float] | None:
         """Return the length and amplitudes of a cube, or None where it holds too few points."""
         center, around = self.partition.center(key), self._around(key)
-        reach = self.partition.reach + BEYOND * self.radius
+        reach = self.partition.reach + LocalFieldParameters.data_margin_disk_radii * self.radius
         rows = around[(np.abs(self.leftover.points[around] - center) <= reach).all(axis=1)]
-        if len(rows) < LEAST_POINTS:
+        if len(rows) < LocalFieldParameters.least_points:
             return None
         length = cube_length(self.belief, self.disks[rows], self.radius)
         patch = self.leftover.patch(rows, center, self._volume(key, center, around), self.device)
@@ -143,11 +144,11 @@ class Blocks:
     def _volume(self, key: Int, center: Float, around: Int) -> Volume:
         """Return samples of the cube clear of the data, with the bounds that the coarse distance sets there."""
         rng = np.random.default_rng([self.seed, CHANCE, *(int(number) + 1 for number in key)])
-        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (VOLUME, 3))
+        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (LocalFieldParameters.volume_samples, 3))
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
         distance, nearest = cKDTree(self.leftover.points[around]).query(x)
         disks = self.disks[around][nearest]
-        clear = distance > CLEAR * disks
+        clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
         signed = side_of(winding) * np.sqrt(distance**2 - disks**2)

@@ -26,9 +26,9 @@ from gnrecon.fit.blocks.tree import Dipoles, morton, octree_blocks
 from gnrecon.fit.blocks.workers import solve_blocks, solve_scheduled
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_fields import CELL, CHOSEN
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Leftover, choose
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.parallel import slices
@@ -78,21 +78,23 @@ def fit_large(
     """
     leftover = Leftover.of(sdf, samples)
     belief = choose(leftover, held, leftover.density.radius, rng, options.device)
-    advance(CHOSEN)
+    chosen = LocalFieldParameters.selection_time_share
+    advance(chosen)
     like = torch.zeros(0, dtype=torch.float64, device=options.device)
     features = Features.draw(options.features, rng, like)
     # Off the data by a part of a cell that no regular scan shares, as in `detail`.
-    partition = Partition(leftover.points.min(axis=0) - 0.137 * CELL * belief.length, CELL * belief.length)
+    edge = LocalFieldParameters.cube_edge_lengths
+    partition = Partition(leftover.points.min(axis=0) - 0.137 * edge * belief.length, edge * belief.length)
     arrays, facts = _tasks(sdf, leftover, belief, features, partition, block_points)
     with _folder(folder) as place:
         work = Work.begin(place, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
         missing = [number for number in range(count) if not work.done(number)]
         if scheduler is not None and missing:
-            solve_scheduled(work, missing, scheduler, part(advance, CHOSEN, 1.0))
+            solve_scheduled(work, missing, scheduler, part(advance, chosen, 1.0))
         else:
             # As many as torch has threads, which is what was asked for, or the machine's cores.
-            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, CHOSEN, 1.0))
+            solve_blocks(work, missing, torch.get_num_threads(), options.device, part(advance, chosen, 1.0))
         return _gathered(work, count, arrays["keys"], partition, features, belief)
 
 
