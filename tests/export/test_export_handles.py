@@ -78,7 +78,7 @@ def test_necks_between_plates_are_cut(true_clip: Mesh) -> None:
     assert off(mesh, true_clip) > 0.09
     assert off(result, true_clip) < 0.04
     assert result.volume == pytest.approx(true_clip.volume, rel=0.002)
-    assert actions[0].startswith("Removed 6 handles or tunnels that no points support, of up to ")
+    assert actions[0].startswith("Removed 6 handles or tunnels that no points support, up to ")
     # What is far from the necks is as it was, normals included.
     kept = np.isin(mesh.vertices, result.vertices).all(axis=1)
     assert kept.mean() > 0.8

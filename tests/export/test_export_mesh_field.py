@@ -12,8 +12,8 @@ from analytic_fields import UTM, Field, torus
 
 from gnrecon.export import SignedDistance
 from gnrecon.export import mesh_field as meshing
-from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.export_parameters import ExportParameters, ResolutionParameters
+from gnrecon.export.mesh_field import MeshOptions, cells_for_curvature, mesh_field
 from gnrecon.export.resolution import chord_error
 from gnrecon.ingest.noise import neighbour_spacing
 from gnrecon.options import Options
@@ -66,9 +66,9 @@ def test_a_mesh_becomes_finer_until_the_error_is_small_enough(field: Precise) ->
     assert again.fineness.resolution == 20
 
 
-def test_what_the_limit_of_cells_reaches_is_said(field: Precise, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meshing, "MOST_REFINED", 30)
-    meshed = mesh_field(field, MeshOptions(resolution=20, max_error=1e-6), data=None)
+def test_what_the_limit_of_cells_reaches_is_said(field: Precise) -> None:
+    limited = ExportParameters(resolution=ResolutionParameters(most_refined_cells=30))
+    meshed = mesh_field(field, MeshOptions(resolution=20, max_error=1e-6), data=None, parameters=limited)
     assert meshed.fineness.resolution == 30
     assert meshed.actions[-1] == "That is not within 1e-06: the limit of 30 cells was reached."
 

@@ -8,7 +8,7 @@ from analytic_fields import UTM, Field, Function, sines, sphere, torus
 from sharp_fields import between, box, cylinder, extracted, lens, to_box_edges, to_cylinder_edges, to_lens_edge
 
 from gnrecon.export import project, quality, remesh, require_sound, sharpen, verify
-from gnrecon.export.remeshing.edge_table import CORNER, CREASE
+from gnrecon.export.remeshing.edge_table import VertexKind
 from gnrecon.export.remeshing.remesh import with_creases
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
@@ -64,8 +64,8 @@ def test_a_box_keeps_its_corners() -> None:
     field = Field(box())
     mesh = remesh(project(sharpen(extracted(field), field), field), field, 0.1)
     kinds = with_creases(mesh, field, 30.0).kinds()
-    assert np.count_nonzero(kinds == CORNER) == 8
-    assert np.count_nonzero(kinds == CREASE) > 80
+    assert np.count_nonzero(kinds == VertexKind.CORNER) == 8
+    assert np.count_nonzero(kinds == VertexKind.CREASE) > 80
     assert mesh.volume == pytest.approx(8 * 0.7 * 0.6 * 0.35, rel=1e-6)
 
 

@@ -151,7 +151,7 @@ def test_nested_shells_stay_oriented() -> None:
     assert len(actions) == 1
     inner, actions = kept(0.7, 0.3)
     assert inner.volume == pytest.approx(ball * (0.7**3 - 0.3**3), rel=0.02)
-    assert "Turned 2 components round" in actions[1]
+    assert "Reversed 2 components" in actions[1]
     for mesh in (outer, shell, inner):
         require_sound(mesh)
         assert mesh.normals is not None
