@@ -1,9 +1,9 @@
-"""Options from files and words: a configuration in TOML, tables in it for certain scans, and ``name=value`` words.
+"""Options from TOML files and from ``name=value`` words.
 
-A configuration has options by the names of `gnrecon.options.Options`, or as the command line spells them
-(``edge_length`` or ``edge-length``), ``reference``, a file to measure the mesh against, and ``timeout`` and ``memory``,
-the limits that a batch sets to each scan; a single run has none. Tables named ``[scans."PATTERN"]`` hold for the scans
-whose path ends so, as ``[scans."left/*.ply"]``. What comes later wins:
+A configuration has options by the names of `gnrecon.option_table.OptionTable`, or as the command line spells them
+(``edge_length`` or ``edge-length``); ``reference``, a file to measure the mesh against; and ``timeout`` and ``memory``,
+limits for each scan of a batch, which a single run ignores. Tables named ``[scans."PATTERN"]`` apply to scans whose
+path ends with the pattern, such as ``[scans."left/*.ply"]``. What comes later wins:
 
 1. the defaults,
 2. the configuration,
@@ -14,26 +14,16 @@ whose path ends so, as ``[scans."left/*.ply"]``. What comes later wins:
 from __future__ import annotations
 
 import tomllib
-import types
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin
 
 import tomli_w
 
-from gnrecon.options import Options
+from gnrecon.option_table import option_rows
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.version import __version__
-
-REFERENCE = "reference"
-
-LIMITS = ("timeout", "memory")
-
-_SCANS = "scans"
-
-_KNOWN = (*(option.name for option in fields(Options)), REFERENCE, *LIMITS)
 
 
 @dataclass(frozen=True)
@@ -42,9 +32,9 @@ class Settings:
 
     Parameters
     ----------
-    general : of all scans
-    tables : pattern of paths, and what holds for the scans that match it
-    given : of the command line
+    general : options for all scans
+    tables : pattern of paths, and options for the scans that match it
+    given : options of the command line
     source : the configuration that was read, or None
     """
 
@@ -54,12 +44,18 @@ class Settings:
     source: Path | None = None
 
     def of(self, scan: Path) -> dict[str, Any]:
-        """Return the values that hold for a scan: options, perhaps a reference, and limits."""
+        """Return the values for a scan: options, and perhaps a reference and limits."""
         found = dict(self.general)
         for pattern, table in self.tables:
             if PurePath(scan).match(pattern):
                 found |= table
         return {**found, **self.given}
+
+    def for_single_run(self, scan: Path) -> tuple[dict[str, Any], Path | None]:
+        """Return the options for a scan without the limits of a batch, and the reference, if any."""
+        values = self.of(scan)
+        reference = values.pop("reference", None)
+        return {name: value for name, value in values.items() if name in option_rows()}, reference
 
 
 def read_settings(path: Path | None, words: Sequence[str], given: Mapping[str, Any]) -> Settings:
@@ -74,31 +70,31 @@ def read_settings(path: Path | None, words: Sequence[str], given: Mapping[str, A
     Raises
     ------
     InputError
-        When the configuration is missing or no TOML.
+        When the configuration is missing or is not TOML.
     UsageError
         When an option is unknown, has a value of a wrong type, or is given twice.
     """
     tree = {} if path is None else _read(path)
     where = "" if path is None else f"{path}: "
-    tables = tree.pop(_SCANS, {})
+    tables = tree.pop("scans", {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise UsageError(f'{where}options for certain scans go into tables such as [scans."left/*.ply"].')
     folder = Path() if path is None else path.parent
     general = _checked(tree, where, folder)
-    particular = tuple((name, _checked(table, f"{where}{name}: ", folder)) for name, table in tables.items())
+    for_scans = tuple((name, _checked(table, f"{where}{name}: ", folder)) for name, table in tables.items())
     chosen = _checked(dict(map(_split, words)), "--set: ", Path())
     if twice := [name for name in chosen if name in given]:
         raise UsageError(f"The option {twice[0]} is given twice, by --set and by its own name.")
-    return Settings(general, particular, {**chosen, **given}, path)
+    return Settings(general, for_scans, {**chosen, **given}, path)
 
 
 def settings_text(values: Mapping[str, Any], scan: Path) -> str:
-    """Return a configuration that holds all options in effect, so that a run with it makes the same mesh.
+    """Return a configuration with all options in effect, so that a run with it makes the same mesh.
 
     Parameters
     ----------
-    values : every option, and perhaps ``reference``; an option without a value is left out, which means the same
-    scan : that it belongs to
+    values : every option, and perhaps ``reference``; None is left out, which has the same effect
+    scan : whose options these are
     """
     plain = {name: _plain(value) for name, value in values.items() if value is not None}
     head = f"# All options in effect, for {scan.name}, of gnrecon {__version__}.\n"
@@ -115,7 +111,7 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"The configuration {path} cannot be read: {error.strerror or error}.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"The configuration {path} is no TOML: {error}.") from error
+        raise InputError(f"The configuration {path} is not TOML: {error}.") from error
 
 
 def _split(word: str) -> tuple[str, Any]:
@@ -126,73 +122,51 @@ def _split(word: str) -> tuple[str, Any]:
 
 
 def _checked(table: Mapping[str, Any], where: str, folder: Path) -> dict[str, Any]:
-    """The values of a table by the options' own names, each of its type."""
+    """The values of a table by option name, each of the option's type; paths are relative to the folder."""
+    known = (*option_rows(), "reference", "timeout", "memory")
     found: dict[str, Any] = {}
     for key, value in table.items():
         name = key.replace("-", "_")
-        if name not in _KNOWN:
-            raise UsageError(f"{where}there is no option {key!r}; the options are {', '.join(_KNOWN)}.")
+        if name not in known:
+            raise UsageError(f"{where}there is no option {key!r}; the options are {', '.join(known)}.")
         if name in found:
             raise UsageError(f"{where}{name} is there twice, with a hyphen and without.")
-        found[name] = _valued(name, value, where, folder)
+        if name in ("timeout", "memory"):
+            found[name] = str(value)
+        else:
+            found[name] = folder / str(value) if name == "reference" else typed(name, value, where)
     return found
 
 
-def _valued(name: str, value: Any, where: str, folder: Path) -> Any:
-    if name in LIMITS:
-        return str(value)
-    return folder / str(value) if name == REFERENCE else typed(name, value, where)
-
-
-_WORDS = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "text",
-}
-
-
-# Values of options, of the type that the option has, from what TOML or a word of the command line says.
-
-
 def typed(name: str, value: Any, where: str = "") -> Any:
-    """Return an option's value, of a type that `Options` declares for it.
+    """Return an option's value as one of the option's types.
 
-    Text is taken for what TOML would read from it, where text itself is none of the types; lists of whole numbers and
-    of texts may be written with commas.
+    Text is read as a TOML value, unless the option takes text. Lists may also be written with commas.
 
     Parameters
     ----------
     name : of the option
-    value : as TOML has it, or text
-    where : said before the sentence of an error
+    value : from TOML, or text
+    where : start of an error's sentence
 
     Raises
     ------
     UsageError
-        When the value is of another type.
+        When the value has another type.
     """
-    kinds = _kinds(name)
+    kinds = option_rows()[name].types
     for kind in kinds:
-        found = _as(kind, value)
+        found = _converted(kind, value)
         if found is not None:
             return found
-    expected = " or ".join(dict.fromkeys(_words(kind) for kind in kinds))
+    expected = " or ".join(dict.fromkeys(_described(kind) for kind in kinds))
     raise UsageError(f"{where}{name} must be {expected}, not {value!r}.")
 
 
-@cache
-def _kinds(name: str) -> tuple[Any, ...]:
-    """The types of an option beside None, numbers first, so that text is tried last."""
-    hint = get_type_hints(Options)[name]
-    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    return tuple(sorted((kind for kind in kinds if kind is not type(None)), key=lambda kind: kind is str))
-
-
-def _as(kind: Any, value: Any) -> Any:
-    """The value as one of a type; None where it is none."""
+def _converted(kind: Any, value: Any) -> Any:
+    """The value as one of a type; None where it is not one."""
     if get_origin(kind) is tuple:
-        return _items(get_args(kind)[0], value)
+        return _converted_items(get_args(kind)[0], value)
     if kind is str:
         return value if isinstance(value, str) else None
     read = _read_value(value) if isinstance(value, str) else value
@@ -201,25 +175,25 @@ def _as(kind: Any, value: Any) -> Any:
     return read if type(read) is kind else None
 
 
-def _items(kind: Any, value: Any) -> tuple[Any, ...] | None:
+def _converted_items(kind: Any, value: Any) -> tuple[Any, ...] | None:
     if isinstance(value, str) and kind is str:
         return (value,)
     if isinstance(value, str):
         read = _read_value(value)
         value = read if isinstance(read, list) else [_read_value(part) for part in value.split(",")]
-    items = [_as(kind, item) for item in value] if isinstance(value, list) else [_as(kind, value)]
+    items = [_converted(kind, item) for item in value] if isinstance(value, list) else [_converted(kind, value)]
     return None if any(item is None for item in items) else tuple(items)
 
 
 def _read_value(text: str) -> Any:
-    """What TOML reads from text; the text itself where that is nothing."""
+    """The TOML value that a text stands for; the text itself where it stands for none."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (tomllib.TOMLDecodeError, KeyError):
         return text
 
 
-def _words(kind: Any) -> str:
+def _described(kind: Any) -> str:
     if get_origin(kind) is tuple:
-        return f"a list of which each is {_WORDS[get_args(kind)[0]]}"
-    return _WORDS[kind]
+        return "a list of texts" if get_args(kind)[0] is str else "a list of whole numbers such as 2000 or 32,32,32"
+    return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]

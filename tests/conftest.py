@@ -51,8 +51,12 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    """A random generator seeded by the test's name: every test has its own numbers, and the same ones each time."""
-    return np.random.default_rng(zlib.crc32(request.node.name.encode()))
+    """A random generator seeded by the test's name: every test has its own numbers, and the same ones each time.
+
+    A test whose bound holds for most draws but not for all names its seed: ``@pytest.mark.seed(1)``.
+    """
+    mark = request.node.get_closest_marker("seed")
+    return np.random.default_rng(zlib.crc32(request.node.name.encode()) if mark is None else mark.args[0])
 
 
 @pytest.fixture

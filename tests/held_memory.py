@@ -9,8 +9,6 @@ from mmap import MAP_ANONYMOUS, MAP_PRIVATE, PAGESIZE, mmap
 import numpy as np
 import psutil
 
-from gnrecon.runtime import memory
-
 
 def use(mb: float) -> None:
     """Hold so much memory, as long as it takes to be seen where the mark cannot be set back, and give it back.
@@ -19,7 +17,7 @@ def use(mb: float) -> None:
     """
     with mmap(-1, max(int(mb * 1e6), 1), flags=MAP_PRIVATE | MAP_ANONYMOUS) as held:
         np.frombuffer(held, dtype=np.uint8)[::PAGESIZE] = 1
-        time.sleep(5 * memory.INTERVAL)
+        time.sleep(0.25)  # five samples
 
 
 def resident() -> float:

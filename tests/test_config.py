@@ -54,13 +54,13 @@ def test_a_reference_lies_beside_the_configuration(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("resolution = ", "is no TOML"),
+        ("resolution = ", "is not TOML"),
         ("resolutions = 3", "there is no option 'resolutions'; the options are read_points, crop"),
         ("resolution = 'fine'", "resolution must be a whole number, not 'fine'"),
         ("resolution = 1.5", "resolution must be a whole number, not 1.5"),
         ("adaptive = 1", "adaptive must be true or false, not 1"),
         ("quality = 3", "quality must be text, not 3"),
-        ("widths = ['a']", "widths must be a list of which each is a whole number"),
+        ("widths = ['a']", "widths must be a list of whole numbers such as 2000 or 32,32,32, not"),
         ("max-points = 1\nmax_points = 2", "max_points is there twice"),
         ("scans = 3", "go into tables such as"),
         ("[scans]\nseed = 3", "go into tables such as"),

@@ -9,10 +9,14 @@ from typing import Any
 
 import pytest
 
-from gnrecon.cli.app import batch_command, parse_widths, reconstruct_command
+from gnrecon.cli.batch_command import batch_command
+from gnrecon.cli.reconstruct_command import reconstruct_command
+from gnrecon.config import typed
 from gnrecon.export import RefineOptions
 from gnrecon.fit import FitOptions
 from gnrecon.ingest import prepare
+from gnrecon.io.io_parameters import IOParameters
+from gnrecon.option_table import option_rows
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
 
@@ -47,7 +51,7 @@ from gnrecon.runtime.errors import UsageError
         ({"smooth": "strain=much"}, "weight of smooth must be a positive number, as in strain=1e-4, not 'much'"),
         ({"fill": "maximal"}, "option fill takes minimal=WEIGHT or minimal alone, .* not 'maximal'"),
         ({"prior": "developable=inf"}, "weight of prior must be a positive number, .* not 'inf'"),
-        ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior belong to the default fit"),
+        ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior are for the default fit"),
         ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
     ],
 )
@@ -112,10 +116,25 @@ def test_the_command_line_has_every_option_with_the_same_default(command: Any) -
     parameters = inspect.signature(command).parameters
     for option in fields(Options):
         if option.name in ("work_dir", "block_scheduler") and command is batch_command:
+            assert option.name not in parameters
             continue  # a folder for the work of one scan, and the cluster that shares it
         assert parameters[option.name].default == option.default, option.name
 
 
+def test_defaults_of_the_table_are_those_of_the_stages() -> None:
+    assert Options().read_points == IOParameters.most_points
+    assert Options().feature_angle == RefineOptions.feature_angle
+    fit = FitOptions()
+    assert (Options().normal_residual, Options().quality, Options().seed) == (fit.normals, fit.quality, fit.seed)
+
+
+def test_the_docstring_has_every_option() -> None:
+    assert Options.__doc__ is not None
+    for row in option_rows().values():
+        assert f"{row.name} : " in Options.__doc__
+        assert row.help in Options.__doc__
+
+
 def test_widths_are_read_from_text() -> None:
-    assert parse_widths("2000") == (2000,)
-    assert parse_widths("32,32,32") == (32, 32, 32)
+    assert typed("widths", "2000") == (2000,)
+    assert typed("widths", "32,32,32") == (32, 32, 32)

@@ -106,7 +106,7 @@ def test_shapes_that_leave_nothing(sdf: NeuralSDF) -> None:
         shaped(sdf, OPTIONS, Shape(offset=-1.2 * BIG))
     with pytest.raises(UsageError, match="leaves nothing"):
         shaped(sdf, OPTIONS, Shape(shell=1.2 * BIG))
-    with pytest.raises(UsageError, match="The crop lies outside of the model, whose box is"):
+    with pytest.raises(UsageError, match="The crop lies outside of the model; the box of the model is"):
         shaped(sdf, OPTIONS, Shape(crop=box(3.0, 4.0)))
     with pytest.raises(MeshError, match="no zero level"):
         shaped(sdf, OPTIONS, Shape(crop=box(0.9, 1.05)))

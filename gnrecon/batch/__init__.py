@@ -1,1 +1,1 @@
-"""Many scans, each reconstructed in a process of its own, so that whatever befalls one of them costs that one only."""
+"""Reconstructs many scans, each in a process of its own, so that a crash affects only that scan."""

@@ -1,7 +1,7 @@
-"""Child processes for scans, by way of a `forker` that is started when the first one is wanted.
+"""Starting child processes for scans, through fork servers that start on demand.
 
-There is one forker for each number of threads, because the numerical libraries read that number when they are loaded;
-all threads of a process share them.
+There is one fork server for each number of threads: the numerical libraries read that number when they are loaded, and
+all children forked from one process share it.
 """
 
 from __future__ import annotations
@@ -25,27 +25,22 @@ from typing import Any
 import gnrecon
 from gnrecon.runtime.errors import ExitCode, GnreconError
 
-WORK = "gnrecon.batch.child"
-"""Module whose function ``work`` a child runs."""
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-class ForkerError(GnreconError, RuntimeError):
-    """The process that forks others could not be started, or has ended."""
+class ForkServerError(GnreconError, RuntimeError):
+    """A fork server could not be started, or has ended."""
 
     exit_code = ExitCode.UNFORESEEN
 
 
-class Child:
-    """A running child; leaving its block ends it, if it has not ended by itself."""
+class ForkedChild:
+    """A running child process; leaving its block kills it if it is still running."""
 
     def __init__(self, connection: socket.socket) -> None:
-        self._connection, self._rest = connection, b""
+        self._connection, self._buffer = connection, b""
         answer = self._receive()
         if answer is None:
             connection.close()
-            raise ForkerError("The process that starts the scans' own ones has ended.")
+            raise ForkServerError("The process that starts a process for each scan has ended.")
         self.pid = int(answer["pid"])
 
     def wait(self, seconds: float) -> int | None:
@@ -53,30 +48,30 @@ class Child:
 
         Raises
         ------
-        ForkerError
-            When the forker has ended, and the child with it.
+        ForkServerError
+            When the fork server has ended, and the child with it.
         """
         if not select.select([self._connection], [], [], seconds)[0]:
             return None
         answer = self._receive()
         if answer is None:
-            raise ForkerError("The process that starts the scans' own ones has ended, and its children with it.")
+            raise ForkServerError("The process that starts a process for each scan has ended, with all of them.")
         return int(answer["status"])
 
     def _receive(self) -> dict[str, Any] | None:
-        while b"\n" not in self._rest:
+        while b"\n" not in self._buffer:
             try:
-                more = self._connection.recv(4096)
+                received = self._connection.recv(4096)
             except ConnectionError:
                 return None
-            if not more:
+            if not received:
                 return None
-            self._rest += more
-        line, _, self._rest = self._rest.partition(b"\n")
-        found: dict[str, Any] = json.loads(line)
-        return found
+            self._buffer += received
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
 
-    def __enter__(self) -> Child:
+    def __enter__(self) -> ForkedChild:
         return self
 
     def __exit__(
@@ -85,13 +80,13 @@ class Child:
         self._connection.close()
 
 
-class Nursery:
-    """A forker, started when it is needed and again when it has ended.
+class ForkServerClient:
+    """Starts a fork server when it is first needed, and again after it has ended.
 
     Parameters
     ----------
     threads : of the numerical libraries
-    work : module of the work
+    work : module whose function ``work`` the children run
     """
 
     def __init__(self, threads: int, work: str) -> None:
@@ -100,13 +95,13 @@ class Nursery:
         self._process: subprocess.Popen[str] | None = None
         self._folder: Path | None = None
 
-    def child(self, argument: Mapping[str, Any], log: Path, environment: Mapping[str, str]) -> Child:
+    def start_child(self, argument: Mapping[str, Any], log: Path, environment: Mapping[str, str]) -> ForkedChild:
         """Start a child that does the work with an argument.
 
         Raises
         ------
-        ForkerError
-            When no forker can be started, or it ends at once.
+        ForkServerError
+            When no fork server can be started, or it ends at once.
         """
         request = {"argument": dict(argument), "log": str(log), "environment": dict(environment)}
         line = json.dumps(request).encode() + b"\n"
@@ -114,55 +109,65 @@ class Nursery:
             if self._process is None:
                 self._start()
             try:
-                return self._ask(line)
-            except ForkerError:  # it was ended from outside
+                return self._send(line)
+            except ForkServerError:  # it was killed from outside
                 self.close()
                 self._start()
-                return self._ask(line)
+                return self._send(line)
 
-    def _ask(self, line: bytes) -> Child:
+    def _send(self, line: bytes) -> ForkedChild:
         connection = socket.socket(socket.AF_UNIX)
         try:
             connection.connect(str(self._address))
             connection.sendall(line)
         except OSError as error:
             connection.close()
-            raise ForkerError(f"The process that starts the scans' own ones has ended ({error.strerror}).") from error
-        return Child(connection)
+            raise ForkServerError(
+                f"The process that starts a process for each scan has ended ({error.strerror})."
+            ) from error
+        return ForkedChild(connection)
 
     @property
     def _address(self) -> Path:
         assert self._folder is not None
-        return self._folder / "forker"
+        return self._folder / "socket"
 
     def _start(self) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="gnrecon-"))
         command = [sys.executable, "-m", "gnrecon.batch.fork_server", str(self._address), self._work]
-        with (self._folder / "words").open("w", encoding="utf-8") as words:
+        with (self._folder / "errors").open("w", encoding="utf-8") as errors:
             self._process = subprocess.Popen(
-                command, env=self._environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words, text=True
+                command,
+                env=self._environment(),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
             )
         assert self._process.stdout is not None
         if self._process.stdout.readline() != "ready\n":
-            said = (self._folder / "words").read_text(encoding="utf-8").strip().splitlines()
+            lines = (self._folder / "errors").read_text(encoding="utf-8").strip().splitlines()
             self.close()
-            raise ForkerError(f"No process could be started for the scans: {said[-1] if said else 'it ended at once'}.")
+            raise ForkServerError(
+                f"No process could be started for the scans: {lines[-1] if lines else 'it ended at once'}."
+            )
 
     def _environment(self) -> dict[str, str]:
-        # The forker is to be of this very gnrecon, and to find the work wherever this process would.
-        here = [str(Path(str(gnrecon.__file__)).parents[1]), *filter(None, sys.path)]
-        threads = dict.fromkeys(THREAD_VARIABLES, str(self._threads))
-        return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **threads, "PYTHONPATH": os.pathsep.join(here)}
+        # The server must run this very copy of gnrecon, and find the work module where this process would.
+        path = [str(Path(str(gnrecon.__file__)).parents[1]), *filter(None, sys.path)]
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(self._threads))
+        # Passive: idle OpenMP threads of one scan sleep instead of spinning on cores that other scans use.
+        return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **threads, "PYTHONPATH": os.pathsep.join(path)}
 
-    def close(self) -> None:
-        """End the forker and all of its children."""
+    def close(self, *, exit_seconds: float = 10.0) -> None:
+        """End the fork server and all of its children; it is killed where it has not ended after `exit_seconds`."""
         if self._process is not None:
             assert self._process.stdin is not None
             assert self._process.stdout is not None
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
             try:
-                self._process.wait(10.0)
+                self._process.wait(exit_seconds)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
@@ -173,29 +178,38 @@ class Nursery:
             self._folder = None
 
 
-_running: dict[tuple[int, str], Nursery] = {}
+_servers: dict[tuple[int, str], ForkServerClient] = {}
 _lock = threading.Lock()
 
 
 def start_child(
-    threads: int, argument: Mapping[str, Any], log: Path, environment: Mapping[str, str], work: str = WORK
-) -> Child:
-    """Start a child of this process's forker for a number of threads.
+    threads: int, argument: Mapping[str, Any], log: Path, environment: Mapping[str, str], work: str | None = None
+) -> ForkedChild:
+    """Start a child of this process's fork server for a number of threads.
+
+    Parameters
+    ----------
+    threads : of the numerical libraries
+    argument : of the work, plain values
+    log : file for the child's output
+    environment : variables to set in the child
+    work : module with ``work(argument) -> exit code``; by default `gnrecon.batch.child_main`
 
     Raises
     ------
-    ForkerError
+    ForkServerError
         When none can be started.
     """
+    module = work or "gnrecon.batch.child_main"
     with _lock:
-        forker = _running.setdefault((threads, work), Nursery(threads, work))
-    return forker.child(argument, log, environment)
+        server = _servers.setdefault((threads, module), ForkServerClient(threads, module))
+    return server.start_child(argument, log, environment)
 
 
 @atexit.register
-def close_forkers() -> None:
-    """End all forkers of this process, and their children."""
+def close_fork_servers() -> None:
+    """End all fork servers of this process, and their children."""
     with _lock:
-        for forker in _running.values():
-            forker.close()
-        _running.clear()
+        for server in _servers.values():
+            server.close()
+        _servers.clear()

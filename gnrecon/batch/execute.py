@@ -1,7 +1,7 @@
-"""One job from its beginning to its end: skipped when nothing has changed, tried, tried again, and recorded.
+"""Runs one job: skips it when nothing has changed, else runs and retries it in a child process and records the result.
 
-An attempt writes into a folder of its own below the output folder. Only when its process has ended well are the files
-hashed and recorded, and then receive their names, so that whatever kills an attempt leaves nothing half written.
+Each attempt writes into a folder of its own within the output folder. Only after its process has succeeded are the
+files hashed and recorded, and then moved to their final names, so that a killed attempt leaves no partial output.
 """
 
 from __future__ import annotations
@@ -21,22 +21,21 @@ from typing import Any
 
 import psutil
 
-from gnrecon.batch.child_process import WORK, Child, ForkerError, start_child
+from gnrecon.batch.child_process import ForkedChild, ForkServerError, start_child
 from gnrecon.batch.job import (
-    FAILURE,
-    PASSING,
     Cause,
     Job,
+    JobOutcome,
+    JobRecord,
     Limits,
-    Outcome,
-    Record,
     Status,
     Stop,
     cause_of,
     describe_signal,
+    failure_file,
     figures_of,
     file_hash,
-    hash_if_there,
+    hash_if_exists,
     identity_of,
     read_record,
     running_folder,
@@ -44,92 +43,92 @@ from gnrecon.batch.job import (
 from gnrecon.runtime.errors import ExitCode, GnreconError, OutputError
 from gnrecon.runtime.files import sync
 
-REPORT, THUMBNAIL = "report.json", "thumbnail.png"
-
 
 def run_job(
-    job: Job, stop: Stop | None = None, environment: Mapping[str, str] | None = None, work: str = WORK
-) -> Outcome:
-    """Do one job, in a child process, unless its result is there already; whatever happens is told by the outcome.
+    job: Job, stop: Stop | None = None, environment: Mapping[str, str] | None = None, work: str | None = None
+) -> JobOutcome:
+    """Run one job in a child process, unless its result exists already; failures are reported by the outcome.
 
     Parameters
     ----------
     job : Job
-    stop : set by the caller when the job is to end now
-    environment : variables that the child is to have
-    work : module with ``work(argument) -> exit code``, see `gnrecon.batch.child`
+    stop : set by the caller when the job should end now
+    environment : variables to set in the child
+    work : module with ``work(argument) -> exit code``, by default `gnrecon.batch.child_main`
     """
     try:
-        return _run(job, _Means(stop or threading.Event(), dict(environment or {}), work))
+        return _run(job, _Launch(stop or threading.Event(), dict(environment or {}), work))
     except GnreconError as error:
         return _failed(job, cause_of(error.exit_code), str(error), error.exit_code)
     except OSError as error:
-        said = f"{error.filename or job.output}: {error.strerror or error}."
-        return _failed(job, Cause.OUTPUT, said, ExitCode.OUTPUT)
+        sentence = f"{error.filename or job.output}: {error.strerror or error}."
+        return _failed(job, Cause.OUTPUT, sentence, ExitCode.OUTPUT)
 
 
 @dataclass(frozen=True)
-class _Means:
-    """How attempts are made, and when they are to end."""
+class _Launch:
+    """How the attempts of a job are started, and what stops them."""
 
     stop: Stop
     environment: dict[str, str]
-    work: str
+    work: str | None
 
 
-def _run(job: Job, means: _Means) -> Outcome:
+def _run(job: Job, launch: _Launch) -> JobOutcome:
     try:
         identity = identity_of(job)
     except OSError as error:
-        said = f"{error.filename}: it cannot be read ({error.strerror})."
-        return _failed(job, Cause.INPUT, said, ExitCode.INPUT)
+        sentence = f"{error.filename}: it cannot be read ({error.strerror})."
+        return _failed(job, Cause.INPUT, sentence, ExitCode.INPUT)
     record = read_record(job.record())
-    if record is not None and not job.fresh and record.holds(identity, job.output):
-        return _told(job, Status.UNCHANGED, record.told)
-    _require_own(job, record)
+    if record is not None and not job.fresh and record.is_current(identity, job.output):
+        return _succeeded(job, Status.UNCHANGED, record.facts)
+    _require_own_outputs(job, record)
     attempts, seconds = 0, 0.0
     while True:
-        outcome = _attempt(job, identity, means)
+        outcome = _attempt(job, identity, launch)
         attempts, seconds = attempts + 1, seconds + outcome.seconds
-        if outcome.cause not in PASSING or means.stop.is_set() or attempts > job.retry:
+        transient = outcome.cause is not None and outcome.cause.is_transient
+        if not transient or launch.stop.is_set() or attempts > job.retry:
             return replace(outcome, attempts=attempts, seconds=round(seconds, 2))
 
 
-def _require_own(job: Job, record: Record | None) -> None:
-    """Refuse to replace what is not this batch's own."""
+def _require_own_outputs(job: Job, record: JobRecord | None) -> None:
+    """Refuse to replace files that this batch has not written."""
     if job.overwrite:
         return
     for name in job.file_names().values():
-        found = hash_if_there(job.output / name)
-        if found is not None and (record is None or not record.knows(name, found)):
+        existing = hash_if_exists(job.output / name)
+        if existing is not None and (record is None or not record.knows(name, existing)):
             raise OutputError(
                 f"{job.output / name} exists already and was not written by this batch, or was changed since; "
                 "choose another folder or add --overwrite."
             )
 
 
-def _attempt(job: Job, identity: dict[str, Any], means: _Means) -> Outcome:
+def _attempt(job: Job, identity: dict[str, Any], launch: _Launch) -> JobOutcome:
     job.log().parent.mkdir(parents=True, exist_ok=True)
-    with _own_folder(job) as folder:
+    with _attempt_folder(job) as folder:
         if "config" in job.kinds:
             (folder / "files" / job.file_names()["config"]).write_text(job.config, encoding="utf-8")
-        end = attempt(
+        # Libraries write temporary files to TMPDIR, within the folder, so that they are deleted even after a crash.
+        end = run_child(
             _argument(job, folder),
             threads=job.options["threads"],
             log=job.log(),
-            environment={"TMPDIR": str((folder / "temporary").absolute()), **means.environment},
+            environment={"TMPDIR": str((folder / "temporary").absolute()), **launch.environment},
             limits=job.limits,
-            stop=means.stop,
-            work=means.work,
+            stop=launch.stop,
+            work=launch.work,
         )
         if end.cause is not None:
-            return _failed(job, end.cause, _sentence(end, folder), end.exit_code, end)
-        return replace(_adopt(job, folder, identity, end), seconds=end.seconds)
+            return _failed(job, end.cause, _failure_sentence(end, folder), end.exit_code, end)
+        return replace(_publish(job, folder, identity, end), seconds=end.seconds)
 
 
 @contextmanager
-def _own_folder(job: Job) -> Iterator[Path]:
-    """A folder that is gone afterwards, with the folders that the files' names need."""
+def _attempt_folder(job: Job) -> Iterator[Path]:
+    """A temporary folder with the subfolders that the files' names need; it is removed afterwards."""
     running = running_folder(job.output)
     running.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f"{Path(job.name).name}-", dir=running))
@@ -142,13 +141,13 @@ def _own_folder(job: Job) -> Iterator[Path]:
 
 
 def _argument(job: Job, folder: Path) -> dict[str, Any]:
-    """What the child is asked to do, as plain values."""
+    """The child's task, as plain values."""
     files = {kind: f"files/{name}" for kind, name in job.file_names().items()}
     return {
         "name": job.name,
         "folder": str(folder.absolute()),
         "scan": str(job.scan),
-        "files": {"report": REPORT, **files, "thumbnail": THUMBNAIL},
+        "files": {"report": "report.json", **files, "thumbnail": "thumbnail.png"},
         "options": dict(job.options),
         "reference": None if job.reference is None else str(job.reference),
         "command": _command(job),
@@ -156,60 +155,64 @@ def _argument(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def _command(job: Job) -> str:
-    """What makes the same mesh again."""
+    """A command line that makes the same mesh again."""
     paths = {kind: str(job.output / name) for kind, name in job.file_names().items()}
     config = ["--config", paths["config"]] if "config" in paths else []
     return shlex.join(["gnrecon", str(job.scan), "-o", paths["mesh"], *config])
 
 
-def _sentence(end: End, folder: Path) -> str:
+def _failure_sentence(end: ChildEnd, folder: Path) -> str:
     if end.message:
         return end.message
     try:
-        return (folder / FAILURE).read_text(encoding="utf-8")
+        return failure_file(folder).read_text(encoding="utf-8")
     except OSError:
         return f"Its process ended with exit code {end.exit_code}."
 
 
-def _adopt(job: Job, folder: Path, identity: dict[str, Any], end: End) -> Outcome:
-    """Record a result, then let its files have their names."""
+def _publish(job: Job, folder: Path, identity: dict[str, Any], end: ChildEnd) -> JobOutcome:
+    """Record a result, then move its files to their final names."""
     names = job.file_names()
-    report = folder / (f"files/{names['report']}" if "report" in names else REPORT)
-    told = json.loads(report.read_text(encoding="utf-8"))
-    facts = {"figures": figures_of(told), "metrics": told["metrics"], "peak_memory_mb": end.peak_memory_mb}
+    files = _argument(job, folder)["files"]
+    report = json.loads((folder / files["report"]).read_text(encoding="utf-8"))
+    facts = {"figures": figures_of(report), "metrics": report["metrics"], "peak_memory_mb": end.peak_memory_mb}
     job.thumbnail().parent.mkdir(parents=True, exist_ok=True)
-    (folder / THUMBNAIL).replace(job.thumbnail())
-    found = {name: hash_if_there(job.output / name) for name in names.values()}
-    record = Record(
+    (folder / files["thumbnail"]).replace(job.thumbnail())
+    # The hashes of replaced files let a batch that is killed before the renaming know them as its own.
+    existing = {name: hash_if_exists(job.output / name) for name in names.values()}
+    record = JobRecord(
         identity,
         {name: file_hash(folder / "files" / name) for name in names.values()},
-        {name: known for name, known in found.items() if known is not None},
+        {name: known for name, known in existing.items() if known is not None},
         (folder / "files").relative_to(job.output).as_posix(),
         facts,
     )
     record.write(job.record())
-    record.place(job.output)
+    record.move_into_place(job.output)
+    # Makes the new names durable, so that a power failure does not undo them.
     sync(job.output)
-    return _told(job, Status.MADE, facts)
+    return _succeeded(job, Status.MADE, facts)
 
 
-def _told(job: Job, status: Status, told: Mapping[str, Any]) -> Outcome:
-    """The outcome of a result that is there, from what its record tells."""
+def _succeeded(job: Job, status: Status, facts: Mapping[str, Any]) -> JobOutcome:
+    """The outcome of a result that exists, with the facts of its record."""
     files = {kind: str(job.output / name) for kind, name in job.file_names().items()}
-    return Outcome(
+    return JobOutcome(
         job.name,
         str(job.scan),
         status,
         files=files,
         thumbnail=str(job.thumbnail()),
         log=str(job.log()),
-        **told,
+        **facts,
     )
 
 
-def _failed(job: Job, cause: Cause | None, message: str, exit_code: int | None, end: End | None = None) -> Outcome:
+def _failed(
+    job: Job, cause: Cause | None, message: str, exit_code: int | None, end: ChildEnd | None = None
+) -> JobOutcome:
     log = str(job.log()) if job.log().is_file() else ""
-    return Outcome(
+    return JobOutcome(
         job.name,
         str(job.scan),
         Status.FAILED,
@@ -222,30 +225,19 @@ def _failed(job: Job, cause: Cause | None, message: str, exit_code: int | None, 
     )
 
 
-LOOK = 0.1
-"""Seconds between two looks at a child."""
-
-_SELDOM = 10
-"""Looks between two searches for what a child has started."""
-
-_PATIENCE = 5.0
-
-
-# One attempt at a piece of work in a child process, within limits of time and memory.
-#
-# Memory is watched from outside, as the resident memory of the child and all that it has started: a limit of address
-# space (``RLIMIT_AS``) would also count what torch and CUDA merely reserve.
+# Memory is watched from outside, as the resident memory of the child and its descendants. A limit of the address space
+# (``RLIMIT_AS``) would also count what torch and CUDA merely reserve.
 
 
 @dataclass(frozen=True)
-class End:
-    """How an attempt ended.
+class ChildEnd:
+    """How a child process ended.
 
     Parameters
     ----------
-    cause : why it failed; None where it went well
-    exit_code : of the child; None where it was ended for another reason than its memory
-    message : a sentence, where the child itself could not say one
+    cause : why it failed; None where it succeeded
+    exit_code : of the child; None where it was killed for taking too long
+    message : a sentence, where the child itself could not write one
     peak_memory_mb : greatest resident memory that was seen, in MB of 10^6 bytes
     seconds : from the child's start to its end
     """
@@ -257,7 +249,7 @@ class End:
     seconds: float
 
 
-def attempt(
+def run_child(
     argument: Mapping[str, Any],
     *,
     threads: int,
@@ -265,86 +257,92 @@ def attempt(
     environment: Mapping[str, str],
     limits: Limits,
     stop: Stop | None = None,
-    work: str = WORK,
-) -> End:
-    """Do a piece of work in a child process and wait for its end, or bring it about.
+    work: str | None = None,
+) -> ChildEnd:
+    """Run work in a child process, within limits of time and memory, and wait for its end.
 
-    Where the process that starts the children was itself ended from outside, it is started again, and so is the work.
+    Where the fork server was killed from outside, it is started again, and so is the work.
 
     Parameters
     ----------
     argument : of the work, plain values
     threads : of the numerical libraries
-    log : file for what the child says
-    environment : variables that the child is to have
+    log : file for the child's output
+    environment : variables to set in the child
     limits : Limits
-    stop : set by the caller when the child is to end now
+    stop : set by the caller when the child should end now
     work : module with ``work(argument) -> exit code``
 
     Raises
     ------
-    ForkerError
-        When no child can be started, or the process that starts them has ended twice.
+    ForkServerError
+        When no child can be started, or the fork server has ended twice.
     """
-    once = partial(_once, argument, threads, log, environment, limits, stop or threading.Event(), work)
+    run = partial(_run_child_once, argument, threads, log, environment, limits, stop or threading.Event(), work)
     try:
-        return once()
-    except ForkerError:
-        return once()
+        return run()
+    except ForkServerError:
+        return run()
 
 
-def _once(
+def _run_child_once(
     argument: Mapping[str, Any],
     threads: int,
     log: Path,
     environment: Mapping[str, str],
     limits: Limits,
     stop: Stop,
-    work: str,
-) -> End:
+    work: str | None,
+    *,
+    poll_seconds: float = 0.1,
+) -> ChildEnd:
+    """Run work in one child; limits are checked every `poll_seconds`, often enough for memory that grows quickly."""
     with start_child(threads, argument, log, environment, work) as child:
-        start, peak, watched = time.monotonic(), 0.0, Watched(child.pid)
-        while (status := child.wait(LOOK)) is None:
-            memory, seconds = watched.memory_mb(), round(time.monotonic() - start, 3)
+        start, peak, monitor = time.monotonic(), 0.0, MemoryMonitor(child.pid)
+        while (status := child.wait(poll_seconds)) is None:
+            memory, seconds = monitor.memory_mb(), round(time.monotonic() - start, 3)
             peak = max(peak, round(memory, 1))
             if stop.is_set():
-                return _killed(child, End(Cause.INTERRUPTED, ExitCode.INTERRUPTED, "Interrupted.", peak, seconds))
+                return _killed(child, ChildEnd(Cause.INTERRUPTED, ExitCode.INTERRUPTED, "Interrupted.", peak, seconds))
             if limits.memory_mb is not None and memory > limits.memory_mb:
-                said = f"It needed {memory:,.0f} MB of memory; the limit is {limits.memory_mb:,.0f} MB (--memory)."
-                return _killed(child, End(Cause.MEMORY, ExitCode.MEMORY, said, peak, seconds))
+                sentence = f"It needed {memory:,.0f} MB of memory; the limit is {limits.memory_mb:,.0f} MB (--memory)."
+                return _killed(child, ChildEnd(Cause.MEMORY, ExitCode.MEMORY, sentence, peak, seconds))
             if limits.seconds is not None and seconds > limits.seconds:
-                said = f"It had not ended after {limits.seconds:g} s, which is the limit (--timeout)."
-                return _killed(child, End(Cause.TIMEOUT, None, said, peak, seconds))
+                sentence = f"It had not ended after {limits.seconds:g} s, which is the limit (--timeout)."
+                return _killed(child, ChildEnd(Cause.TIMEOUT, None, sentence, peak, seconds))
         seconds = round(time.monotonic() - start, 3)
     message = describe_signal(-status) if status < 0 else ""
-    return End(cause_of(status), status, message, peak, seconds)
+    return ChildEnd(cause_of(status), status, message, peak, seconds)
 
 
-def _killed(child: Child, end: End) -> End:
-    """Kill a child with all that it has started, and wait until it has gone."""
-    for process in _tree(child.pid):
+def _killed(child: ForkedChild, end: ChildEnd, *, wait_seconds: float = 5.0) -> ChildEnd:
+    """Kill a child with its descendants, and wait at most `wait_seconds` until it is gone."""
+    for process in _process_tree(child.pid):
         with suppress(psutil.Error):
             process.kill()
-    with suppress(ForkerError):
-        child.wait(_PATIENCE)
+    with suppress(ForkServerError):
+        child.wait(wait_seconds)
     return end
 
 
-class Watched:
-    """A process whose memory is looked at again and again.
+class MemoryMonitor:
+    """Measures the memory of a process and its descendants repeatedly.
 
-    What it has started is looked for now and then only, because that takes a look at every process of the machine.
+    Parameters
+    ----------
+    pid : of the process
+    search_interval : measurements between two searches for descendants, which look at every process of the machine
     """
 
-    def __init__(self, pid: int) -> None:
-        self._pid, self._looks = pid, 0
+    def __init__(self, pid: int, *, search_interval: int = 10) -> None:
+        self._pid, self._search_interval, self._count = pid, search_interval, 0
         self._tree: list[psutil.Process] = []
 
     def memory_mb(self) -> float:
-        """Return the resident memory of it and its descendants, in MB of 10^6 bytes; 0 when it has ended."""
-        if self._looks % _SELDOM == 0:
-            self._tree = _tree(self._pid)
-        self._looks += 1
+        """Return the resident memory, in MB of 10^6 bytes; 0 when the process has ended."""
+        if self._count % self._search_interval == 0:
+            self._tree = _process_tree(self._pid)
+        self._count += 1
         total = 0
         for process in self._tree:
             with suppress(psutil.Error):
@@ -352,7 +350,7 @@ class Watched:
         return total / 1e6
 
 
-def _tree(pid: int) -> list[psutil.Process]:
+def _process_tree(pid: int) -> list[psutil.Process]:
     try:
         process = psutil.Process(pid)
         return [process, *process.children(recursive=True)]

@@ -1,4 +1,8 @@
-"""The default engine: processes of this machine, several at a time."""
+"""Runs the jobs of a batch: in processes of this machine, or on a Dask cluster.
+
+`run_locally` is the default. `run_on_cluster` submits the same function as Dask tasks, so that each scan has a process
+of its own with its limits wherever it runs. `fitting_jobs` says how many jobs a machine takes at a time.
+"""
 
 from __future__ import annotations
 
@@ -17,36 +21,36 @@ from typing import Any
 import numpy as np
 import psutil
 
-from gnrecon.batch.child_process import WORK, close_forkers
+from gnrecon.batch.child_process import close_fork_servers
 from gnrecon.batch.execute import run_job
-from gnrecon.batch.job import Cause, Job, Outcome, Status, running_folder
+from gnrecon.batch.job import Cause, Job, JobOutcome, Status, running_folder
 from gnrecon.options import Options
 from gnrecon.report.estimate import estimate
+from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import ExitCode
-from gnrecon.runtime.parallel import connected, require_distributed
 
 
-def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: Callable[[Outcome], None]) -> None:
-    """Do jobs, `count` at a time, each in a process of its own.
+def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: Callable[[JobOutcome], None]) -> None:
+    """Run jobs, `count` at a time, each in a process of its own.
 
-    Whatever ends this function early, such as Ctrl-C, ends the processes, too.
+    An exception that ends this function early, such as Ctrl-C, also ends the processes.
 
     Parameters
     ----------
-    jobs : in the order in which they are begun
+    jobs : in the order in which they are started
     count : at a time
-    devices : CUDA devices, as ``CUDA_VISIBLE_DEVICES`` names them, that jobs take in turn; none: whatever is there
-    done : told each outcome, in the order in which they come
+    devices : CUDA devices, as ``CUDA_VISIBLE_DEVICES`` names them, that jobs take in turn; empty: all devices
+    done : called with each outcome, as they come
     """
-    stop, seats = threading.Event(), _Seats(count, devices)
+    stop, pool_of_devices = threading.Event(), _DevicePool(count, devices)
 
-    def one(job: Job) -> Outcome:
-        with seats.taken() as environment:
+    def run(job: Job) -> JobOutcome:
+        with pool_of_devices.borrowed() as environment:
             return run_job(job, stop, environment)
 
     try:
         with ThreadPoolExecutor(count, thread_name_prefix="gnrecon-job") as pool:
-            futures = [pool.submit(one, job) for job in jobs]
+            futures = [pool.submit(run, job) for job in jobs]
             try:
                 for future in as_completed(futures):
                     done(future.result())
@@ -56,11 +60,11 @@ def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: C
                     future.cancel()
                 raise
     finally:
-        close_forkers()
+        close_fork_servers()
 
 
-class _Seats:
-    """As many places as jobs may run at a time, each with a device."""
+class _DevicePool:
+    """One slot for each job that may run at a time, with the environment that names its device."""
 
     def __init__(self, count: int, devices: Sequence[str]) -> None:
         self._free: SimpleQueue[dict[str, str]] = SimpleQueue()
@@ -68,7 +72,7 @@ class _Seats:
             self._free.put({"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {})
 
     @contextmanager
-    def taken(self) -> Iterator[dict[str, str]]:
+    def borrowed(self) -> Iterator[dict[str, str]]:
         environment = self._free.get()
         try:
             yield environment
@@ -76,16 +80,8 @@ class _Seats:
             self._free.put(environment)
 
 
-RETRIES = 2
-"""How often Dask begins a task again that raised an error, as a worker without the libraries would."""
-
-
-# The same jobs on a Dask cluster: one that is there already, or one of local processes.
-#
-# A task of the cluster is the very function that local jobs are, so that each scan has a process of its own with its
-# limits wherever it runs. Dask gives the tasks of a lost worker to others; a task first looks at the scan's record,
-# which lies beside the outputs, so that nothing finished is done twice. All workers must see the scans and the outputs
-# by the same paths.
+# Dask gives the tasks of a lost worker to others. Each task first reads the scan's record in the output folder, so that
+# nothing finished is done twice. All workers must see the scans and the outputs by the same paths.
 
 
 def run_on_cluster(
@@ -93,21 +89,24 @@ def run_on_cluster(
     address: str | None,
     count: int,
     devices: Sequence[str],
-    done: Callable[[Outcome], None],
-    work: str = WORK,
+    done: Callable[[JobOutcome], None],
+    work: str | None = None,
+    *,
+    retries: int = 2,
 ) -> None:
-    """Do jobs on a cluster, as many at a time as its workers have threads.
+    """Run jobs on a Dask cluster, as many at a time as its workers have threads.
 
-    Whatever ends this function early, such as Ctrl-C, ends the running scans, too.
+    An exception that ends this function early, such as Ctrl-C, also ends the running scans.
 
     Parameters
     ----------
-    jobs : in the order in which they are handed in
+    jobs : in the order in which they are submitted
     address : of a scheduler, such as ``tcp://host:8786``; None: a cluster of this machine's processes
     count : of local workers
     devices : CUDA devices that local workers take in turn
-    done : told each outcome, in the order in which they come
+    done : called with each outcome, as they come
     work : module of the work, see `run_job`
+    retries : how often Dask repeats a task that raised an error, as on a worker without the libraries
 
     Raises
     ------
@@ -115,12 +114,13 @@ def run_on_cluster(
         When Dask is not installed, or the scheduler does not answer.
     """
     distributed = require_distributed()
-    with _client(distributed, address, count) as client, client.as_current(), _sign(jobs[0].output) as sign:
+    with _client(distributed, address, count) as client, client.as_current(), _alive_file(jobs[0].output) as alive:
         futures = {}
         for job in jobs:
-            there = replace(job, scan=job.scan.absolute(), output=job.output.absolute())
+            task = replace(job, scan=job.scan.absolute(), output=job.output.absolute())
+            # A unique key, because Dask returns the stored result of an equal key, such as that of an earlier batch.
             key = f"gnrecon-{job.name}-{secrets.token_hex(4)}"
-            futures[client.submit(on_worker, there, sign, list(devices), work, key=key, retries=RETRIES)] = job
+            futures[client.submit(run_on_worker, task, alive, list(devices), work, key=key, retries=retries)] = job
         try:
             for future in distributed.as_completed(list(futures)):
                 error = future.exception() if future.status != "finished" else None
@@ -130,37 +130,37 @@ def run_on_cluster(
             raise
 
 
-def on_worker(job: Job, sign: Path, devices: list[str], work: str) -> Outcome:
-    """Do a job on a worker, until the batch takes its sign away."""
+def run_on_worker(job: Job, alive: Path, devices: list[str], work: str | None) -> JobOutcome:
+    """Run a job on a Dask worker, until the batch removes the file that marks it as alive."""
     from distributed import get_worker
 
     name = get_worker().name
     environment = {}
     if devices and isinstance(name, int) and "CUDA_VISIBLE_DEVICES" not in os.environ:
         environment = {"CUDA_VISIBLE_DEVICES": devices[name % len(devices)]}
-    return run_job(job, Abandoned(sign), environment, work)
+    return run_job(job, FileRemoved(alive), environment, work)
 
 
-class Abandoned:
-    """Set when a file is gone that was there before."""
+class FileRemoved:
+    """A stop signal that is set once a file that existed is gone."""
 
-    def __init__(self, sign: Path) -> None:
-        self._sign, self._seen = sign, False
+    def __init__(self, path: Path) -> None:
+        self._path, self._seen = path, False
 
     def is_set(self) -> bool:
-        """Whether the file is gone; one that was never seen may only be late, as network file systems are."""
-        there = self._sign.exists()
-        self._seen |= there
-        return self._seen and not there
+        """Whether the file is gone; one that was never seen may only be late on a network file system."""
+        exists = self._path.exists()
+        self._seen |= exists
+        return self._seen and not exists
 
 
 @contextmanager
 def _client(distributed: Any, address: str | None, count: int) -> Iterator[Any]:
     if address is not None:
-        with connected(address) as client:
+        with dask_client(address) as client:
             yield client
         return
-    # The limits of memory are the jobs' own; a dashboard is for those who have a cluster of their own.
+    # Each job has its own memory limit, and a local cluster needs no dashboard.
     with (
         distributed.LocalCluster(
             n_workers=count,
@@ -176,46 +176,35 @@ def _client(distributed: Any, address: str | None, count: int) -> Iterator[Any]:
 
 
 @contextmanager
-def _sign(output: Path) -> Iterator[Path]:
-    """A file that is there as long as the batch is."""
+def _alive_file(output: Path) -> Iterator[Path]:
+    """A file that exists as long as the batch runs."""
     running = running_folder(output.absolute())
     running.mkdir(parents=True, exist_ok=True)
-    sign = running / f".batch-{secrets.token_hex(6)}"
-    sign.touch()
+    path = running / f".batch-{secrets.token_hex(6)}"
+    path.touch()
     try:
-        yield sign
+        yield path
     finally:
-        sign.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
 
-def _lost(job: Job, error: BaseException) -> Outcome:
-    """The outcome of a job that Dask gave up, as when it lost one worker after the other with it."""
-    said = f"The cluster gave it up: {type(error).__name__}: {error}".splitlines()[0]
-    return Outcome(job.name, str(job.scan), Status.FAILED, Cause.UNFORESEEN, said, ExitCode.UNFORESEEN)
+def _lost(job: Job, error: BaseException) -> JobOutcome:
+    """The outcome of a job that Dask gave up, for example after several workers were lost while running it."""
+    sentence = f"The cluster gave it up: {type(error).__name__}: {error}".splitlines()[0]
+    return JobOutcome(job.name, str(job.scan), Status.FAILED, Cause.UNFORESEEN, sentence, ExitCode.UNFORESEEN)
 
 
-_CGROUP = Path("/sys/fs/cgroup")
-
-_UNKNOWN_MB = 2000.0
-"""Of memory for a run that nothing is known of before."""
-
-_BYTES_A_POINT = 12
-"""Of the densest common storage, three floats."""
-
-
-# How many scans a machine takes at a time, by its cores, its free memory and its GPUs.
-
-
-def fitting_jobs(jobs: Sequence[Job], threads: int) -> int:
-    """Return how many of the jobs the machine takes at a time.
+def fitting_jobs(jobs: Sequence[Job], threads: int, *, usable_memory_share: float = 0.9) -> int:
+    """Return how many of the jobs the machine takes at a time, by its cores and its free memory.
 
     Parameters
     ----------
-    jobs : that are to be done
+    jobs : to be done
     threads : of each
+    usable_memory_share : of the free memory that jobs may fill; the rest is left to the system
     """
     by_cores = available_cores() // threads
-    by_memory = int(0.9 * available_memory_mb() / max(map(_needed_mb, jobs)))
+    by_memory = int(usable_memory_share * available_memory_mb() / max(map(_needed_mb, jobs)))
     return max(1, min(by_cores, by_memory, len(jobs)))
 
 
@@ -223,43 +212,50 @@ def available_cores() -> int:
     """Return the cores that this process may use, by affinity and by the quota of its control group."""
     cores = len(os.sched_getaffinity(0))
     with suppress(OSError, ValueError):
-        quota, period = (_CGROUP / "cpu.max").read_text(encoding="ascii").split()
+        quota, period = _read_cgroup("cpu.max").split()
         cores = min(cores, max(1, int(quota) // int(period)))
     return cores
 
 
 def available_memory_mb() -> float:
-    """Return the memory that is free, in MB of 10^6 bytes, within the limit of the control group."""
+    """Return the free memory, in MB of 10^6 bytes, within the limit of the control group."""
     free = int(psutil.virtual_memory().available)
     with suppress(OSError, ValueError):
-        limit = int((_CGROUP / "memory.max").read_text(encoding="ascii"))
-        free = min(free, limit - int((_CGROUP / "memory.current").read_text(encoding="ascii")))
+        free = min(free, int(_read_cgroup("memory.max")) - int(_read_cgroup("memory.current")))
     return free / 1e6
 
 
-def _needed_mb(job: Job) -> float:
-    """The limit of a job's memory, or what a run of as many points as its file may hold is expected to need."""
+def _read_cgroup(name: str) -> str:
+    return Path("/sys/fs/cgroup", name).read_text(encoding="ascii")
+
+
+def _needed_mb(job: Job, *, unknown_run_mb: float = 2000.0, least_point_bytes: int = 12) -> float:
+    """Return the memory limit of a job, or else what a run of as many points as its file may hold should need.
+
+    Parameters
+    ----------
+    job : Job
+    unknown_run_mb : for a run whose size cannot be estimated, in MB of 10^6 bytes
+    least_point_bytes : of a point in the densest common storage, three floats
+    """
     if job.limits.memory_mb is not None:
         return job.limits.memory_mb
     options = Options.of(**job.options)
-    if options.edge_length is not None:  # the size of the shape is not known before
-        return _UNKNOWN_MB
+    if options.edge_length is not None:  # needs the size of the shape, which is not known yet
+        return unknown_run_mb
     size = job.scan.stat().st_size if job.scan.is_file() else 0
-    points = min(options.read_points, size // _BYTES_A_POINT)
+    points = min(options.read_points, size // least_point_bytes)
     expected = estimate(points, points, np.array([[-1.0] * 3, [1.0] * 3]), options)
-    return _UNKNOWN_MB if expected is None else expected.memory_mb
-
-
-# Which CUDA devices there are, so that each job can be given one of them.
+    return unknown_run_mb if expected is None else expected.memory_mb
 
 
 def cuda_devices(jobs: Sequence[Job]) -> list[str]:
-    """Return the devices, as ``CUDA_VISIBLE_DEVICES`` names them, if a job asks for ``cuda``; none otherwise.
+    """Return the devices, as ``CUDA_VISIBLE_DEVICES`` names them, if a job uses ``cuda``; none otherwise.
 
-    A job that asks for a certain one, such as ``cuda:1``, needs to see them all; then none are handed out.
+    A job with a fixed device, such as ``cuda:1``, needs to see all devices; then none are assigned.
     """
-    wanted = {str(job.options["device"]) for job in jobs}
-    if "cuda" not in wanted or any(device.startswith("cuda:") for device in wanted):
+    names = {str(job.options["device"]) for job in jobs}
+    if "cuda" not in names or any(device.startswith("cuda:") for device in names):
         return []
     if visible := os.environ.get("CUDA_VISIBLE_DEVICES"):
         return [name.strip() for name in visible.split(",") if name.strip()]

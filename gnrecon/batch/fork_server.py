@@ -1,12 +1,12 @@
-"""A process that has imported all libraries once, and forks a child for each scan that is asked for.
+"""Fork server: a process that imports all libraries once and forks a child for each scan.
 
-Importing torch and open3d takes some seconds, a fork some milliseconds. The child is a process in its own session: what
-kills it, or what it does to its memory, touches neither this process nor other scans.
+Importing torch and open3d takes some seconds; a fork takes some milliseconds. Each child is a process in its own
+session, so that a crash of one scan affects neither this process nor other scans.
 
 Started as ``python -m gnrecon.batch.fork_server SOCKET MODULE``, it listens on a Unix socket. A client connects, sends
-one line of JSON (``argument``, ``log``, ``environment``), and receives one line with the child's ``pid`` and, when it
-has ended, one with its ``status``, the exit code or the negative signal. A client that hangs up ends its child. When
-standard input ends, because the one who started this process is gone, all children end, and so does this process.
+one line of JSON (``argument``, ``log``, ``environment``), and receives one line with the child's ``pid`` and, when the
+child has ended, one with its ``status``: the exit code or the negative signal. A client that hangs up ends its child.
+When standard input ends, because the parent of this process has gone, all children end, and so does this process.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from types import FrameType
 from typing import Any, NoReturn
 
 
-class Forker:
-    """The loop that accepts clients, forks children and tells their ends.
+class ForkServer:
+    """The loop that accepts clients, forks children and reports how they end.
 
     Parameters
     ----------
@@ -41,11 +41,11 @@ class Forker:
         self._listener, self._work = listener, work
         self._clients: dict[int, socket.socket] = {}
         self._selector = selectors.DefaultSelector()
-        # The system says that a child has ended by a signal, and Python by a byte in this pipe.
+        # The system reports the end of a child by a signal, which Python turns into a byte in this pipe.
         self._ended, waker = socket.socketpair()
         waker.setblocking(False)
         self._waker = waker
-        signal.signal(signal.SIGCHLD, _wake)
+        signal.signal(signal.SIGCHLD, _ignore_signal)
         signal.set_wakeup_fd(waker.fileno(), warn_on_full_buffer=False)
         for source in (listener, self._ended, sys.stdin):
             self._selector.register(source, selectors.EVENT_READ)
@@ -55,7 +55,7 @@ class Forker:
         while True:
             for key, _ in self._selector.select():
                 if key.fileobj is sys.stdin:
-                    self._end_all()
+                    self._kill_all()
                     return
                 if key.fileobj is self._listener:
                     self._accept()
@@ -63,35 +63,36 @@ class Forker:
                     self._ended.recv(4096)
                     self._reap()
                 elif key.data in self._clients:
-                    self._hang_up(key.data)
+                    self._abandon(key.data)
 
-    def _accept(self) -> None:
+    def _accept(self, *, request_timeout_seconds: float = 10.0) -> None:
+        """Read one request and fork a child for it; a client that sends nothing in time is dropped."""
         client, _ = self._listener.accept()
-        client.settimeout(10.0)
+        client.settimeout(request_timeout_seconds)
         try:
             request = json.loads(client.makefile("r", encoding="utf-8").readline())
-        except (OSError, ValueError):  # one that was gone before it had said anything
+        except (OSError, ValueError):  # the client left before its request was complete
             client.close()
             return
         sys.stdout.flush()
         parent, pid = os.getpid(), os.fork()
         if pid == 0:
-            self._be_child(request, client, parent)
+            self._run_child(request, client, parent)
         self._clients[pid] = client
         self._selector.register(client, selectors.EVENT_READ, data=pid)
-        self._tell(pid, {"pid": pid})
+        self._send(pid, {"pid": pid})
 
-    def _be_child(self, request: dict[str, Any], client: socket.socket, parent: int) -> NoReturn:
+    def _run_child(self, request: dict[str, Any], client: socket.socket, parent: int) -> NoReturn:
         code = 1
         try:
             signal.set_wakeup_fd(-1)
             for one in (client, self._listener, self._ended, self._waker, *self._clients.values()):
                 one.close()
             self._selector.close()
-            become_child(request["log"], request["environment"], parent)
+            detach_child(request["log"], request["environment"], parent)
             code = int(import_module(self._work).work(request["argument"]))
         finally:
-            # Neither the exit handlers nor the buffers of the process that this is a copy of.
+            # os._exit skips the exit handlers and the unwritten buffers that were copied from the parent.
             with contextlib.suppress(OSError, ValueError):
                 sys.stdout.flush()
                 sys.stderr.flush()
@@ -106,19 +107,19 @@ class Forker:
             if pid == 0:
                 return
             if pid in self._clients:
-                self._tell(pid, {"status": os.waitstatus_to_exitcode(status)})
+                self._send(pid, {"status": os.waitstatus_to_exitcode(status)})
                 self._forget(pid)
 
-    def _hang_up(self, pid: int) -> None:
-        """End a child that nobody waits for any more; it is reaped with the others."""
+    def _abandon(self, pid: int) -> None:
+        """Kill a child whose client has gone; it is reaped with the others."""
         self._forget(pid)
-        _end(pid)
+        _kill_group(pid)
 
-    def _end_all(self) -> None:
+    def _kill_all(self) -> None:
         for pid in list(self._clients):
-            self._hang_up(pid)
+            self._abandon(pid)
 
-    def _tell(self, pid: int, message: dict[str, int]) -> None:
+    def _send(self, pid: int, message: dict[str, int]) -> None:
         with contextlib.suppress(OSError):
             self._clients[pid].sendall(json.dumps(message).encode() + b"\n")
 
@@ -128,76 +129,53 @@ class Forker:
         client.close()
 
 
-def _wake(number: int, frame: FrameType | None) -> None:
-    """Nothing is to be done; but without a handler, Python would write no byte."""
+def _ignore_signal(number: int, frame: FrameType | None) -> None:
+    """Do nothing. Without a Python handler, no byte is written to the wake-up pipe."""
     del number, frame
 
 
-def _end(pid: int) -> None:
-    """Kill a child and what it has started."""
-    for kill in (os.killpg, os.kill):  # the group may not be there yet
+def _kill_group(pid: int) -> None:
+    """Kill a child and the processes that it has started."""
+    for kill in (os.killpg, os.kill):  # the group may not exist yet
         with contextlib.suppress(ProcessLookupError):
             kill(pid, signal.SIGKILL)
 
 
-def main(words: list[str]) -> NoReturn:
-    """Listen on the socket that the first word names, for work that the second one names."""
-    path, work = words
-    module = import_module(work)
-    if hasattr(module, "prepare"):
-        module.prepare()
-    # An interrupt of the terminal is for the batch to deal with.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(path)
-        listener.listen(64)
-        print("ready", flush=True)
-        Forker(listener, work).serve()
-    # Nothing is left to be done, and the libraries take their time to go.
-    os._exit(0)
+# A forked child first gets a session, streams and a lifetime of its own. Its standard input is empty and its output
+# goes to a log. It ends when its parent does (``prctl(PR_SET_PDEATHSIG)`` of Linux), so that a batch that is killed
+# leaves no process behind. Where memory runs out, the system kills it (``oom_score_adj``) before the batch itself.
 
 
-if __name__ == "__main__":
-    main(sys.argv[1:])
-
-_PR_SET_PDEATHSIG = 1
-
-
-# What a forked process does first, to stand alone: a session, streams and an end of its own.
-#
-# Its standard input is empty and its words go to a log. It ends when its parent does (``prctl(PR_SET_PDEATHSIG)`` of
-# Linux), so that a batch that is killed leaves no process behind; and where memory runs out it is the one that the
-# system is to end first (``oom_score_adj``), rather than the batch.
-
-
-def become_child(log: str, environment: Mapping[str, str], parent: int) -> None:
-    """Take the calling, freshly forked process apart from its parent.
+def detach_child(log: str, environment: Mapping[str, str], parent: int) -> None:
+    """Separate the calling, freshly forked process from its parent.
 
     Parameters
     ----------
-    log : file that receives what is said on stdout and stderr; an older one is replaced
+    log : file that receives stdout and stderr; an older one is replaced
     environment : variables to set
-    parent : process whose end is to be this one's, too
+    parent : process whose end also ends this one
     """
+    # A session of its own, so that the whole process group can be killed.
     os.setsid()
-    end_with(parent)
+    die_with_parent(parent)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _redirect(os.open(os.devnull, os.O_RDONLY), 0)
-    words = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-    os.dup2(words, 1)
-    _redirect(words, 2)
-    faulthandler.enable(file=sys.stderr)  # the log of a crash in native code shows where Python was
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    os.dup2(output, 1)
+    _redirect(output, 2)
+    faulthandler.enable(file=sys.stderr)  # a crash in native code then logs the Python stack
     os.environ.update(environment)
-    tempfile.tempdir = None  # so that TMPDIR is looked up again
+    tempfile.tempdir = None  # so that TMPDIR is read again
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
-def end_with(parent: int) -> None:
-    """Let the system kill this process when its parent ends; where it has ended already, end now."""
+def die_with_parent(parent: int) -> None:
+    """Let the system kill this process when its parent ends; where the parent has already ended, exit now."""
+    pr_set_pdeathsig = 1  # from linux/prctl.h
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
@@ -205,3 +183,24 @@ def end_with(parent: int) -> None:
 def _redirect(descriptor: int, target: int) -> None:
     os.dup2(descriptor, target)
     os.close(descriptor)
+
+
+def main(arguments: list[str]) -> NoReturn:
+    """Listen on the socket given by the first argument, for work of the module given by the second."""
+    path, work = arguments
+    module = import_module(work)
+    if hasattr(module, "prepare"):
+        module.prepare()
+    # The batch handles an interrupt from the terminal.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(path)
+        listener.listen(64)
+        print("ready", flush=True)
+        ForkServer(listener, work).serve()
+    # Skips the exit handlers of the libraries, which are slow.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,4 +1,8 @@
-"""One scan of a batch as a piece of work: plain values, so that any process on any machine can take it over."""
+"""A batch job: one scan to reconstruct, the record of its result and its outcome, all as plain values.
+
+Plain values can be sent to any process on any machine. A `JobRecord` lies in the output folder and lets a batch that is
+started again skip what is done already.
+"""
 
 from __future__ import annotations
 
@@ -11,28 +15,35 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from gnrecon.io.merge import members
+from gnrecon.io.merge import input_files
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import write_text
 from gnrecon.version import __version__
 
-STATE = ".gnrecon"
-"""Folder within the output folder: records, logs, thumbnails and what is being worked at."""
+FILE_ENDINGS = {
+    "mesh": ".{mesh_format}",
+    "report": ".report.json",
+    "page": ".html",
+    "preview": ".preview.png",
+    "model": ".gnr",
+    "config": ".config.toml",
+}
+"""Kinds of output files, and what each adds to the name of a scan's outputs."""
 
-PROGRESS, FAILURE = "progress.json", "failure.txt"
-"""Files in an attempt's folder: how far it is, and the sentence on its failure."""
+MESH_FIGURES = ("vertices", "faces", "components", "genus", "closed", "area", "volume", "invented_area_share")
+"""Entries of a report's ``mesh`` that a table of many runs shows."""
 
 
 class Stop(Protocol):
-    """Tells whether work is to end now, as `threading.Event` does."""
+    """Says whether work should end now, as `threading.Event` does."""
 
     def is_set(self) -> bool:
-        """Whether it is to end."""
+        """Whether work should end."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one attempt at a scan may take.
+    """Limits of one attempt at a scan.
 
     Parameters
     ----------
@@ -55,11 +66,11 @@ class Job:
     output : folder of the batch's outputs
     options : fields of `gnrecon.options.Options`; `threads` is a number
     mesh_format : extension of the mesh, without the dot
-    kinds : of files that are wanted beside the mesh, of `gnrecon.batch.job.FILES`
-    reference : truth to measure the mesh against
-    config : text of a configuration that makes the same mesh, for the file beside it
+    kinds : kinds of files to write in addition to the mesh, of `FILE_ENDINGS`
+    reference : ground truth to measure the mesh against
+    config : text of a configuration that makes the same mesh, written next to it
     limits : of each attempt
-    retry : how often a failure that may pass is tried again
+    retry : how often a transient failure is tried again
     overwrite : whether files that no record of this folder knows may be replaced
     fresh : whether the work is done again even where nothing has changed
     """
@@ -78,52 +89,65 @@ class Job:
     fresh: bool = False
 
     def file_names(self) -> dict[str, str]:
-        """Return the path of each wanted kind of file, relative to the output folder."""
-        endings = {
-            "mesh": f".{self.mesh_format}",
-            "report": ".report.json",
-            "page": ".html",
-            "preview": ".preview.png",
-            "model": ".gnr",
-            "config": ".config.toml",
+        """Return the path of each kind of file to write, relative to the output folder."""
+        return {
+            kind: self.name + ending.format(mesh_format=self.mesh_format)
+            for kind, ending in FILE_ENDINGS.items()
+            if kind in ("mesh", *self.kinds)
         }
-        return {kind: self.name + ending for kind, ending in endings.items() if kind in ("mesh", *self.kinds)}
 
     def record(self) -> Path:
-        """Return where the record of finished work lies."""
-        return self.output / STATE / "records" / f"{self.name}.json"
+        """Return the path of the record of finished work."""
+        return records_folder(self.output) / f"{self.name}.json"
 
     def log(self) -> Path:
-        """Return where the last attempt's words lie."""
-        return self.output / STATE / "logs" / f"{self.name}.log"
+        """Return the path of the last attempt's log."""
+        return state_folder(self.output) / "logs" / f"{self.name}.log"
 
     def thumbnail(self) -> Path:
-        """Return where a small picture of the mesh lies."""
-        return self.output / STATE / "thumbnails" / f"{self.name}.png"
+        """Return the path of a small picture of the mesh."""
+        return state_folder(self.output) / "thumbnails" / f"{self.name}.png"
+
+
+def state_folder(output: Path) -> Path:
+    """Return the folder for records, logs, thumbnails and running attempts, within the output folder."""
+    return output / ".gnrecon"
+
+
+def records_folder(output: Path) -> Path:
+    """Return the folder of the records of finished work."""
+    return state_folder(output) / "records"
 
 
 def running_folder(output: Path) -> Path:
-    """Return the folder in which each attempt has a folder of its own while it runs."""
-    return output / STATE / "running"
+    """Return the folder in which each running attempt has a folder of its own."""
+    return state_folder(output) / "running"
 
 
-# What a result depends on, as one hash: the bytes that are read, the options, the wanted files and the version.
+def progress_file(folder: Path) -> Path:
+    """Return the file in an attempt's folder that states its progress."""
+    return folder / "progress.json"
+
+
+def failure_file(folder: Path) -> Path:
+    """Return the file in an attempt's folder that holds the sentence on its failure."""
+    return folder / "failure.txt"
 
 
 def identity_of(job: Job) -> dict[str, Any]:
-    """Return what a job's result depends on, as plain values; equal ones make equal results.
+    """Return everything that a job's result depends on, as plain values; equal identities give equal results.
 
     Raises
     ------
     OSError
         When a file cannot be read.
     """
-    reference = [] if job.reference is None else members(job.reference)
+    reference = [] if job.reference is None else input_files(job.reference)
     return {
         "version": __version__,
-        "inputs": {str(path.name): file_hash(path) for path in members(job.scan)},
+        "inputs": {str(path.name): file_hash(path) for path in input_files(job.scan)},
         "reference": [file_hash(path) for path in reference],
-        # As JSON has it, so that what was read back from a record compares equal.
+        # Through JSON, so that it compares equal to what is read back from a record.
         "options": json.loads(json.dumps(dict(job.options))),
         "files": job.file_names(),
     }
@@ -141,7 +165,7 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def hash_if_there(path: Path) -> str | None:
+def hash_if_exists(path: Path) -> str | None:
     """Return the hash of a file's bytes, or None where there is no such file."""
     try:
         return file_hash(path)
@@ -149,47 +173,45 @@ def hash_if_there(path: Path) -> str | None:
         return None
 
 
-# The record of a finished scan: by it a batch that is started again knows what need not be done twice.
-#
-# A record is written when a result was verified and hashed, and before its files receive their names. So at whatever
-# moment a batch is killed, what a record tells of is either in place, or in the attempt's folder, from where the next
-# start brings it; and a file that is there is either known to a record, as the result or as what it was about to
-# replace, or somebody else's.
+# A record is written after a result was verified and hashed, and before its files are moved into place. At whatever
+# moment a batch is killed, the files of a record are therefore either in place or still in the attempt's folder, from
+# where the next start moves them. And every file in place is either known to a record, as its result or as what it was
+# about to replace, or was not written by the batch.
 
 
 @dataclass(frozen=True)
-class Record:
-    """Finished work.
+class JobRecord:
+    """Record of finished work.
 
     Parameters
     ----------
     identity : what it depends on, as of `identity_of`
     outputs : hash of each file of the result, by its path relative to the output folder
     replaced : hash of each file that this result was to replace
-    staged : folder that holds the files until they receive their names, relative to the output folder
-    told : what is told of it beside its files, fields of `Outcome`
+    staged : folder that holds the files until they are moved into place, relative to the output folder
+    facts : further fields of the `JobOutcome`, such as its figures
     """
 
     identity: Mapping[str, Any]
     outputs: Mapping[str, str]
     replaced: Mapping[str, str]
     staged: str
-    told: Mapping[str, Any]
+    facts: Mapping[str, Any]
 
-    def holds(self, identity: Mapping[str, Any], folder: Path) -> bool:
-        """Whether the same work was asked for, and its files are there as they were written."""
+    def is_current(self, identity: Mapping[str, Any], folder: Path) -> bool:
+        """Whether this is the result of the same work, and its files exist as they were written."""
         return identity == self.identity and all(
-            hash_if_there(folder / name) == known for name, known in self.outputs.items()
+            hash_if_exists(folder / name) == known for name, known in self.outputs.items()
         )
 
-    def knows(self, name: str, found: str) -> bool:
-        """Whether a file of this name and hash is one of the batch's own."""
-        return found in (self.outputs.get(name), self.replaced.get(name))
+    def knows(self, name: str, content_hash: str) -> bool:
+        """Whether a file of this name and hash was written by the batch."""
+        return content_hash in (self.outputs.get(name), self.replaced.get(name))
 
-    def place(self, folder: Path) -> None:
-        """Let the files that still wait in the attempt's folder have their names."""
+    def move_into_place(self, folder: Path) -> None:
+        """Move the files that are still in the attempt's folder to their final names."""
         for name, known in self.outputs.items():
-            if hash_if_there(folder / self.staged / name) == known:
+            if hash_if_exists(folder / self.staged / name) == known:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / self.staged / name).replace(folder / name)
 
@@ -205,25 +227,26 @@ class Record:
         write_text(path, json.dumps(asdict(self), indent=2) + "\n", overwrite=True)
 
 
-def read_record(path: Path) -> Record | None:
-    """Return the record in a file; None where there is none, or what is there is none."""
+def read_record(path: Path) -> JobRecord | None:
+    """Return the record in a file; None where there is no valid one."""
     try:
-        return Record(**json.loads(path.read_text(encoding="utf-8")))
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if "told" in values:  # how earlier versions named the field
+            values["facts"] = values.pop("told")
+        return JobRecord(**values)
     except (OSError, ValueError, TypeError):
         return None
 
 
-def all_records(folder: Path) -> list[Record]:
-    """Return the records below a folder; a hidden file is one that was not yet written to its end."""
-    records = [read_record(path) for path in sorted(folder.rglob("*.json")) if not path.name.startswith(".")]
+def all_records(output: Path) -> list[JobRecord]:
+    """Return the records in an output folder; hidden files are incomplete ones."""
+    files = sorted(records_folder(output).rglob("*.json"))
+    records = [read_record(path) for path in files if not path.name.startswith(".")]
     return [record for record in records if record is not None]
 
 
-# What became of one scan of a batch, and by which cause where it failed.
-
-
 class Status(enum.StrEnum):
-    """What was done about a scan."""
+    """Result of a scan."""
 
     MADE = "made"
     UNCHANGED = "unchanged"
@@ -231,7 +254,7 @@ class Status(enum.StrEnum):
 
 
 class Cause(enum.StrEnum):
-    """Why a scan failed; each names a group of the summary."""
+    """Why a scan failed; each is a group of the summary. Names are those of `ExitCode` where it has such a code."""
 
     INPUT = "input"
     USAGE = "usage"
@@ -244,27 +267,15 @@ class Cause(enum.StrEnum):
     UNFORESEEN = "unforeseen"
     INTERRUPTED = "interrupted"
 
-
-_CAUSES = {
-    ExitCode.USAGE: Cause.USAGE,
-    ExitCode.INPUT: Cause.INPUT,
-    ExitCode.FIT: Cause.FIT,
-    ExitCode.MESH: Cause.MESH,
-    ExitCode.OUTPUT: Cause.OUTPUT,
-    ExitCode.MEMORY: Cause.MEMORY,
-    ExitCode.INTERRUPTED: Cause.INTERRUPTED,
-}
-
-PASSING = frozenset({Cause.OUTPUT, Cause.MEMORY, Cause.TIMEOUT, Cause.SIGNAL, Cause.UNFORESEEN})
-"""Causes that may be gone at the next attempt; the others depend on the scan and the options alone."""
-
-FILES = ("mesh", "report", "page", "preview", "model", "config")
-"""Kinds of files that a scan may be given."""
+    @property
+    def is_transient(self) -> bool:
+        """Whether another attempt may succeed; other causes depend only on the scan and the options."""
+        return self in (Cause.OUTPUT, Cause.MEMORY, Cause.TIMEOUT, Cause.SIGNAL, Cause.UNFORESEEN)
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of one scan.
+class JobOutcome:
+    """What happened to one scan.
 
     Parameters
     ----------
@@ -273,13 +284,13 @@ class Outcome:
     status : Status
     cause : why it failed, or None
     message : one sentence on the failure, or nothing
-    exit_code : of its process; negative for a signal, None where it was ended for taking too long
-    files : path of each kind of file that was written, of `FILES`
+    exit_code : of its process; negative for a signal, None where it was killed for taking too long
+    files : path of each kind of file that was written, of `FILE_ENDINGS`
     thumbnail, log : paths; empty where there is none
-    attempts : how often it was tried, this time
+    attempts : number of attempts in this batch
     seconds : from the first attempt to the end of the last one
     peak_memory_mb : greatest resident memory of its process, in MB of 10^6 bytes; None where nothing was run
-    figures : what the mesh is like, see `figures_of`
+    figures : properties of the mesh, see `figures_of`
     metrics : distances to the reference, where there is one
     """
 
@@ -304,19 +315,20 @@ class Outcome:
         return self.status == Status.FAILED
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as plain values, every kind of file by its name."""
+        """Return the fields as plain values, with an entry for every kind of file."""
         values = asdict(self)
         files = values.pop("files")
-        return {**values, **{kind: files.get(kind, "") for kind in FILES}}
+        return {**values, **{kind: files.get(kind, "") for kind in FILE_ENDINGS}}
 
 
 def cause_of(exit_code: int) -> Cause | None:
-    """Return the cause that an exit code stands for; None for success."""
+    """Return the cause of failure for an exit code; None for success."""
     if exit_code == ExitCode.OK:
         return None
     if exit_code < 0:
         return Cause.SIGNAL
-    return _CAUSES.get(ExitCode(exit_code), Cause.UNFORESEEN) if exit_code in list(ExitCode) else Cause.UNFORESEEN
+    name = ExitCode(exit_code).name if exit_code in list(ExitCode) else ""
+    return Cause.__members__.get(name, Cause.UNFORESEEN)
 
 
 def describe_signal(number: int) -> str:
@@ -327,7 +339,6 @@ def describe_signal(number: int) -> str:
 
 
 def figures_of(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the few figures of a run's report that a table of many runs shows."""
+    """Return the figures of a run's report that a table of many runs shows."""
     mesh = report["mesh"]
-    names = ("vertices", "faces", "components", "genus", "closed", "area", "volume", "invented_area_share")
-    return {"points": report["ingest"]["kept"], **{name: mesh[name] for name in names}}
+    return {"points": report["ingest"]["kept"], **{name: mesh[name] for name in MESH_FIGURES}}

@@ -1,4 +1,4 @@
-"""The progress of a batch: a live table on a terminal, a line for each scan elsewhere."""
+"""The progress of a batch: a live table on a terminal, a line for each finished scan elsewhere."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from gnrecon.batch.job import PROGRESS, Outcome, Status, running_folder
+from gnrecon.batch.job import JobOutcome, Status, progress_file, running_folder
 from gnrecon.run import STAGES
 
-_STYLES = {Status.MADE: "green", Status.UNCHANGED: "dim", Status.FAILED: "red"}
-_FINISHED_SHOWN = 8
 
-
-class Board:
-    """What is shown of a batch.
+class ProgressBoard:
+    """Shows the progress of a batch.
 
     Parameters
     ----------
-    console : where
+    console : to print to
     total : number of scans
     output : folder of the batch's outputs
+    finished_rows : the last finished scans that the table lists; more would not fit on a small terminal
     """
 
-    def __init__(self, console: Console, total: int, output: Path) -> None:
+    def __init__(self, console: Console, total: int, output: Path, *, finished_rows: int = 8) -> None:
         self._console, self._total, self._output = console, total, output
-        self._outcomes: list[Outcome] = []
+        self._finished_rows = finished_rows
+        self._outcomes: list[JobOutcome] = []
         self._start = time.monotonic()
 
-    def done(self, outcome: Outcome) -> None:
-        """Show a scan's end."""
+    def done(self, outcome: JobOutcome) -> None:
+        """Show that a scan has finished."""
         self._outcomes.append(outcome)
         if not self._console.is_terminal:
             result = outcome.message if outcome.failed else f"{outcome.files['mesh']} ({outcome.status})"
@@ -58,43 +57,48 @@ class Board:
         return Group(self._head(), self._running(), self._finished())
 
     def _head(self) -> Text:
-        counts = {status: sum(one.status == status for one in self._outcomes) for status in Status}
+        counts = {status: sum(outcome.status == status for outcome in self._outcomes) for status in Status}
         seconds = time.monotonic() - self._start
         text = Text(f"{len(self._outcomes)} of {self._total} scans")
         for status, count in counts.items():
             if count:
-                text.append(f"  {count} {status}", style=_STYLES[status])
-        worked = [one for one in self._outcomes if one.attempts]
+                text.append(f"  {count} {status}", style=_style(status))
+        run = [outcome for outcome in self._outcomes if outcome.attempts]
         text.append(f"  {_clock(seconds)}")
-        if worked and len(self._outcomes) < self._total:
-            left = seconds / len(worked) * (self._total - len(self._outcomes))
+        if run and len(self._outcomes) < self._total:
+            # Unchanged scans take no time, so the estimate counts only those that were run.
+            left = seconds / len(run) * (self._total - len(self._outcomes))
             text.append(f", about {_clock(left)} left", style="dim")
         return text
 
     def _running(self) -> Table:
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-        for name, stage, share, seconds in _states(self._output):
-            words = STAGES.get(stage, "Starting")
-            table.add_row(name, words, ProgressBar(total=1.0, completed=share, width=24), _clock(seconds))
+        for name, stage, share, seconds in _running_scans(self._output):
+            title = STAGES.get(stage, "Starting")
+            table.add_row(name, title, ProgressBar(total=1.0, completed=share, width=24), _clock(seconds))
         return table
 
     def _finished(self) -> Table:
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-        for outcome in self._outcomes[-_FINISHED_SHOWN:]:
-            told = outcome.message if outcome.failed else outcome.files["mesh"]
-            status = Text(str(outcome.cause or outcome.status), style=_STYLES[outcome.status])
-            table.add_row(outcome.name, status, Text(told, overflow="ellipsis", no_wrap=True, style="dim"))
+        for outcome in self._outcomes[-self._finished_rows :]:
+            result = outcome.message if outcome.failed else outcome.files["mesh"]
+            status = Text(str(outcome.cause or outcome.status), style=_style(outcome.status))
+            table.add_row(outcome.name, status, Text(result, overflow="ellipsis", no_wrap=True, style="dim"))
         return table
 
 
-def _states(output: Path) -> list[tuple[str, str, float, float]]:
-    """Name, stage, share of it that is done and seconds until now of each scan that is being worked at."""
+def _style(status: Status) -> str:
+    return {Status.MADE: "green", Status.UNCHANGED: "dim", Status.FAILED: "red"}[status]
+
+
+def _running_scans(output: Path) -> list[tuple[str, str, float, float]]:
+    """Name, stage, finished share of it, and seconds so far of each running scan."""
     found = []
     for folder in sorted(running_folder(output).glob("*")):
         try:
-            state = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
+            state = json.loads(progress_file(folder).read_text(encoding="utf-8"))
             seconds = max(0.0, time.time() - state["begun"])
-        except (OSError, ValueError):  # not begun yet, just ended, or being written
+        except (OSError, ValueError):  # not started yet, just ended, or being written
             continue
         found.append((state["name"], state["stage"], float(state["share"]), seconds))
     return found

@@ -1,4 +1,4 @@
-"""What a batch is asked for."""
+"""The request for a batch, as the command line gives it, with its validation."""
 
 from __future__ import annotations
 
@@ -10,31 +10,30 @@ from gnrecon.io import writable
 from gnrecon.runtime.errors import UsageError
 
 
-# What a batch is asked for.
 @dataclass(frozen=True)
 class Request:
-    """A batch as the command line asks for it.
+    """A batch as requested on the command line.
 
     Parameters
     ----------
     sources : files, folders and patterns
-    output : folder for the meshes, made when missing
+    output : folder for the meshes, created when missing
     lists : files with a source on each line
-    patterns : of the files that are taken from folders; empty: all that can be read
-    recursive : whether subfolders are entered
+    patterns : of the files to take from folders; empty: all that can be read
+    recursive : whether subfolders are searched
     name : template of the outputs' names, see `gnrecon.batch.scan_search`
     mesh_format : extension of the meshes, without the dot
-    kinds : of files that are wanted beside each mesh, of `gnrecon.batch.job.FILES`
+    kinds : kinds of files to write in addition to each mesh, of `gnrecon.batch.job.FILE_ENDINGS`
     settings : options, references and limits, for all scans or for some
     references : folder of references
-    reference_name : template of a reference's path in there, with its extension or without
-    jobs : at a time; None: as many as the machine takes
-    retry : how often a failure that may pass is tried again
+    reference_name : template of a reference's path in that folder, with or without its extension
+    jobs : number of jobs at a time; None: as many as the machine takes
+    retry : how often a transient failure is tried again
     engine : ``"local"`` or ``"dask"``
-    scheduler : address of a Dask scheduler, which means the engine, too
+    scheduler : address of a Dask scheduler; implies the engine ``"dask"``
     overwrite, fresh : as of `Job`
-    quiet : whether nothing but failures is said
-    command : the line that asked for it
+    quiet : whether only failures are printed
+    command : the command line
 
     Raises
     ------
@@ -67,13 +66,13 @@ class Request:
             supported = ", ".join(suffix[1:] for suffix in known)
             raise UsageError(f"Meshes cannot be written as {self.mesh_format!r}; use {supported}.")
         if not self.sources and not self.lists:
-            raise UsageError("Name a folder, a pattern or scans, or a list of them by --list.")
+            raise UsageError("Name a folder, a pattern or scans, or give a list of them with --list.")
         if "-" in self.sources:
-            raise UsageError("A batch reads no standard input; name a folder, a pattern or scans.")
+            raise UsageError("A batch does not read standard input; name a folder, a pattern or scans.")
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"The number of jobs must be positive, not {self.jobs}.")
         if self.reference_name is not None and self.references is None:
-            raise UsageError("A template of references needs the folder that they lie in: add --reference-dir.")
+            raise UsageError("A template of references needs the folder of the references: add --reference-dir.")
         if self.engine not in ("local", "dask"):
             raise UsageError(f"The engine is local or dask, not {self.engine!r}.")
         if self.retry < 0:

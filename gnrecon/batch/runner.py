@@ -1,4 +1,4 @@
-"""A whole batch: plan it, do it, show how far it is, and write its account."""
+"""Runs a whole batch: plans it, runs its jobs, shows the progress, and writes the summary."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gnrecon.batch.executors import cuda_devices, fitting_jobs, run_locally, run_on_cluster
-from gnrecon.batch.job import STATE, Outcome, Status, all_records, running_folder
+from gnrecon.batch.job import JobOutcome, Status, all_records, records_folder, running_folder, state_folder
 from gnrecon.batch.plan import plan
-from gnrecon.batch.progress_board import Board
+from gnrecon.batch.progress_board import ProgressBoard
 from gnrecon.batch.request import Request
-from gnrecon.batch.summary import NAME, Account, write_summary
+from gnrecon.batch.summary import BatchSummary, write_summary
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 
 
 def run_batch(request: Request) -> int:
-    """Reconstruct all scans that are asked for, each in a process of its own, and return the exit code.
+    """Reconstruct all requested scans, each in a process of its own, and return the exit code.
 
-    Work that was done before is not done again. Beside the meshes lies the account of the whole, see
-    `gnrecon.batch.summary`, also where the batch was interrupted.
+    Scans whose result is current are skipped. The summary is written to the output folder, see `gnrecon.batch.summary`,
+    also where the batch was interrupted.
 
     Raises
     ------
     InputError
         When a source is missing, or there is no scan.
     UsageError
-        When options, names or formats make no sense, or another batch is at work in the output folder.
+        When options, names or formats are invalid, or another batch is running in the output folder.
     OutputError
-        When the output folder cannot be made, or the account not be written.
+        When the output folder cannot be created, or the summary cannot be written.
     """
     jobs = plan(request)
     devices = cuda_devices(jobs)
     threads = max(int(job.options["threads"]) for job in jobs)
     console, start = Console(stderr=True, quiet=request.quiet), time.monotonic()
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, JobOutcome] = {}
     interrupted = False
-    with workplace(request.output):
+    with locked_output_folder(request.output):
         count = request.jobs or len(devices) or fitting_jobs(jobs, threads)
         without = sum(job.reference is None for job in jobs)
         if request.references is not None and without:
             console.print(f"{without} of {len(jobs)} scans have no reference in {request.references}.", soft_wrap=True)
-        board = Board(console, len(jobs), request.output)
+        board = ProgressBoard(console, len(jobs), request.output)
 
-        def done(outcome: Outcome) -> None:
+        def done(outcome: JobOutcome) -> None:
             outcomes[outcome.name] = outcome
             board.done(outcome)
 
@@ -60,67 +60,67 @@ def run_batch(request: Request) -> int:
                     run_on_cluster(jobs, request.scheduler, count, devices, done)
                 else:
                     run_locally(jobs, count, devices, done)
-        except KeyboardInterrupt:  # What was done until now is still worth its account.
+        except KeyboardInterrupt:  # the summary still lists what was finished
             interrupted = True
         ordered = tuple(outcomes[job.name] for job in jobs if job.name in outcomes)
-        account = Account(ordered, len(jobs), count, threads, time.monotonic() - start, request.command)
-        write_summary(account, request.output)
-    for line in _closing(account):
+        summary = BatchSummary(ordered, len(jobs), count, threads, time.monotonic() - start, request.command)
+        written = write_summary(summary, request.output)
+    for line in _closing_lines(summary):
         console.print(line, highlight=False, markup=False)
     if interrupted:
-        told = request.output / f"{NAME}.json"
-        print(f"gnrecon: Interrupted; {told} tells what was done until then.", file=sys.stderr)
+        print(f"gnrecon: Interrupted; {written} lists what was done until then.", file=sys.stderr)
         return ExitCode.INTERRUPTED
-    return ExitCode.BATCH if account.count(Status.FAILED) else ExitCode.OK
+    return ExitCode.BATCH if summary.count(Status.FAILED) else ExitCode.OK
 
 
-def _closing(account: Account) -> list[RenderableType]:
-    """A line of figures, and the failures."""
-    made, unchanged = account.count(Status.MADE), account.count(Status.UNCHANGED)
-    line = f"{made + unchanged} of {account.total} scans reconstructed"
+def _closing_lines(summary: BatchSummary) -> list[RenderableType]:
+    """A line of figures, and a table of the failures."""
+    made, unchanged = summary.count(Status.MADE), summary.count(Status.UNCHANGED)
+    line = f"{made + unchanged} of {summary.total} scans reconstructed"
     line += f", {unchanged} of them unchanged" if unchanged else ""
-    line += f", in {account.seconds:.0f} s"
-    if not account.count(Status.FAILED):
+    line += f", in {summary.seconds:.0f} s"
+    if not summary.count(Status.FAILED):
         return [f"{line}."]
-    causes = ", ".join(f"{count} {cause}" for cause, count in account.causes().items())
+    causes = ", ".join(f"{count} {cause}" for cause, count in summary.causes().items())
     table = Table()
     for heading in ("scan", "cause", "seconds", "what happened"):
         table.add_column(heading, overflow="fold")
-    for outcome in account.outcomes:
+    for outcome in summary.outcomes:
         if outcome.failed:
             table.add_row(outcome.scan, str(outcome.cause), f"{outcome.seconds:.1f}", outcome.message)
     return [table, f"{line}; failed: {causes}."]
 
 
-# The output folder of a batch: made, held by one batch at a time, and freed of what an earlier one left half done.
-
-
 @contextmanager
-def workplace(output: Path) -> Iterator[None]:
-    """Hold an output folder while the block runs; the system lets go of it even when this process is killed.
+def locked_output_folder(output: Path) -> Iterator[None]:
+    """Create an output folder and lock it while the block runs; the system unlocks it even if this process is killed.
+
+    Results of an earlier batch that were recorded but not yet in place are moved there; its other leftovers are
+    deleted.
 
     Raises
     ------
     OutputError
-        When it cannot be made or written to.
+        When it cannot be created or written to.
     UsageError
-        When another batch is at work there.
+        When another batch is running there.
     """
     try:
-        (output / STATE).mkdir(parents=True, exist_ok=True)
-        lock = (output / STATE / "lock").open("w", encoding="utf-8")
+        state_folder(output).mkdir(parents=True, exist_ok=True)
+        lock = (state_folder(output) / "lock").open("w", encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"The folder {output} cannot be made: {error.strerror or error}.") from error
+        raise OutputError(f"The folder {output} cannot be created: {error.strerror or error}.") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise UsageError(
-                f"Another batch is at work in {output}; wait for its end, or choose another folder."
+                f"Another batch is running in {output}; wait for its end, or choose another folder."
             ) from None
-        for record in all_records(output / STATE / "records"):
-            record.place(output)
+        for record in all_records(output):
+            record.move_into_place(output)
+        # After the recorded results were moved, these folders only hold files of killed attempts.
         shutil.rmtree(running_folder(output), ignore_errors=True)
-        for left in (output / STATE / "records").rglob(".*.json"):
-            left.unlink(missing_ok=True)
+        for incomplete in records_folder(output).rglob(".*.json"):
+            incomplete.unlink(missing_ok=True)
         yield

@@ -1,4 +1,7 @@
-"""The account of a batch: ``summary.json`` for programs, ``summary.csv`` for tables, ``summary.html`` to look at."""
+"""The summary of a batch: ``summary.json`` for programs, ``summary.csv`` for tables, ``summary.html`` for people.
+
+The HTML page is one file with a picture of each mesh, its figures, and the failures grouped by their causes.
+"""
 
 from __future__ import annotations
 
@@ -17,29 +20,41 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from gnrecon.batch.job import FILES, Cause, Outcome, Status
+from gnrecon.batch.job import FILE_ENDINGS, MESH_FIGURES, Cause, JobOutcome, Status
 from gnrecon.report.html import scales as numbers
 from gnrecon.report.html import style_text
 from gnrecon.runtime.files import write_text
 from gnrecon.version import __version__
 
-NAME = "summary"
+CAUSE_DESCRIPTIONS = {
+    Cause.INPUT: "the scan cannot be read or reconstructed",
+    Cause.USAGE: "the options do not fit the scan",
+    Cause.FIT: "the fit failed",
+    Cause.MESH: "the mesh is not sound",
+    Cause.OUTPUT: "a file could not be written",
+    Cause.MEMORY: "not enough memory",
+    Cause.TIMEOUT: "it took too long",
+    Cause.SIGNAL: "the process was killed",
+    Cause.UNFORESEEN: "a fault of gnrecon",
+    Cause.INTERRUPTED: "interrupted",
+}
 
 
 @dataclass(frozen=True)
-class Account:
-    """What a batch did.
+class BatchSummary:
+    """Results of a batch.
 
     Parameters
     ----------
     outcomes : in the order of the scans
-    total : how many scans it was about, which are more where it was interrupted
-    jobs : at a time, and `threads` of each
-    seconds : that it took
-    command : the line that asked for it
+    total : number of scans in the batch; more than the outcomes where it was interrupted
+    jobs : number of jobs at a time
+    threads : of each job
+    seconds : duration of the batch
+    command : the command line
     """
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[JobOutcome, ...]
     total: int
     jobs: int
     threads: int
@@ -47,12 +62,13 @@ class Account:
     command: str | None = None
 
     def count(self, status: Status) -> int:
-        """Return how many scans came to a status."""
+        """Return how many scans have a status."""
         return sum(outcome.status == status for outcome in self.outcomes)
 
     def causes(self) -> dict[str, int]:
         """Return how many scans failed by each cause, the most frequent first."""
-        return dict(Counter(str(one.cause) for one in self.outcomes if one.cause is not None).most_common())
+        failures = [str(outcome.cause) for outcome in self.outcomes if outcome.cause is not None]
+        return dict(Counter(failures).most_common())
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -71,72 +87,51 @@ class Account:
         }
 
 
-def write_summary(account: Account, folder: Path) -> None:
-    """Write the account into a folder in three formats, each atomically; older ones are replaced.
+def write_summary(summary: BatchSummary, folder: Path) -> Path:
+    """Write the summary into a folder in three formats, each atomically, and return the path of the JSON file.
+
+    Older summaries are replaced.
 
     Raises
     ------
     OutputError
         When a file cannot be written.
     """
-    text = json.dumps(account.as_dict(), indent=2, allow_nan=False) + "\n"
-    write_text(folder / f"{NAME}.json", text, overwrite=True)
-    write_text(folder / f"{NAME}.csv", table_text(account.outcomes), overwrite=True)
-    write_text(folder / f"{NAME}.html", overview_text(account.as_dict(), folder), overwrite=True)
+    # JSON has no NaN; a value that is not finite would make the file unreadable for other programs.
+    text = json.dumps(summary.as_dict(), indent=2, allow_nan=False) + "\n"
+    write_text(folder / "summary.json", text, overwrite=True)
+    write_text(folder / "summary.csv", summary_csv(summary.outcomes), overwrite=True)
+    write_text(folder / "summary.html", summary_html(summary.as_dict(), folder), overwrite=True)
+    return folder / "summary.json"
 
 
-_PLAIN = ("name", "scan", "status", "cause", "message", "exit_code", "attempts", "seconds", "peak_memory_mb")
+def summary_csv(outcomes: Sequence[JobOutcome]) -> str:
+    """Return the outcomes as comma-separated values: a line of column names, then one line for each scan.
 
-_FIGURES = ("points", "vertices", "faces", "components", "genus", "closed", "area", "volume", "invented_area_share")
-
-
-def table_text(outcomes: Sequence[Outcome]) -> str:
-    """Return the outcomes as comma-separated values, one line a scan below a line of names.
-
-    Distances to references are there where a scan has some.
+    There are columns for distances to references if a scan has a reference.
     """
-    metrics = [name for outcome in outcomes for name in _numbers(outcome.metrics)]
-    columns = [*_PLAIN, *_FIGURES, *dict.fromkeys(metrics), *FILES]
+    metrics = [name for outcome in outcomes for name in _numeric(outcome.metrics)]
+    columns = ["name", "scan", "status", "cause", "message", "exit_code", "attempts", "seconds", "peak_memory_mb"]
+    columns += ["points", *MESH_FIGURES, *dict.fromkeys(metrics), *FILE_ENDINGS]
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     for outcome in outcomes:
-        table.writerow({**outcome.as_dict(), **outcome.figures, **_numbers(outcome.metrics)})
+        table.writerow({**outcome.as_dict(), **outcome.figures, **_numeric(outcome.metrics)})
     return text.getvalue()
 
 
-def _numbers(metrics: Mapping[str, Any] | None) -> dict[str, float]:
+def _numeric(metrics: Mapping[str, Any] | None) -> dict[str, float]:
     return {name: value for name, value in (metrics or {}).items() if isinstance(value, int | float)}
 
 
-COLORS = 64
-"""Of a thumbnail on the page."""
-
-WORDS = {
-    Cause.INPUT: "the scan cannot be read or reconstructed",
-    Cause.USAGE: "the options do not fit the scan",
-    Cause.FIT: "the fit failed",
-    Cause.MESH: "the mesh is not sound",
-    Cause.OUTPUT: "a file could not be written",
-    Cause.MEMORY: "not enough memory",
-    Cause.TIMEOUT: "it took too long",
-    Cause.SIGNAL: "the process was killed",
-    Cause.UNFORESEEN: "a fault of gnrecon",
-    Cause.INTERRUPTED: "interrupted",
-}
-"""What each cause means, in a few words."""
-
-
-# The summary to look at: one HTML file with a picture of each mesh, its figures, and the failures by their causes.
-
-
-def overview_text(account: Mapping[str, Any], folder: Path) -> str:
+def summary_html(summary: Mapping[str, Any], folder: Path) -> str:
     """Return the page as text.
 
     Parameters
     ----------
-    account : as `Account.as_dict` gives it
-    folder : that the page is to lie in, from which it links to the files
+    summary : as `BatchSummary.as_dict` returns it
+    folder : where the page will lie; links to files are relative to it
     """
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -148,13 +143,17 @@ def overview_text(account: Mapping[str, Any], folder: Path) -> str:
         "memory": numbers.memory,
         "percent": lambda value: numbers.share(value, 1.0),
     }
-    scans = [_row(scan, folder) for scan in account["scans"]]
+    scans = [_row(scan, folder) for scan in summary["scans"]]
     causes = [
-        {"name": name, "words": WORDS[Cause(name)], "scans": [scan for scan in scans if scan["cause"] == name]}
-        for name in account["causes"]
+        {
+            "name": name,
+            "description": CAUSE_DESCRIPTIONS[Cause(name)],
+            "scans": [scan for scan in scans if scan["cause"] == name],
+        }
+        for name in summary["causes"]
     ]
-    return environment.get_template("overview.html.j2").render(
-        account=account,
+    return environment.get_template("summary.html.j2").render(
+        summary=summary,
         folder=folder.absolute().name,
         scans=scans,
         causes=causes,
@@ -164,23 +163,23 @@ def overview_text(account: Mapping[str, Any], folder: Path) -> str:
 
 
 def _row(scan: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    links = [(kind, _link(scan[kind], folder)) for kind in FILES if scan[kind]]
+    links = [(kind, _link(scan[kind], folder)) for kind in FILE_ENDINGS if scan[kind]]
     links += [("log", _link(scan["log"], folder))] if scan["log"] else []
-    return {**scan, "links": links, "picture": _picture(scan["thumbnail"])}
+    return {**scan, "links": links, "picture": _picture_uri(scan["thumbnail"])}
 
 
 def _link(path: str, folder: Path) -> str:
     return quote(os.path.relpath(path, folder))
 
 
-def _picture(path: str) -> str | None:
-    """A picture as a data URI, in few colours, because a page may hold thousands; None where it is not there."""
+def _picture_uri(path: str, *, colors: int = 64) -> str | None:
+    """A picture as a data URI, reduced to `colors` because a page may hold thousands; None where there is none."""
     from PIL import Image
 
     packed = io.BytesIO()
     try:
         with Image.open(path) as picture:
-            picture.convert("RGB").quantize(COLORS).save(packed, format="PNG", optimize=True)
+            picture.convert("RGB").quantize(colors).save(packed, format="PNG", optimize=True)
     except OSError:
         return None
     return f"data:image/png;base64,{base64.b64encode(packed.getvalue()).decode('ascii')}"

@@ -1,272 +1,87 @@
-"""``gnrecon info SCAN``: what is in a scan and what would trouble a fit; and what a run would do, without doing it."""
+"""The commands ``eval``, ``convert``, ``check`` and ``info``, on files, and ``doctor`` and ``schema``, on gnrecon."""
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from rich.console import Console
+import typer
 
-from gnrecon.export import examine, measure
-from gnrecon.fit import bounds_of
-from gnrecon.geometry.mesh import Mesh
-from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest import Layers, layers_of, prepare, survey
-from gnrecon.io import (
-    CLOUD_WRITERS,
-    Reading,
-    all_members,
-    holds,
-    read_any,
-    read_mesh,
-    read_reference,
-    unverified,
-    writable,
-    write_cloud,
-    write_mesh,
-    written_origin,
-)
-from gnrecon.io.origin import told
-from gnrecon.io.write import losses
-from gnrecon.options import Options
-from gnrecon.pipeline import described, read_source
-from gnrecon.report.estimate import estimate
-from gnrecon.runtime.errors import ExitCode, InputError, MeshError, UsageError
-from gnrecon.runtime.files import require_files, write_text
-
-_NORMALS = {
-    "missing": "missing; they will be estimated",
-    "zero": "zero for most points; they will be estimated",
-    "unnormalised": "good, of other lengths than one",
-    "inconsistent": "inconsistent: neighbours often face opposite ways",
-    "inward": "consistent, but inward; they will be flipped",
-    "good": "good",
-}
+from gnrecon.cli.shared_parameters import DebugOption, FormatOption, OverwriteOption, QuietOption, SeedOption
+from gnrecon.option_table import Panel
+from gnrecon.runtime.errors import ExitCode
 
 
-def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = None, *, as_json: bool = False) -> int:
-    """Print the facts of a scan and what a run with these options would do, and return the exit code 0.
+def eval_command(
+    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF, GLB or 3MF file.")],
+    reference: Annotated[Path, typer.Option(help="Mesh or cloud to measure it against.")],
+    samples: Annotated[int, typer.Option(help="Points drawn on each surface.")] = 100_000,
+    seed: SeedOption = 0,
+    report: Annotated[
+        Path | None, typer.Option("--json", help="JSON file to write.", rich_help_panel=Panel.OUTPUT)
+    ] = None,
+    overwrite: OverwriteOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Print how far a mesh lies from a reference: Chamfer, RMS, Hausdorff, F-score, normal consistency."""
+    from gnrecon.cli.inspect_files import evaluate
 
-    Raises
-    ------
-    UsageError
-        When an option is out of its range.
-    InputError
-        When the scan cannot be read, or no surface can be fitted to it.
-    """
-    chosen = Options.of(**options)
-    cloud, reading = read_source(list(scans), None, format, chosen.read_points, chosen.region())
-    plan, layers = _plan(cloud, reading, chosen)
-    facts = described(survey(cloud), layers, reading)
-    if facts is None:
-        raise InputError("The scan holds fewer than 25 finite and distinct points, so that nothing can be told of it.")
-    if as_json:
-        attributes = {name: list(values.shape[1:]) for name, values in cloud.attributes.items()}
-        print(json.dumps({"reading": reading.as_dict(), **facts, "attributes": attributes, "plan": plan}, indent=2))
-    else:
-        print("\n".join([*_describe(facts, cloud, chosen.units), *_sentences(plan, layers)]))
-    return ExitCode.OK
+    del debug
+    raise SystemExit(evaluate(mesh, reference, samples=samples, seed=seed, report=report, overwrite=overwrite))
 
 
-def _plan(cloud: PointCloud, reading: Reading, options: Options) -> tuple[dict[str, Any], Layers | None]:
-    """What a run would do, as plain values, and the layers that it would find."""
-    samples, counts = prepare(cloud, **options.ingest())
-    fit, bounds = options.fit(), bounds_of(samples)
-    options = options.for_scan(samples.frame.to_world(samples.points), bounds)
-    expected = estimate(reading.points, len(samples), bounds, options)
-    plan = {
-        "points": len(samples),
-        "widths": None if fit.adaptive else list(fit.widths_for(len(samples))),
-        "steps": fit.steps_for(len(samples)),
-        "detail_features": fit.features if fit.adaptive else None,
-        "remarks": [*reading.remarks(), *counts.remarks()],
-        "seconds": None if expected is None else expected.seconds,
-        "memory_mb": None if expected is None else expected.memory_mb,
-        "estimate": "No estimate of time and memory: no such run was measured."
-        if expected is None
-        else expected.describe(),
-    }
-    return plan, layers_of(samples, counts.normals)
+def convert_command(
+    source: Annotated[Path, typer.Argument(help="Mesh or cloud to read.")],
+    target: Annotated[Path, typer.Argument(help="File to write; its extension names the format.")],
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Write a mesh or a cloud in another format, unchanged, and name what the format cannot hold."""
+    from gnrecon.cli.inspect_files import convert
+
+    del debug
+    raise SystemExit(convert(source, target, overwrite=overwrite, quiet=quiet))
 
 
-def _describe(facts: Mapping[str, Any], cloud: PointCloud, units: str | None) -> list[str]:
-    size = " x ".join(f"{high - low:.6g}" for low, high in zip(facts["lower"], facts["upper"], strict=True))
-    counts = {
-        "not finite": facts["non_finite"],
-        "duplicates": facts["duplicates"],
-        "copies": facts["repeated"],
-        "in isolated clusters": facts["clusters"],
-    }
-    thick = f"{facts['spacing_p5']:.4g} to {facts['spacing_p95']:.4g} for 90 %"
-    lines = {
-        "points": ", ".join([f"{facts['points']:,}", *(f"{count:,} {what}" for what, count in counts.items())]),
-        "size": f"{size} file units",
-        "unit": _unit(facts, units),
-        "spacing": f"{facts['spacing']:.4g} in the median, {thick}",
-        "density": f"varies by a factor of {facts['density_variation']:.3g}",
-        "noise": _noise(facts),
-        "normals": _NORMALS[facts["normals"]],
-        "outliers": f"{facts['outliers']} of up to 10,000 points",
-        "surface": _surface(facts),
-        "layers": "one" if facts["layers"] is None else f"two, about {facts['layers']['offset']:.3g} apart",
-        "attributes": ", ".join(cloud.attributes) or "none",
-        "scanner": f"{facts['origins']} known positions" if facts["origins"] else "positions not known",
-    }
-    return [f"{name + ':':12} {text}" for name, text in lines.items()]
+def check_command(
+    mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF, GLB or 3MF file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    debug: DebugOption = False,
+) -> None:
+    """Check whether a mesh bounds a solid: exit code 0 if it is a closed, oriented 2-manifold, 5 if it is not."""
+    from gnrecon.cli.inspect_files import check
+
+    del debug
+    raise SystemExit(check(mesh, as_json=as_json))
 
 
-def _unit(facts: Mapping[str, Any], units: str | None) -> str:
-    if units is not None:
-        return f"{units}, as was told"
-    if facts["units_guess"] is None:
-        return f"not to be guessed: {facts['units_reason']}"
-    return f"perhaps {facts['units_guess']}, a guess: {facts['units_reason']}"
+def info_command(
+    scans: Annotated[list[Path], typer.Argument(help="One or more scans; - is standard input.")],
+    format: FormatOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    debug: DebugOption = False,
+) -> None:
+    """Describe a scan, what might make a fit difficult, and what a run would do by default."""
+    from gnrecon.cli.scan_info import info
+
+    del debug
+    raise SystemExit(info(scans, {}, format, as_json=as_json))
 
 
-def _surface(facts: Mapping[str, Any]) -> str:
-    if facts["noise"] is None:
-        return "too few points to tell borders"
-    if not facts["open"]:
-        return "closed"
-    return f"open, or with holes: {facts['border_share']:.1%} of the points lie at a border"
+def doctor_command() -> None:
+    """Check the installation, and print how to install what is missing."""
+    from rich.console import Console
+
+    from gnrecon.cli.doctor import diagnose, render
+
+    checks = diagnose()
+    render(checks, Console())
+    raise SystemExit(0 if all(check.ok for check in checks) else ExitCode.INPUT)
 
 
-def _noise(facts: Mapping[str, Any]) -> str:
-    """The noise along the normal, or what can be said of it."""
-    if facts["noise"] is None:
-        return f"not to be told from the surface's own bends, at most {facts['noise_limit']:.3g}"
-    if facts["noise"] == 0:
-        return f"none that can be told from the surface's own bends, at most {facts['noise_limit']:.2g}"
-    return f"{facts['noise']:.3g} along the normal, {facts['noise'] / facts['spacing']:.2g} of the spacing"
+def schema_command() -> None:
+    """Print the JSON schema of the report: every field with its meaning and unit."""
+    from gnrecon.report.report import schema_text
 
-
-def _sentences(plan: Mapping[str, Any], layers: Layers | None) -> list[str]:
-    if plan["widths"] is None:
-        network = f"a smooth global field and local detail of {plan['detail_features']:,} sines a cube"
-    else:
-        network = f"layers of {', '.join(map(str, plan['widths']))} sines, in {plan['steps']} steps"
-    sentence = f"A run would fit {plan['points']:,} points with {network}."
-    return [*plan["remarks"], *([] if layers is None else [layers.describe()]), sentence, plan["estimate"]]
-
-
-# ``gnrecon check MESH``: whether any mesh bounds a solid, and what is unusual about it.
-
-
-def check(path: Path, *, as_json: bool = False) -> int:
-    """Print what a mesh is, as text or as one JSON object, and return the exit code 0 where it bounds a solid.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read or holds no faces.
-    MeshError
-        When the mesh does not bound a solid, after printing; the sentence names everything that is wrong.
-    """
-    findings = examine(read_mesh(path))
-    if as_json:
-        # JSON knows no numbers that are not finite, such as the volume of a mesh with broken vertices.
-        values = {name: _plain(value) for name, value in findings.as_dict().items()}
-        print(json.dumps({"file": str(path), **values}, indent=2))
-    else:
-        print("\n".join(findings.describe()))
-    if not findings.sound:
-        raise MeshError(f"{path} does not bound a solid: it {'; it '.join(findings.failures)}.")
-    return ExitCode.OK
-
-
-def _plain(value: object) -> object:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-# ``gnrecon eval MESH --reference FILE``: how far a mesh lies from the surface that it should be.
-
-
-def evaluate(
-    path: Path, reference: Path, *, samples: int, seed: int, report: Path | None = None, overwrite: bool = False
-) -> int:
-    """Print the distances between a mesh and a reference with their definitions, and return the exit code 0.
-
-    Parameters
-    ----------
-    path : the mesh
-    reference : a mesh or a cloud in the same frame and units
-    samples : points on each surface
-    seed : of the sampling
-    report : JSON file to write with all figures
-    overwrite : whether an existing report may be replaced
-
-    Raises
-    ------
-    UsageError
-        When the number of samples is not positive, or the report is one of the inputs.
-    InputError
-        When a file cannot be read, or holds nothing to measure.
-    OutputError
-        When the report cannot be written.
-    """
-    require_files(all_members([path, reference]), [] if report is None else [report], overwrite)
-    metrics = measure(read_mesh(path), read_reference(reference), samples=samples, seed=seed)
-    if report is not None:
-        figures = {"mesh": str(path), "reference": str(reference), "seed": seed, **metrics.as_dict()}
-        write_text(report, json.dumps(figures, indent=2) + "\n", overwrite)
-    print("\n".join(metrics.describe()))
-    return ExitCode.OK
-
-
-# ``gnrecon convert IN OUT``: any mesh or cloud in another format, unchanged; what is lost on the way is named.
-
-
-def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool = False) -> int:
-    """Write what a file holds in the format that the target's extension names, and return the exit code 0.
-
-    Nothing is repaired: a mesh that is open stays open. The file is read back and compared before it gets its name.
-
-    Raises
-    ------
-    UsageError
-        When the extension is unknown, a cloud is to become a mesh, or the target is the source.
-    InputError
-        When the source cannot be read.
-    MeshError, OutputError
-        When the target cannot be written.
-    """
-    require_files(all_members([source]), [target], overwrite)
-    extension = target.suffix.lower()
-    if extension not in (known := dict.fromkeys([*writable(), *CLOUD_WRITERS])):
-        named = ", ".join(suffix[1:] for suffix in known)
-        raise UsageError(f"A file cannot be written as {extension or 'one without an extension'!r}; use {named}.")
-    found, unread = read_any(source)
-    sentences = [f"{source} holds what is not read: {', '.join(unread)}."] if unread else []
-    console = Console(stderr=True, quiet=quiet)
-    for sentence in [*sentences, *_write(found, target, overwrite), _summary(found, target)]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
-    return ExitCode.OK
-
-
-def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]:
-    """Write a mesh or a cloud and return sentences about what was lost."""
-    lost: list[str] = []
-
-    def compare(path: Path) -> None:
-        lost.extend(losses(found, read_any(path)[0]))
-
-    if isinstance(found, Mesh) and target.suffix.lower() in writable():
-        unheld = [name for name, values in found.attributes.items() if not holds(target, name, values)]
-        write_mesh(found, target, overwrite, compare)
-        origin = written_origin(found, target)
-        lost += [] if origin is None else [told(origin)]
-        lost += unverified(target)
-        lost += [f"The format has no place for {', '.join(unheld)} of the vertices; PLY has."] if unheld else []
-    else:
-        cloud = PointCloud(found.vertices, found.normals, found.attributes) if isinstance(found, Mesh) else found
-        write_cloud(cloud, target, overwrite, compare)
-    return lost
-
-
-def _summary(found: Mesh | PointCloud, target: Path) -> str:
-    if isinstance(found, Mesh) and target.suffix.lower() in writable():
-        return f"{target}: {len(found.vertices)} vertices, {len(found.faces)} faces."
-    return f"{target}: {len(found.vertices if isinstance(found, Mesh) else found.points)} points."
+    print(schema_text(), end="")

@@ -1,83 +1,117 @@
-"""``gnrecon mesh MODEL -o MESH``: mesh a fitted field again without refitting: finer, cropped, offset, hollowed."""
+"""The command ``gnrecon mesh MODEL -o MESH``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-import numpy as np
-from rich.console import Console
+import typer
 
-from gnrecon.export import Neighbourhood, require_sound, verify_file
-from gnrecon.fit import NeuralSDF
-from gnrecon.geometry.mesh import Mesh
-from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io import check_writable, holds, write_mesh
-from gnrecon.options import Options
-from gnrecon.pipeline import limited, require_device
-from gnrecon.report.report import Stages
-from gnrecon.run import shown, summarise
-from gnrecon.runtime.errors import ExitCode
-from gnrecon.runtime.files import require_files
-from gnrecon.solid import Shape, shaped
-from gnrecon.vertex_attributes import curvature_of, wanted
+from gnrecon.cli.option_parameters import table_option
+from gnrecon.cli.shared_parameters import (
+    CurvatureOption,
+    DebugOption,
+    OutputOption,
+    OverwriteOption,
+    QuietOption,
+    ThreadsOption,
+)
+from gnrecon.option_table import OptionTable, Panel
 
-
-def remesh(
-    model: Path, output: Path, options: dict[str, Any], shape: Shape, *, overwrite: bool = False, quiet: bool = False
-) -> int:
-    """Mesh a saved field, write the mesh once it is verified, and return the exit code 0.
-
-    Parameters
-    ----------
-    model : a file that `NeuralSDF.save` wrote
-    output : the mesh; its extension names the format
-    options : of the meshing, by their names in `Options`; the field is evaluated on the device
-    shape : offset, shell and crop, in file units
-    overwrite : whether an existing mesh may be replaced
-    quiet : say nothing but failures
-
-    Raises
-    ------
-    UsageError, InputError, MeshError, OutputError, MemoryLimitError
-        Each says in one sentence what is wrong; nothing is written then.
-    """
-    check_writable(output)
-    require_files([model], [output], overwrite)
-    chosen = Options.of(**options)
-    require_device(chosen.device)
-    wanted(PointCloud(np.empty((0, 3))), chosen.attributes)  # a misspelt name is refused before the work
-    console = Console(stderr=True, quiet=quiet)
-    with shown(console, verbose=False) as progress, limited(chosen.threads):
-        stages = Stages(progress.stage, chosen.device)
-        with stages("read"):
-            sdf = NeuralSDF.load(model, chosen.device)
-        mesh, remarks = shaped(sdf, chosen, shape, stages=stages, advance=progress.advance)
-        with stages("verify"):
-            facts = require_sound(mesh)
-        if shape.levels == (0.0,):  # elsewhere, neither the points nor the field say anything of the surface
-            with stages("attributes"):
-                mesh = _adorned(mesh, sdf, chosen, output)
-        progress.stage("write")
-        losses = write_mesh(mesh, output, overwrite, verify=_verify)
-    summary = summarise(output, facts.as_dict(), stages.resources())
-    for sentence in [*remarks, *losses, summary]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
-    return ExitCode.OK
+ModelArgument = Annotated[Path, typer.Argument(help="Fitted field, a .gnr file that --save wrote.")]
+ResolutionOption = Annotated[int | None, table_option("resolution")]
+EdgeLengthOption = Annotated[str | None, table_option("edge_length")]
+MaxErrorOption = Annotated[str | None, table_option("max_error")]
+CropOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is then that of the box, "
+        "and cuts are closed by flat caps.",
+        rich_help_panel=Panel.MESH,
+    ),
+]
+OffsetOption = Annotated[
+    str,
+    typer.Option(
+        help="Move the surface outward, inward if negative: 0.5, or 2mm with --units.", rich_help_panel=Panel.MESH
+    ),
+]
+ShellOption = Annotated[
+    str | None,
+    typer.Option(help="Hollow the solid to a wall of this thickness, measured inward.", rich_help_panel=Panel.MESH),
+]
+UnitsOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Unit of the file (um, mm, cm, m, km, in, ft); lengths may then have a unit, such as 2mm.",
+        rich_help_panel=Panel.MESH,
+    ),
+]
+KeepHandlesOption = Annotated[bool, table_option("keep_handles")]
+RemeshOption = Annotated[float | None, table_option("remesh")]
+AdaptiveOption = Annotated[bool, table_option("adaptive")]
+SimplifyOption = Annotated[float | None, table_option("simplify")]
+FacesOption = Annotated[int | None, table_option("faces")]
+FeatureAngleOption = Annotated[float, table_option("feature_angle")]
+AttributesOption = Annotated[
+    str,
+    typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=Panel.MESH),
+]
+DeviceOption = Annotated[
+    str, typer.Option(help="Where the field is evaluated: cpu or cuda.", rich_help_panel=Panel.MESH)
+]
 
 
-def _adorned(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path) -> Mesh:
-    """Tell each vertex how far it lies from the model's points, and how the field is curved there, where asked for.
+def mesh_command(
+    model: ModelArgument,
+    output: OutputOption,
+    resolution: ResolutionOption = None,
+    edge_length: EdgeLengthOption = None,
+    max_error: MaxErrorOption = None,
+    crop: CropOption = None,
+    offset: OffsetOption = "0",
+    shell: ShellOption = None,
+    units: UnitsOption = None,
+    keep_handles: KeepHandlesOption = False,
+    remesh: RemeshOption = None,
+    adaptive: AdaptiveOption = False,
+    simplify: SimplifyOption = None,
+    faces: FacesOption = None,
+    feature_angle: FeatureAngleOption = OptionTable.feature_angle,
+    attributes: AttributesOption = "auto",
+    curvature: CurvatureOption = False,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Mesh a fitted field again, without refitting: at another resolution, cropped, offset, or as a hollow shell."""
+    import numpy as np
 
-    Distances that nobody asked for by name are left out where the format has no place for them.
-    """
-    made = {one.name: one.values for one in (curvature_of(mesh, sdf) if options.curvature else [])}
-    if options.attributes != "none" and sdf.data is not None:
-        distances = Neighbourhood(sdf.data).distances(mesh.vertices)
-        if options.attributes != "auto" or holds(output, "distance", distances):
-            made["distance"] = distances
-    return mesh.with_attributes(made)
+    from gnrecon.cli.remesh_model import remesh_model
+    from gnrecon.geometry.units import parse_box, parse_length
+    from gnrecon.solid import Shape
 
-
-def _verify(path: Path) -> None:
-    verify_file(path)
+    del debug
+    shape = Shape(
+        parse_length(offset, units),
+        None if shell is None else parse_length(shell, units),
+        None if crop is None else np.array(parse_box(crop)),
+    )
+    options = {
+        "resolution": resolution,
+        "edge_length": None if edge_length is None else parse_length(edge_length, units),
+        "max_error": None if max_error is None else parse_length(max_error, units),
+        "keep_handles": keep_handles,
+        "remesh": remesh,
+        "adaptive": adaptive,
+        "simplify": simplify,
+        "faces": faces,
+        "feature_angle": feature_angle,
+        "attributes": attributes,
+        "curvature": curvature,
+        "device": device,
+        "threads": threads,
+    }
+    raise SystemExit(remesh_model(model, output, options, shape, overwrite=overwrite, quiet=quiet))

@@ -18,7 +18,7 @@ from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 MEASURED = ("amplitude", "confidence", "intensity", "quality", "reflectance")
 """Names of measured values, which are averaged even where a file holds whole numbers."""

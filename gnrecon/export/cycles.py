@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from gnrecon.export.mesh_statistics import Edges, face_components
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 Signatures = npt.NDArray[np.uint64]
 

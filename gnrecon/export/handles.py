@@ -31,6 +31,7 @@ from gnrecon.export.export_parameters import ExportParameters, HandleParameters
 from gnrecon.export.mesh_statistics import Edges, corner_fans
 from gnrecon.export.verify import require_sound
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.local_pca import plane_normals
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.statistics import widest_gap
 from gnrecon.runtime.errors import MeshError
@@ -155,8 +156,7 @@ class _PointSupport:
         """
         points = self._density.points
         around = points[self._density.tree.query(points, k=min(self.parameters.ring_points + 1, len(points)))[1]]
-        spread = around - around.mean(axis=1, keepdims=True)
-        return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0])
+        return plane_normals(around)
 
     def uncovered(self, mesh: Mesh, disks: Float, loops: Sequence[Loop]) -> list[Loop]:
         """Return the loops that are short, and about which the normals of nearby points leave a wide angle free."""

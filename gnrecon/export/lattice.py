@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from gnrecon.export.project import SignedDistance, evaluates_blocks, sdf_around
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 

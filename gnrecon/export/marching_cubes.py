@@ -26,7 +26,7 @@ from gnrecon.export.sparse_grid import NarrowBand, narrow_band
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
 def extract(
@@ -76,10 +76,10 @@ def extract(
     band = narrow_band(
         lattice,
         None if data is None else lattice.nodes(data),
-        part(advance, 0.0, 0.9),
+        subrange(advance, 0.0, 0.9),
         parameters=parameters or ExtractionParameters(),
     )
-    pieces = _march_all(band, part(advance, 0.9, 1.0))
+    pieces = _march_all(band, subrange(advance, 0.9, 1.0))
     del band
     if not pieces:
         raise MeshError(

@@ -30,7 +30,7 @@ from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 _log = logging.getLogger(__name__)
 
@@ -235,7 +235,7 @@ def _extract_until_accurate(
             resolution=cells,
             bounds=box,
             data=data,
-            advance=part(advance, begin, end),
+            advance=subrange(advance, begin, end),
             parameters=parameters.extraction,
         )
         mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)

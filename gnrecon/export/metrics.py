@@ -17,8 +17,8 @@ from gnrecon.export.boolean import centre_and_size
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError, UsageError
-from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh, area_vectors
 from gnrecon.geometry.point_cloud import Frame
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.parallel import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 

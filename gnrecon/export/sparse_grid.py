@@ -26,8 +26,8 @@ from gnrecon.export.export_parameters import ExtractionParameters
 from gnrecon.export.lattice import Lattice
 from gnrecon.export.leaf_storage import LeafStore, UniformRow, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.runtime.parallel import slices
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
 @functools.cache
@@ -319,7 +319,7 @@ def narrow_band(
     done = search_time_share
     for share, found in candidate_leaves(lattice, coarse, leaves, data, parameters):
         begin, done = done, search_time_share + (1.0 - search_time_share) * share
-        band.evaluate(found, part(advance, begin, done))
+        band.evaluate(found, subrange(advance, begin, done))
     _propagate(band)
     return band
 

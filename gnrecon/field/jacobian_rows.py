@@ -76,7 +76,7 @@ class Jet:
             adjoint_tangents = self._along(axis.expand_as(self.gradient))[1]
             columns.append(adjoint_tangents[0] @ self.layers[0][0])
         hessian = torch.stack(columns, dim=2)
-        # Exactly symmetric, whatever the rounding.
+        # Exactly symmetric despite rounding.
         return (hessian + hessian.mT) / 2
 
     def _along(self, v: Tensor) -> tuple[list[Tensor], list[Tensor]]:
@@ -88,7 +88,7 @@ class Jet:
         adjoint_tangents = [torch.zeros_like(self.adjoints[-1])]
         for level in range(len(self.slopes) - 1, -1, -1):
             weights = self.layers[level + 1][0]
-            # The outermost adjoint is constant, so its tangent contributes nothing to the layer before it.
+            # The outermost adjoint is constant, so its tangent is zero.
             inner = self.slopes[level] * (adjoint_tangents[0] @ weights) if level + 1 < len(self.slopes) else 0.0
             bend = (self.adjoints[level + 1] @ weights).mul_(z_tangents[level]).mul_(self.activations[level + 1])
             adjoint_tangents.insert(0, inner - bend)
@@ -102,7 +102,7 @@ Derivatives = dict[Index, Tensor]
 
 # Second derivatives in space, and rows of the parameter Jacobian for residuals of them, in closed form.
 #
-# With activations a_l, adjoints d_l = df/dz_l and D_i the derivative along an axis of space, `field.jet` makes rows of
+# With activations a_l, adjoints d_l = df/dz_l and D_i the derivative along an axis of space, `Jet` computes rows of
 # c df + v . d(grad f) from d a^T. A residual of curvature also has a part M : d(Hess f) with M symmetric. With the
 # operator P = v . grad + sum_ij M_ij D_i D_j its row is, per layer,
 #
@@ -116,13 +116,13 @@ Derivatives = dict[Index, Tensor]
 #
 #     D_i d = (D_i s') e + s' D_i e,     P d = (P s') e + 2 sum_i (D_i s') (sum_j M_ij D_j e) + s' P e,
 #
-# so that there is one forward and one backward pass for the axes, whatever the number of residuals, and one for each
-# residual's P. Units of several numbers (wavelets) sum over them. Nothing is differentiated by nesting; `torch.func` is
-# the tests' oracle.
+# so there is one forward and one backward pass for the axes, for any number of residuals, and one for each residual's
+# P. Units of several numbers (wavelets) sum over them. No automatic differentiation is nested; the tests compare with
+# `torch.func`.
 #
-# The axes may be other directions u_1 .. u_K, of each point's own: D_i = u_i . grad, and P's second part is sum_ij (U M
-# U^T)_ij D_i D_j where M has no part off their span. A surface's curvatures need its two tangents alone, which spares a
-# third of the axes' passes and one of the five outer products.
+# The axes may be other directions u_1 .. u_K, which differ between points: D_i = u_i . grad, and P's second part is
+# sum_ij (U M U^T)_ij D_i D_j if M has no part off their span. The curvatures of a surface need only its two tangents,
+# which saves a third of the work for the axes and one of the five outer products.
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class CurvedJet:
-    """A field's value and its first and second derivatives at N points, and those of all of them by the parameters.
+    """A field's value and its first and second derivatives at N points, with their derivatives by the parameters.
 
     Parameters
     ----------
@@ -208,11 +208,11 @@ class CurvedJet:
     def hessian(self) -> Tensor:
         """Second derivatives of f in space, of shape (N, 3, 3), exactly symmetric.
 
-        Of two directions' complement, those along it twice are unknown, and zero here.
+        With two directions, the second derivative along their complement is unknown and set to zero.
         """
         found = (self.axes.adjoints[0] @ self.layers[0][0]).permute(1, 0, 2)
         if self.directions is not None:
-            # U H is what was found, and H = U^T U H + H U^T U - U^T U H U^T U, but for the complement's own part.
+            # U H is known, and H = U^T U H + H U^T U - U^T U H U^T U, except for the part of the complement.
             U = self.directions.permute(1, 0, 2)
             found = U.mT @ (2 * found - (found @ U.mT) @ U)
         return (found + found.mT) / 2
@@ -305,7 +305,7 @@ class CurvedJet:
 def _turned(M: Tensor, along: Tensor) -> Tensor:
     """Return sum_j M_ij X_j for X of shape (K, N, width), M of shape (N, K, K)."""
     turned = torch.empty_like(along, memory_format=torch.contiguous_format)
-    # K^2 passes over what lies in the cache are several times as fast as N products of small matrices.
+    # K^2 passes over cached data are several times as fast as N products of small matrices.
     for row, place in zip(M.unbind(1), turned.unbind(0), strict=True):
         first, *others = row[:, :, None].unbind(1)
         torch.mul(first, along[0], out=place)

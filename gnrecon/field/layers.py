@@ -1,7 +1,7 @@
-"""Activations of a network's hidden units with their derivatives up to the third.
+"""Activations of a network's hidden units with derivatives up to the third, and the layout of its parameters.
 
-A unit takes q numbers z (one, or two for a wavelet) to one number. With second derivatives of a network in space, the
-Jacobian by its parameters needs the third derivatives of its units, and no more.
+A unit maps q numbers z (one, or two for a wavelet) to one number. The Jacobian by the parameters of a network's second
+derivatives in space needs the third derivatives of its units.
 
     sine      sin z                        Sitzmann et al., Implicit neural representations with periodic activation
                                            functions (2020)
@@ -9,7 +9,7 @@ Jacobian by its parameters needs the third derivatives of its units, and no more
     wavelet   cos z_1 exp(-z_2^2)          the real Gabor wavelet of Saragadam et al., WIRE: wavelet implicit neural
                                            representations (2023); the paper's bracket
 
-The usual factors omega_0 and s_0 are no separate numbers here: they are part of the weights, which begin larger.
+The usual factors omega_0 and s_0 are not separate numbers here: they are part of the initial weights.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import torch
 from torch import Tensor
 
 Index = tuple[int, ...]
-"""By which of a unit's numbers it is differentiated, ascending: () not at all, (0, 0) twice by the first one."""
+"""The inputs of a unit by which it is differentiated, ascending: () for the value, (0, 0) twice by the first one."""
 
 
 @dataclass(frozen=True)
 class Activation:
-    """What a hidden unit does.
+    """The function of a hidden unit.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ TANH = Activation("tanh", 1, _tanh)
 WAVELET = Activation("wavelet", 2, _wavelet)
 
 ACTIVATIONS = {one.name: one for one in (SINE, TANH, WAVELET)}
-"""All of them by their names."""
+"""The activations by name."""
 
 
 # Where each layer's weights lie in the flat parameter vector.

@@ -1,7 +1,7 @@
 """Sine networks (SIREN) and their first derivatives in closed form.
 
 With a_0 = x, each hidden layer takes z_l = W_l a_{l-1} + b_l to a_l = sin z_l, and f = W a_L + b. The usual factor
-omega_0 is no separate number here: it is part of the weights, so that Gauss-Newton may change it.
+omega_0 is not a separate number here: it is part of the weights, so Gauss-Newton can change it.
 
 The adjoints d_l = df/dz_l run backwards from d = 1: d_l = cos z_l o (W_{l+1}^T d_{l+1}), and grad f = W_1^T d_1.
 
@@ -72,7 +72,7 @@ class Siren:
         return jet.value, jet.gradient
 
     def jet(self, theta: Tensor, x: Tensor) -> Jet:
-        """Return activations and adjoints at points x, of shape (N, 3), from which all derivatives are made."""
+        """Return activations and adjoints at points x, of shape (N, 3), from which all derivatives follow."""
         layers = self.layout.layers(theta)
         activations, slopes = [x], []
         for weights, bias in layers[:-1]:
@@ -89,7 +89,7 @@ class Siren:
 # Fully connected networks of any activation, with second derivatives in closed form.
 #
 # With a_0 = x, each hidden layer takes z_l = W_l a_{l-1} + b_l to its units' values a_l, and f = W a_L + b. A unit of q
-# numbers (two for a wavelet) has q rows in W_l: first those of all units' first numbers, then those of the second ones.
+# numbers (two for a wavelet) has q rows in W_l: first those of all units' first numbers, then those of the second.
 #
 # The networks of the paper's shape-learning problems are ``Network((32, 32), TANH)`` and ``Network((32, 32),
 # WAVELET)``.
@@ -105,8 +105,8 @@ class Network:
         Hidden units of each layer.
     activation : Activation
     frequencies : tuple of float
-        Factors on a unit's numbers in the first layer's start, such as (omega_0, s_0) of a wavelet: how much detail the
-        network begins with. One for each number of a unit.
+        Factors of the first layer's initial weights, one for each input of a unit, such as (omega_0, s_0) of a wavelet.
+        They set the scale of the initial detail.
     """
 
     widths: tuple[int, ...]
@@ -147,5 +147,5 @@ class Network:
         return jet.value, jet.gradient
 
     def curved_jet(self, theta: Tensor, x: Tensor) -> CurvedJet:
-        """Return what all derivatives at points x, of shape (N, 3), are made from."""
+        """Return the network's derivatives at points x, of shape (N, 3)."""
         return CurvedJet.of(self.layout.layers(theta), self.activation, x)

@@ -7,6 +7,7 @@ a division, and the weights are twice continuously differentiable, so that a ble
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,14 +18,23 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.field.random_features import Features
-from gnrecon.geometry.arrays import Float, Int
-from gnrecon.runtime.parallel import abreast, slices
+from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
 
-OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 
-_TURNS = np.array(list(itertools.product((False, True), repeat=3)))
-"""Along which axes a cube is the neighbour of a point's own cell."""
+@functools.cache
+def neighbour_offsets() -> Int:
+    """Return the offsets of a cell and its 26 neighbours in keys, of shape (27, 3)."""
+    return np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+
+
+@functools.cache
+def _axis_subsets() -> Mask:
+    """Return all subsets of the axes, of shape (8, 3): those along which a cube is a neighbour of a point's cell."""
+    return np.array(list(itertools.product((False, True), repeat=3)))
 
 
 @dataclass(frozen=True)
@@ -55,7 +65,7 @@ class Partition:
         return center
 
     def members(self, x: Float) -> tuple[Int, list[Int]]:
-        """Return the keys, of shape (B, 3) and in order, of all cubes that hold some of x, and the rows each holds.
+        """Return the sorted keys, of shape (B, 3), of all cubes that contain some of x, and the rows in each.
 
         Parameters
         ----------
@@ -68,20 +78,21 @@ class Partition:
         return keys[first], np.split(rows, first[1:]) if len(first) else []
 
     def pairs(self, x: Float) -> tuple[Int, Int]:
-        """Return every pair of a cube's key, of shape (P, 3), and a row of x that it holds, of shape (P,), by rows.
+        """Return every pair of a cube's key, of shape (P, 3), and a row of x in that cube, of shape (P,), by rows.
 
-        Along each axis a point lies in its own cell, and in the zone of overlap of at most one neighbour.
+        Along each axis a point lies in its own cell and in the overlap with at most one neighbour.
         """
         u = (x - self.origin) / self.cell
         own = np.floor(u).astype(np.int64)
-        beside = np.where(u - own < 0.5, -1, 1)
-        overlaps = np.abs(u - (own + beside + 0.5)) < (1.0 + self.overlap) / 2
-        held = np.stack([(overlaps | ~turn).all(axis=1) for turn in _TURNS], axis=1)
-        rows, turns = np.nonzero(held)
-        return own[rows] + _TURNS[turns] * beside[rows], rows
+        neighbour = np.where(u - own < 0.5, -1, 1)
+        overlaps = np.abs(u - (own + neighbour + 0.5)) < (1.0 + self.overlap) / 2
+        subsets = _axis_subsets()
+        inside = np.stack([(overlaps | ~axes).all(axis=1) for axes in subsets], axis=1)
+        rows, numbers = np.nonzero(inside)
+        return own[rows] + subsets[numbers] * neighbour[rows], rows
 
     def pairs_of_boxes(self, low: Float, high: Float) -> tuple[Int, Int]:
-        """Return every pair of a cube's key, of shape (P, 3), and a row of the boxes that it meets, of shape (P,).
+        """Return every pair of a cube's key, of shape (P, 3), and a row of a box that it intersects, of shape (P,).
 
         Parameters
         ----------
@@ -137,19 +148,12 @@ def _product(changed: Tensor, others: Tensor, axes: tuple[int, ...]) -> Tensor:
     return factors[0] * factors[1] * factors[2]
 
 
-ROWS = 512
-"""Pairs of a point and a cube whose features are made at once: they stay in the processor's cache."""
-
-TOGETHER, AROUND = 16_384, 131_072
-"""Points that one thread evaluates at a time: any, and those around centres, which take less each."""
-
-
-# Local detail on top of a global network: one layer of sine features a cube, blended by a partition of unity.
+# Local detail on top of a global network: one layer of sine features per cube, blended by a partition of unity.
 #
 #     d(x) = sum_b w_b(x) sum_j a_bj sin(F_j . (x - c_b) / l_b + p_j)
 #
 # All cubes share frequencies F and phases p; each has a centre c_b, a length l_b and output weights a_b of its own.
-# Where no cube holds x, d = 0. Coordinates are relative to the cube, so that single precision loses nothing.
+# If no cube contains x, d = 0. Coordinates are relative to the cube, so that single precision does not lose digits.
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,7 @@ class Detail:
         return self.amplitudes.numel() + 4 * len(self.features) + len(self.lengths)
 
     def as_dict(self, scale: float) -> dict[str, float]:
-        """Return what the data chose, as plain values; lengths in the unit of which `scale` make a radius."""
+        """Return the fitted values as plain numbers; lengths are multiplied by `scale`, the radius of the cloud."""
         return {
             "cubes": len(self),
             "features": len(self.features),
@@ -211,21 +215,23 @@ class Detail:
         value, gradient = self._blended(x, 1)
         return value, gradient
 
-    def value_around(self, x: Float, offsets: Float) -> Float:
+    def value_around(
+        self, x: Float, offsets: Float, *, batch_values: int = FieldParameters.batch_stencil_values
+    ) -> Float:
         """Return d, of shape (N, K), at K offsets, of shape (K, 3), from each of x, of shape (N, 3)."""
         values = np.empty((len(x), len(offsets)))
 
         def fill(rows: slice) -> None:
             values[rows] = self._blend_around(x[rows], offsets)
 
-        abreast(fill, slices(len(x), max(1, AROUND // len(offsets))), self.amplitudes.device)
+        map_in_threads(fill, slices(len(x), max(1, batch_values // len(offsets))), self.amplitudes.device)
         return values
 
     def hessian(self, x: Float) -> Float:
         """Return the second derivatives of d, of shape (N, 3, 3), at x, of shape (N, 3)."""
         return self._blended(x, 2)[2]
 
-    def _blended(self, x: Float, order: int) -> list[Float]:
+    def _blended(self, x: Float, order: int, *, batch_points: int = FieldParameters.batch_points) -> list[Float]:
         """Return d and its derivatives up to an order."""
         sums = [np.empty((len(x), *(order_ * [3]))) for order_ in range(order + 1)]
 
@@ -233,11 +239,11 @@ class Detail:
             for total, part in zip(sums, self._blend(x[rows], order), strict=True):
                 total[rows] = part
 
-        abreast(fill, slices(len(x), TOGETHER), self.amplitudes.device)
+        map_in_threads(fill, slices(len(x), batch_points), self.amplitudes.device)
         return sums
 
     def _blend(self, x: Float, order: int) -> list[Float]:
-        """Return what `_blended` does for points of which all may be held at once, with all of their cubes."""
+        """Return the result of `_blended` for one batch of points, with all of their cubes."""
         keys, rows = self.partition.pairs(x)
         cubes = self._cubes(keys)
         by_cube = np.flatnonzero(cubes >= 0)
@@ -256,7 +262,7 @@ class Detail:
         return [part.new_zeros(len(x), *part.shape[1:]).index_add_(0, to, part).numpy() for part in parts]
 
     def _blend_around(self, x: Float, offsets: Float) -> Float:
-        """Return what `value_around` does, for centres of which all may be held at once, with all of their cubes."""
+        """Return the result of `value_around` for one batch of centres, with all of their cubes."""
         keys, rows = self.partition.pairs_of_boxes(x + offsets.min(axis=0), x + offsets.max(axis=0))
         cubes = self._cubes(keys)
         by_cube = np.flatnonzero(cubes >= 0)
@@ -271,12 +277,20 @@ class Detail:
             own = stencil.sums(phase, self.amplitudes[cube]).double().cpu().numpy()
             points = torch.as_tensor((x[near][:, None] + offsets).reshape(-1, 3))
             weight = next(self.partition.weight(points, torch.as_tensor(center), 0)).numpy()
-            # A centre has a cube once, so that no row is named twice.
+            # A centre is paired with a cube once, so no row occurs twice.
             values[near] += weight.reshape(own.shape) * own
         return values
 
-    def _own(self, points: Tensor, centers: Tensor, cubes: Int, order: int) -> list[Tensor]:
-        """Return cubes' own functions with derivatives, each at one point, in double precision.
+    def _own(
+        self,
+        points: Tensor,
+        centers: Tensor,
+        cubes: Int,
+        order: int,
+        *,
+        batch_pairs: int = FieldParameters.batch_pairs,
+    ) -> list[Tensor]:
+        """Return the functions of the cubes with derivatives, each at one point, in double precision.
 
         Parameters
         ----------
@@ -288,11 +302,11 @@ class Detail:
         local, amplitudes = self.features.local(points, centers, lengths), self.amplitudes
         numbers = torch.as_tensor(cubes, device=amplitudes.device)
         own = [amplitudes.new_empty(len(points), *(order_ * [3])) for order_ in range(order + 1)]
-        for rows in slices(len(points), ROWS):
+        for rows in slices(len(points), batch_pairs):
             sums = self.features.sums_of(local[rows], amplitudes[numbers[rows]], order)
             for whole, part in zip(own, sums, strict=True):
                 whole[rows] = part
-        # Derivatives are along x over the length so far.
+        # So far derivatives are with respect to x / length.
         own = [part.double().cpu() for part in own]
         return [part / lengths.reshape(-1, *(k * [1])) ** k for k, part in enumerate(own)]
 
@@ -310,7 +324,7 @@ class Detail:
 
     @cached_property
     def _lookup(self) -> tuple[Int, Int, Int, Int]:
-        """The least key, how many there might be along each axis, the cubes' codes in order, and the row of each."""
+        """The smallest key, the extent of the keys along each axis, the sorted codes of the cubes, and their rows."""
         low, extent = self.keys.min(axis=0), np.ptp(self.keys, axis=0) + 1
         codes = _codes(self.keys - low, extent)
         order = np.argsort(codes, kind="stable")

@@ -1,8 +1,9 @@
-"""Sine features: a layer of fixed frequencies and phases, of which any number of functions are weighted sums.
+"""Random sine features: functions that are weighted sums of one layer of fixed frequencies and phases.
 
     c(x) = sum_j a_j sin(F_j . (x - c_0) / l + p_j)
 
-Frequencies F are drawn for a length of one, so that one draw serves functions of any length l about any centre c_0.
+Frequencies F are drawn for a length of one, so one draw can be used for functions of any length l around any centre
+c_0.
 """
 
 from __future__ import annotations
@@ -14,10 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.geometry.arrays import Float
-
-DEGREES_OF_FREEDOM = 12.0
-"""Of the features' spectrum, a Student t distribution: the larger, the smoother; 4 is a Matern kernel's."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +27,16 @@ class Features:
     phases: Tensor
 
     @classmethod
-    def draw(cls, count: int, rng: np.random.Generator, like: Tensor) -> Features:
-        """Draw features; their kernel is smooth, see `DEGREES_OF_FREEDOM`."""
-        spread = np.sqrt(rng.chisquare(DEGREES_OF_FREEDOM, count) / DEGREES_OF_FREEDOM)
+    def draw(
+        cls,
+        count: int,
+        rng: np.random.Generator,
+        like: Tensor,
+        *,
+        degrees_of_freedom: float = FieldParameters.degrees_of_freedom,
+    ) -> Features:
+        """Draw features whose frequencies have a Student t distribution; more degrees of freedom are smoother."""
+        spread = np.sqrt(rng.chisquare(degrees_of_freedom, count) / degrees_of_freedom)
         frequencies = rng.standard_normal((count, 3)) / spread[:, None]
         phases = rng.uniform(0.0, 2 * np.pi, count)
         return cls(torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like))
@@ -56,7 +62,7 @@ class Features:
         center : of shape (3,), or (N, 3)
         length : one, or of shape (N, 1)
         """
-        # Relative to the centre first: in single precision nothing is lost then.
+        # Subtract the centre first, so that single precision does not lose digits.
         return torch.nn.functional.pad(((x - center) / length).to(self.frequencies), (0, 1), value=1.0)
 
     def phase(self, x: Tensor, center: Tensor, length: float) -> Tensor:
@@ -99,17 +105,17 @@ class Features:
         return (self.frequencies[:, :, None] * self.frequencies[:, None, :]).reshape(-1, 9)
 
 
-# Sines at points that lie alike around many centres, such as the nodes of a lattice's blocks.
+# Sines at the same offsets around many centres, such as the nodes of a lattice's blocks.
 #
 #     sin(F . (c + o) + p) = sin(F . c + p) cos(F . o) + cos(F . c + p) sin(F . o)
 #
-# Sums of m sines at K offsets from each of N centres so take N m sines and cosines and two matrix products, in place of
-# N K m sines.
+# Sums of m sines at K offsets from each of N centres therefore take N m sines and cosines and two matrix products
+# instead of N K m sines.
 
 
 @dataclass(frozen=True)
 class Stencil:
-    """What m features turn by from a centre to K offsets from it: cosine and sine of F . o, both of shape (m, K)."""
+    """The phase shifts of m features from a centre to K offsets: cosine and sine of F . o, both of shape (m, K)."""
 
     cosine: Tensor
     sine: Tensor

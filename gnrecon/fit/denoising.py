@@ -19,23 +19,13 @@ import numpy as np
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Choice, Leftover, Trials
-from gnrecon.fit.shape_priors.bilateral_filter import Averaging
-from gnrecon.fit.shape_priors.sharp_shape import Sharp, has_edges
+from gnrecon.fit.parameters import DenoisingParameters
+from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape, has_edges
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import Samples
 
 _log = logging.getLogger(__name__)
-
-FIRST = Averaging(2.5, 0.4)
-"""What is tried first; only where it helps are the others."""
-
-OTHERS = (Averaging(4.0, 0.4), Averaging(6.0, 0.4))
-
-CLEARLY = 2.0
-"""Standard errors by which patches must be better for averaging where no edges are seen."""
-
-NOISY = 0.05
-"""Noise of the positions, in radii of a point's disk, above which points are averaged."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +43,10 @@ class LocalData:
     samples: Samples
     leftover: Leftover
     belief: Belief
-    averaging: Averaging | None = None
+    averaging: BilateralFilter | None = None
 
     @classmethod
-    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> LocalData:
+    def of_faces(cls, sdf: NeuralSDF, sharp: SharpShape) -> LocalData:
         """Return what faces that were continued to their edges tell by themselves, beside a global field."""
         return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
 
@@ -69,6 +59,8 @@ def choose_local_data(
     rng: np.random.Generator,
     device: str,
     outliers: bool = False,
+    *,
+    parameters: DenoisingParameters = DenoisingParameters(),
 ) -> LocalData:
     """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
 
@@ -94,50 +86,60 @@ def choose_local_data(
     # Outliers that are left have no part in the noise that evidence tells.
     plain = choice.belief if outliers else choice.best
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
-    if samples.estimated or choice.belief.position <= 1.001 * NOISY * radius:
+    if samples.estimated or choice.belief.position <= 1.001 * parameters.least_noise_disk_radii * radius:
         return LocalData(samples, leftover, plain)
 
-    def with_kept(averaging: Averaging) -> Trials:
+    def with_kept(averaging: BilateralFilter) -> Trials:
         points, normals = samples.points.copy(), samples.normals.copy()
-        points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
+        points[~held], normals[~held] = averaging.apply(points[~held], normals[~held])
         # The noise of averaged points is alike among neighbours, of which no evidence is made.
         of_averaged = Leftover.of(sdf, replace(samples, points=points, normals=normals))
         return replace(trials, leftover=of_averaged, evidence=None)
 
-    found = _best(choice, with_kept, lambda: has_edges(*FIRST.of(samples.points, samples.normals)))
+    first = _candidates(parameters)[0]
+    found = _best(choice, with_kept, lambda: has_edges(*first.apply(samples.points, samples.normals)), parameters)
     if found is None:
         return LocalData(samples, leftover, plain)
     averaging, better = found
-    points, normals = averaging.of(samples.points, samples.normals)
+    points, normals = averaging.apply(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
-    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
+    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width_radii)
     return LocalData(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
 
 
 def _best(
-    choice: Choice, kept_averaged: Callable[[Averaging], Trials], edges: Callable[[], bool]
-) -> tuple[Averaging, Trials] | None:
+    choice: Choice,
+    kept_averaged: Callable[[BilateralFilter], Trials],
+    edges: Callable[[], bool],
+    parameters: DenoisingParameters = DenoisingParameters(),
+) -> tuple[BilateralFilter, Trials] | None:
     """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
 
     Whether there are edges is asked where the patches alone do not decide. All are compared at the length that suits
     the points as they are; a better one is chosen afterwards.
     """
     plain = _of_best_noise(choice.scores)
+    first, *others = _candidates(parameters)
 
-    def tried(averaging: Averaging) -> tuple[Float, Trials]:
+    def tried(averaging: BilateralFilter) -> tuple[Float, Trials]:
         trials = kept_averaged(averaging)
         return plain - _of_best_noise(trials.scores(choice.belief.length)), trials
 
-    gain, trials = tried(FIRST)
+    gain, trials = tried(first)
     doubt = gain.std() / np.sqrt(len(gain))
-    if not (gain.mean() > CLEARLY * doubt or (gain.mean() > -doubt and edges())):
+    if not (gain.mean() > parameters.gain_standard_errors * doubt or (gain.mean() > -doubt and edges())):
         return None
-    best, averaging = float(gain.mean()), FIRST
-    for other in OTHERS:
+    best, averaging = float(gain.mean()), first
+    for other in others:
         gain, of_other = tried(other)
         if gain.mean() > best:
             best, averaging, trials = float(gain.mean()), other, of_other
     return averaging, trials
+
+
+def _candidates(parameters: DenoisingParameters) -> list[BilateralFilter]:
+    """Return the filters to try, of which the others are tried only where the first one helps."""
+    return [BilateralFilter(width, parameters.normal_difference) for width in parameters.widths_disk_radii]
 
 
 def _of_best_noise(scores: Float) -> Float:

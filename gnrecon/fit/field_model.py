@@ -20,15 +20,13 @@ from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.geometry.signed_distance import Box
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.files import atomic_write
-from gnrecon.runtime.parallel import abreast, slices
+from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.version import __version__
 
-_BATCH_BYTES = 4_000_000
 
-
-# What stays in the processor's cache is twice as fast as what does not.
 @dataclass(frozen=True)
 class NeuralSDF:
     """A signed distance field: negative inside, in file units.
@@ -183,10 +181,10 @@ class NeuralSDF:
     def _tensor(self, x: Float) -> Tensor:
         return torch.as_tensor(x).to(self.theta)
 
-    def _each_batch(self, fill: Callable[[slice], None], count: int) -> None:
-        """Have `count` rows filled, so many at a time as the cache holds."""
-        size = max(256, _BATCH_BYTES // (8 * max(self.field.widths)))
-        abreast(fill, slices(count, size), self.theta.device)
+    def _each_batch(self, fill: Callable[[slice], None], count: int, *, batch_bytes: int = 4_000_000) -> None:
+        """Fill `count` rows in batches whose activations stay in the processor's cache, which is twice as fast."""
+        size = max(256, batch_bytes // (8 * max(self.field.widths)))
+        map_in_threads(fill, slices(count, size), self.theta.device)
 
 
 FORMAT = "gnrecon-sdf-1"
@@ -275,11 +273,6 @@ def _require_sense(path: str | Path, tensors: Mapping[str, torch.Tensor]) -> Non
         raise InputError(f"{path} holds {tuple(support.shape)} numbers as the data's points, not rows of three.")
 
 
-LATTICE, NOISE, KEYS, LENGTHS = "detail.lattice", "detail.noise", "detail.keys", "detail.lengths"
-
-FREQUENCIES, PHASES, AMPLITUDES = "detail.frequencies", "detail.phases", "detail.amplitudes"
-
-
 # The detail of a dense scan's field as tensors of a model file, and back.
 
 
@@ -287,13 +280,13 @@ def detail_tensors(detail: Detail) -> dict[str, Tensor]:
     """Return a detail as tensors by name; the lattice is its origin, its cell and its overlap."""
     lattice = [*detail.partition.origin.tolist(), detail.partition.cell, detail.partition.overlap]
     tensors = {
-        LATTICE: torch.tensor(lattice, dtype=torch.float64),
-        NOISE: torch.tensor([detail.position, detail.angle], dtype=torch.float64),
-        KEYS: torch.as_tensor(detail.keys),
-        LENGTHS: torch.as_tensor(detail.lengths),
-        FREQUENCIES: detail.features.frequencies,
-        PHASES: detail.features.phases,
-        AMPLITUDES: detail.amplitudes,
+        "detail.lattice": torch.tensor(lattice, dtype=torch.float64),
+        "detail.noise": torch.tensor([detail.position, detail.angle], dtype=torch.float64),
+        "detail.keys": torch.as_tensor(detail.keys),
+        "detail.lengths": torch.as_tensor(detail.lengths),
+        "detail.frequencies": detail.features.frequencies,
+        "detail.phases": detail.features.phases,
+        "detail.amplitudes": detail.amplitudes,
     }
     return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
 
@@ -306,10 +299,12 @@ def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
     InputError
         When tensors are missing or do not fit together.
     """
-    if LATTICE not in tensors:
+    if "detail.lattice" not in tensors:
         return None
-    lattice, noise, keys, lengths = (tensors[name].cpu().numpy() for name in (LATTICE, NOISE, KEYS, LENGTHS))
-    frequencies, phases, amplitudes = (tensors[name] for name in (FREQUENCIES, PHASES, AMPLITUDES))
+    lattice, noise, keys, lengths = (
+        tensors[f"detail.{name}"].cpu().numpy() for name in ("lattice", "noise", "keys", "lengths")
+    )
+    frequencies, phases, amplitudes = (tensors[f"detail.{name}"] for name in ("frequencies", "phases", "amplitudes"))
     cubes, features = len(lengths), len(phases)
     shapes = (lattice.shape, noise.shape, keys.shape, lengths.shape, tuple(frequencies.shape), tuple(amplitudes.shape))
     if shapes != ((5,), (2,), (cubes, 3), (cubes,), (features, 3), (cubes, features)):

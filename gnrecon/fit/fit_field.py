@@ -1,4 +1,10 @@
-"""Samples in, a fitted signed distance field out: by default `adaptive`, else one wide layer or several, as asked."""
+"""Fits a signed distance field to oriented points.
+
+`fit` is the entry. By default it fits a smooth global field and local fields (`two_level`), which the data determines
+without settings. With a network, a number of steps, another optimiser or another normal residual in the options, it
+fits one network instead (`single_network`): a linear start (`initialisation`), then steps of an optimiser
+(`gnrecon.optim`) on the terms of `objective`.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +18,13 @@ from gnrecon.field.networks import Siren
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.objective import Scene
+from gnrecon.fit.parameters import FitParameters, SingleNetworkParameters
 from gnrecon.fit.single_network import fit_deep, fit_wide
 from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
-
-WIDE_STARTED, DEEP_STARTED = 0.4, 0.05
-"""About which share of the time has passed when the start is made, where steps follow."""
-
-MOST_SUPPORT = 20_000
-"""Points that stay with a field, so that meshing it later can tell surface from what was invented."""
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
 def fit(
@@ -33,6 +34,8 @@ def fit(
     advance: ProgressCallback = ignore_progress,
     folder: str | Path | None = None,
     scheduler: str | None = None,
+    *,
+    parameters: FitParameters = FitParameters(),
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a sine network to the signed distance of oriented points.
 
@@ -43,9 +46,10 @@ def fit(
     samples : points and normals of shape (N, 3) in the unit ball, with their frame
     options : choices of network, start and steps
     callback : called with the record of each step
-    advance : told of the share that is done, of the start and of the most steps that may follow
-    folder : where the work of the default fit is kept, solved by blocks then, so that the same fit takes it up again
+    advance : called with the share that is done
+    folder : work folder of the default fit, which is then solved by blocks and resumes from what the folder holds
     scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks
+    parameters : tuning constants
 
     Raises
     ------
@@ -57,11 +61,11 @@ def fit(
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
     if options.adaptive:
-        sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler)
+        sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler, parameters=parameters)
     elif folder is not None:
-        raise UsageError("A work folder serves the default fit alone, not one network (--widths, --steps).")
+        raise UsageError("A work folder is for the default fit only; leave out --widths and --steps.")
     else:
-        sdf, fitted = _fit_network(samples, options, rng, callback, advance)
+        sdf, fitted = _fit_network(samples, options, rng, callback, advance, parameters.single_network)
     if not sdf.finite:
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
     return replace(sdf, support=_support(samples)), fitted
@@ -73,27 +77,33 @@ def _fit_network(
     rng: np.random.Generator,
     callback: Callback | None,
     advance: ProgressCallback,
+    parameters: SingleNetworkParameters,
 ) -> tuple[NeuralSDF, Solution]:
-    """Fit the one network that the options ask for."""
+    """Fit the network that the options describe."""
     scene = Scene.of(samples, options.device, rng)
     field = Siren(options.widths_for(len(samples)))
     steps = options.steps_for(len(samples))
-    method, started = (fit_wide, WIDE_STARTED) if len(field.widths) == 1 else (fit_deep, DEEP_STARTED)
+    wide = len(field.widths) == 1
+    started = parameters.wide_start_time_share if wide else parameters.deep_start_time_share
     started = started if steps else 1.0
 
-    def told(record: Record) -> None:
+    def report(record: Record) -> None:
         if callback is not None:
             callback(record)
         advance(started + (1.0 - started) * record.step / steps)
 
-    fitted = method(field, scene, options, rng, told, part(advance, 0.0, started))
+    method = fit_wide if wide else fit_deep
+    fitted = method(field, scene, options, rng, report, subrange(advance, 0.0, started))
     return NeuralSDF(field, fitted.theta, samples.frame, scene.box, options.as_dict()), fitted
 
 
-def _support(samples: Samples) -> npt.NDArray[np.float32]:
-    """Return the points, or some of them where they are many, in their order, of shape (N, 3)."""
+def _support(samples: Samples, *, most_points: int = 20_000) -> npt.NDArray[np.float32]:
+    """Return the points that are kept with the field, at most `most_points`, in their order, of shape (N, 3).
+
+    Meshing tells with them where the surface is supported by data; 20,000 take 240 kB.
+    """
     rows = np.arange(len(samples))
-    if len(rows) > MOST_SUPPORT:
-        # By chance, because a scanner's order has patterns; and by chance of its own, so that the fit's is untouched.
-        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_SUPPORT, replace=False))
+    if len(rows) > most_points:
+        # At random, because a scanner's order has patterns, with a generator of its own: the fit's draws stay the same.
+        rows = np.sort(np.random.default_rng(0).choice(rows, most_points, replace=False))
     return samples.points[rows].astype(np.float32)

@@ -1,50 +1,48 @@
-"""The choices of a fit, with their defaults."""
+"""The options of a fit, with their defaults and checks (`FitOptions`)."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.fit.regularisers import Regulariser, regularisers
 from gnrecon.least_squares import SOLVERS
 from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, normal_projection, normal_vector
 from gnrecon.residuals.named_residuals import named
 from gnrecon.runtime.errors import UsageError
-from gnrecon.runtime.plugins import RESIDUALS, find, installed
+from gnrecon.runtime.plugins import find, installed
 
 NORMAL_RESIDUALS: dict[str, Residual] = {
     "vector": normal_vector,
     "projection": normal_projection,
     "cosine": normal_cosine,
 }
-WIDE_STEPS, DEEP_STEPS, LEAST_POINTS_TO_REFINE = 4, 120, 1000
-UNITS_PER_POINT, LEAST_UNITS = 3, 1000
-POINTS_PER_UNIT, SPARSE_UNITS, DENSE_UNITS = 4, 2000, 3000
+# Features of each local field.
 QUALITIES = {"draft": 300, "normal": 600, "high": 1000}
 SEARCHES = ("auto", "damping", "geodesic", "line")
 OPTIMISERS = {"gn": "Gauss-Newton", "adam": "Adam", "lbfgs": "L-BFGS"}
-BASELINE_STEPS = {"adam": 2000, "lbfgs": 40}
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What a fit is asked to do.
+    """Options of a fit.
 
     Parameters
     ----------
     widths : tuple of int, optional
-        Hidden layers of one network for the whole shape. By default there is a smooth global layer and local detail of
-        the size that the data asks for, see `gnrecon.fit.two_level`. One wide layer starts from random sine features
-        and an exact linear solve; several layers from random frequencies.
+        Hidden layers of one network for the whole shape. By default there is a smooth global layer and local fields
+        whose length scale the data determines; see `gnrecon.fit.two_level`. One wide layer starts from random sine
+        features and an exact linear solve; several layers from random frequencies.
     steps : int, optional
         Steps after the start of one network; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or
         more, none for fewer points, 120 for several layers; 2,000 of Adam, and 40 of L-BFGS, each of 20 iterations.
         Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
         point from 1,000 to 2,000, and of one for four points from there to 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
-        Features of the detail a cube, 300, 600 or 1,000, where there is detail.
+        Features of each local field: 300, 600 or 1,000.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
-        Residual of the given normals, see `gnrecon.residuals.constraints`.
+        Residual of the given normals; see `gnrecon.residuals.constraints`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
         Gauss-Newton, or one of the methods that the paper compares with.
     solver : str
@@ -58,8 +56,8 @@ class FitOptions:
     device : str
         A torch device, ``"cpu"`` or ``"cuda"``.
     smooth, fill, prior : str, optional
-        What is asked of the surface besides, as ``"strain=1e-4"``, ``"minimal"`` and ``"developable"``, see
-        `gnrecon.fit.regularisers`; not of one network.
+        Curvature penalties of the default fit, such as ``"strain=1e-4"``, ``"minimal"`` and ``"developable"``; see
+        `gnrecon.fit.regularisers`.
 
     Raises
     ------
@@ -95,27 +93,27 @@ class FitOptions:
             raise UsageError(f"The search must be one of {', '.join(SEARCHES)}, not {self.search!r}.")
         if self.regularisers and not self.adaptive:
             raise UsageError(
-                "smooth, fill and prior belong to the default fit; they do not go with widths, steps, another "
+                "smooth, fill and prior are for the default fit; they cannot be combined with widths, steps, another "
                 "optimiser or another normal residual."
             )
 
     @property
     def adaptive(self) -> bool:
-        """Whether the data chooses network and detail, because nothing was asked that only one network can do."""
+        """Whether the default fit is used: no option was given that only the fit of one network has."""
         one = self.widths is not None or self.steps is not None
         return not one and self.optimiser == "gn" and self.normals == "vector"
 
     @property
     def regularisers(self) -> tuple[Regulariser, ...]:
-        """What is asked of the surface besides."""
+        """The curvature penalties."""
         return regularisers(self.smooth, self.fill, self.prior)
 
     @property
     def features(self) -> int:
-        """Features of the detail a cube."""
+        """Features of each local field."""
         return QUALITIES[self.quality]
 
-    def steps_for(self, points: int) -> int:
+    def steps_for(self, points: int, *, parameters: SingleNetworkParameters = SingleNetworkParameters()) -> int:
         """Return the most steps after the start, for a number of points.
 
         Below 1,000 points frequencies that follow the data fit it better and what lies between it worse (measured, see
@@ -125,21 +123,25 @@ class FitOptions:
             return 0
         if self.steps is not None:
             return self.steps
-        if self.optimiser in BASELINE_STEPS:
-            return BASELINE_STEPS[self.optimiser]
-        if len(self.widths_for(points)) > 1:
-            return DEEP_STEPS
-        return WIDE_STEPS if points >= LEAST_POINTS_TO_REFINE else 0
+        if self.optimiser == "adam":
+            return parameters.adam_steps
+        if self.optimiser == "lbfgs":
+            return parameters.lbfgs_steps
+        if self.widths is not None and len(self.widths) > 1:
+            return parameters.deep_steps
+        return parameters.wide_steps if points >= parameters.least_points_to_refine else 0
 
-    def widths_for(self, points: int) -> tuple[int, ...]:
+    def widths_for(
+        self, points: int, *, parameters: SingleNetworkParameters = SingleNetworkParameters()
+    ) -> tuple[int, ...]:
         """Return the hidden layers for a number of points.
 
         Fewer units than data rows smooth dense clouds; more of them only make sparse ones slower and less smooth.
         """
         if self.widths is not None:
             return self.widths
-        most = min(max(points // POINTS_PER_UNIT, SPARSE_UNITS), DENSE_UNITS)
-        return (min(max(UNITS_PER_POINT * points, LEAST_UNITS), most),)
+        most = min(max(points // parameters.points_per_unit, parameters.most_sparse_units), parameters.most_units)
+        return (min(max(parameters.units_per_point * points, parameters.least_units), most),)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as plain values."""
@@ -156,8 +158,8 @@ def normal_residual(name: str) -> Residual:
     """
     if name in NORMAL_RESIDUALS:
         return NORMAL_RESIDUALS[name]
-    if find(RESIDUALS, name) is None:
-        known = [*NORMAL_RESIDUALS, *(one.entry.name for one in installed(RESIDUALS))]
+    if find("residual", name) is None:
+        known = [*NORMAL_RESIDUALS, *(one.entry.name for one in installed("residual"))]
         raise UsageError(f"The normal residual must be one of {', '.join(known)}, not {name!r}.")
     residual = named(name)
     if isinstance(residual, SecondOrder):

@@ -12,27 +12,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.field.networks import Siren
-from gnrecon.field.random_features import DEGREES_OF_FREEDOM, Features
+from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.initialisation import Spectrum
 from gnrecon.fit.local_solve import Patch, PatchSystem
-from gnrecon.fit.model_selection import SPARSE
-from gnrecon.fit.objective import REACH, Scene
+from gnrecon.fit.objective import Scene
+from gnrecon.fit.parameters import GlobalFieldParameters, ModelSelectionParameters, ObjectiveParameters
 from gnrecon.fit.single_network import fit_wide
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import is_certain
+from gnrecon.geometry.signed_distance import is_sign_certain
 from gnrecon.optim import Solution
-from gnrecon.runtime.progress import ProgressCallback, part
+from gnrecon.runtime.progress import ProgressCallback, subrange
 
 _log = logging.getLogger(__name__)
-
-UNITS = 1000
-
-FEW = 4e-3
-"""Share of the free space by which normals that weigh more may spoil its sign."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +42,14 @@ class GlobalField:
 
 
 def fit_global(
-    samples: Samples, held: Mask, rows: Int, options: FitOptions, rng: np.random.Generator, advance: ProgressCallback
+    samples: Samples,
+    held: Mask,
+    rows: Int,
+    options: FitOptions,
+    rng: np.random.Generator,
+    advance: ProgressCallback,
+    *,
+    parameters: GlobalFieldParameters = GlobalFieldParameters(),
 ) -> GlobalField:
     """Fit the smooth field to some of the samples.
 
@@ -66,9 +69,9 @@ def fit_global(
     """
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
-    smoothness = global_smoothness(samples, held, scene, rng.spawn(1)[0])
-    spectrum = smooth_spectrum(smoothness.length, scene)
-    field = Siren((UNITS,))
+    smoothness = global_smoothness(samples, held, scene, rng.spawn(1)[0], parameters=parameters)
+    spectrum = smooth_spectrum(smoothness.length, scene, parameters=parameters)
+    field = Siren((parameters.units,))
     linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
 
     def fitted(reach: float, advance: ProgressCallback) -> tuple[NeuralSDF, Solution, float]:
@@ -77,15 +80,16 @@ def fit_global(
         return sdf, solution, wrong_sign(sdf, scene, rng.spawn(1)[0])
 
     # Where more is asked of the surface in holes than the data says, normals may not carry it out of the box.
-    reach = REACH if options.regularisers else smoothness.reach
-    sdf, solution, wrong = fitted(reach, part(advance, 0.0, 0.5))
-    if reach > REACH and wrong > FEW:
-        plain, plainly, ghosts = fitted(REACH, part(advance, 0.5, 1.0))
-        if wrong > ghosts + FEW:
-            reach, sdf, solution = REACH, plain, plainly
+    plain_reach = ObjectiveParameters.normal_reach_spacings
+    reach = plain_reach if options.regularisers else smoothness.reach
+    sdf, solution, wrong = fitted(reach, subrange(advance, 0.0, 0.5))
+    if reach > plain_reach and wrong > parameters.wrong_sign_share:
+        plain, plainly, ghosts = fitted(plain_reach, subrange(advance, 0.5, 1.0))
+        if wrong > ghosts + parameters.wrong_sign_share:
+            reach, sdf, solution = plain_reach, plain, plainly
     _log.info(
         "The global field has %d features of length %.3g radii, and sees %d points; normals reach %.3g spacings.",
-        UNITS,
+        parameters.units,
         spectrum.length,
         len(rows),
         reach,
@@ -97,32 +101,8 @@ def wrong_sign(sdf: NeuralSDF, scene: Scene, rng: np.random.Generator) -> float:
     """Return the share of the free space where the field has the wrong sign beyond doubt, in [0, 1]."""
     x, distance = scene.volume(scene.volume_count, rng)
     other = sdf.sdf(sdf.frame.to_world(x)) * distance < 0
-    certain = is_certain(scene.coarse.winding_number(x[other]))
+    certain = is_sign_certain(scene.coarse.winding_number(x[other]))
     return float(certain.sum() / max(len(x), 1))
-
-
-LENGTHS = (0.25, 0.5, 1.0)
-"""Lengths to choose from, in radii."""
-
-REACHES = (REACH, 1.2, 3.0, 8.0, 20.0)
-"""Weights of the normals to choose from: the lengths, in spacings, over which an angle counts as a height."""
-
-SPACINGS = 4.0
-"""Least length of a global field's features, in spacings of the points that it sees: shorter ones oscillate."""
-
-ALIKE = 0.01
-"""Share by which a longer one may predict worse than the best."""
-
-FEATURES, POINTS, VOLUME = 600, 2000, 2000
-
-POSITION = 0.1
-"""Noise of positions that is assumed, in spacings; that of normals, in radians, is this over the reach."""
-
-LEAST_HELD = 5
-"""Left-out points that have a say."""
-
-SIZE = 1.0
-"""Standard deviation of the field, in radii."""
 
 
 # How smooth a scan's shape is as a whole, and what its normals are worth, chosen by left-out points.
@@ -142,15 +122,26 @@ class Smoothness:
     reach: float
 
 
-def smooth_spectrum(length: float, scene: Scene) -> Spectrum:
+def smooth_spectrum(
+    length: float, scene: Scene, *, parameters: GlobalFieldParameters = GlobalFieldParameters()
+) -> Spectrum:
     """Return the spectrum of a global field's features of a length in radii, or longer where points are few.
 
     It is that of the detail's features, with which the length is chosen, too.
     """
-    return Spectrum(max(length, SPACINGS * scene.coarse.spacing), DEGREES_OF_FREEDOM)
+    return Spectrum(
+        max(length, parameters.least_length_spacings * scene.coarse.spacing), FieldParameters.degrees_of_freedom
+    )
 
 
-def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random.Generator) -> Smoothness:
+def global_smoothness(
+    samples: Samples,
+    held: Mask,
+    scene: Scene,
+    rng: np.random.Generator,
+    *,
+    parameters: GlobalFieldParameters = GlobalFieldParameters(),
+) -> Smoothness:
     """Return the length of features that a global field of the scan needs, and how far its normals reach.
 
     Parameters
@@ -160,29 +151,31 @@ def global_smoothness(samples: Samples, held: Mask, scene: Scene, rng: np.random
     scene : Scene
     rng : draws features and samples
     """
-    if held.sum() < LEAST_HELD:
-        return Smoothness(LENGTHS[0], REACH)
-    seen = rng.permutation(len(scene.samples))[:POINTS]
-    x, distance = scene.volume(VOLUME, rng)
+    if held.sum() < parameters.least_validation_points:
+        return Smoothness(parameters.length_scales_radii[0], ObjectiveParameters.normal_reach_spacings)
+    seen = rng.permutation(len(scene.samples))[: parameters.selection_points]
+    x, distance = scene.volume(parameters.selection_volume_samples, rng)
     points, normals = scene.points[seen], scene.normals[seen]
     signed = scene.tensor(distance)
     center = torch.zeros(3).to(points)
     volume = scene.tensor(x), signed, signed, signed, signed.abs()
     patch = Patch(points, torch.zeros(len(points)).to(points), normals, *volume, center)
-    features = Features.draw(FEATURES, rng, points)
-    out = np.flatnonzero(held)[:POINTS]
+    features = Features.draw(parameters.selection_features, rng, points)
+    out = np.flatnonzero(held)[: parameters.selection_points]
     left, turned = scene.tensor(samples.points[out]), scene.tensor(samples.normals[out])
     # Estimated ones are means of their neighbours', which smooth fields predict too well.
-    reaches = REACHES[:1] if samples.estimated and len(samples) <= SPARSE else REACHES
+    ignored = samples.estimated and len(samples) <= ModelSelectionParameters.sparse_points
+    reaches = parameters.normal_reaches_spacings[: 1 if ignored else None]
+    noise = parameters.position_noise_spacings
     best = []
-    for length in LENGTHS:
-        system, scores = PatchSystem(patch, features, length, SIZE), []
+    for length in parameters.length_scales_radii:
+        system, scores = PatchSystem(patch, features, length, parameters.field_deviation_radii), []
         for reach in reaches:
-            amplitudes = system.solve(POSITION * scene.coarse.spacing, POSITION / reach)
+            amplitudes = system.solve(noise * scene.coarse.spacing, noise / reach)
             value, gradient = features.sums(amplitudes, left, center, length, 1)
             angle = (gradient - turned).norm(dim=1).mean()
             scores.append((float(value.abs().mean() + scene.coarse.spacing * angle), reach))
         best.append((length, *min(scores)))
     least = min(score for _, score, _ in best)
-    length, _, reach = max(tried for tried in best if tried[1] <= (1 + ALIKE) * least)
+    length, _, reach = max(tried for tried in best if tried[1] <= (1 + parameters.tie_share) * least)
     return Smoothness(length, reach)

@@ -8,7 +8,7 @@ kernel interpolation with Hermite data.
 Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
 Where the solution's sign disagrees with the coarse distance ("ghosts"), samples are added and the solve is repeated.
 
-*Spectral.* Deeper networks begin with normal frequencies of standard deviation OMEGA in the first layer, hidden weights
+*Spectral.* Deeper networks begin with normal frequencies of fixed standard deviation in the first layer, hidden weights
 that keep the variance of sines (Sitzmann et al. 2020, theorem 1.8), uniform phases, and one exact solve of the last
 layer, with a ridge that keeps its weights small: from large weights every direction of Gauss-Newton is a bad one.
 """
@@ -26,29 +26,13 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.objective import FieldProblem, Scene, Term
+from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.least_squares.direct import Cholesky
 from gnrecon.least_squares.system import identity
 from gnrecon.runtime.errors import FitError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
-
-RIDGE = 1e-8
-
-ROUNDS, TRIALS = 3, 3
-"""Solves, and how many times a solve's samples are searched for ghosts after it."""
-
-WRONG_WEIGHT = 5
-"""How much more a sample counts that an earlier round gave the wrong sign: without it, horns grow on sparse scans."""
-
-ATTEMPTS = 6
-
-OMEGA = 4.0
-
-SPECTRAL_RIDGE, SPECTRAL_SAMPLES = 1e-4, 4000
-
-SEARCH_POINTS, FINAL_POINTS = 5000, 20000
-"""Most data points of the rounds that look for ghosts, and of the last round."""
 
 TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
 """Terms of volume samples x, their coarse distances, and at most so many data points."""
@@ -58,15 +42,12 @@ TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
 class Spectrum:
     """Of random features: their length l, in radii, and nu, the degrees of freedom: the more, the smoother."""
 
-    length: float
-    degrees_of_freedom: float
-
-
-COARSE = Spectrum(0.12, 4.0)
+    length: float = InitialisationParameters.length_scale_radii
+    degrees_of_freedom: float = InitialisationParameters.degrees_of_freedom
 
 
 def random_features(
-    width: int, rng: np.random.Generator, like: Tensor, spectrum: Spectrum = COARSE
+    width: int, rng: np.random.Generator, like: Tensor, spectrum: Spectrum = Spectrum()
 ) -> tuple[Tensor, Tensor]:
     """Return frequencies, of shape (width, 3), and phases, of shape (width,), of sine features of a spectrum."""
     direction = rng.standard_normal((width, 3))
@@ -81,8 +62,10 @@ def wide_start(
     scene: Scene,
     terms_of: TermsOf,
     rng: np.random.Generator,
-    spectrum: Spectrum = COARSE,
+    spectrum: Spectrum = Spectrum(),
     advance: ProgressCallback = ignore_progress,
+    *,
+    parameters: InitialisationParameters = InitialisationParameters(),
 ) -> Tensor:
     """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
 
@@ -98,15 +81,16 @@ def wide_start(
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
     search = GhostSearch(scene.coarse, x, np.sign(distance))
-    for round_number in range(ROUNDS):
-        last = round_number + 1 == ROUNDS
-        terms = terms_of(scene.tensor(x), scene.tensor(distance), FINAL_POINTS if last else SEARCH_POINTS)
+    for round_number in range(parameters.rounds):
+        last = round_number + 1 == parameters.rounds
+        most_points = parameters.final_points if last else parameters.search_points
+        terms = terms_of(scene.tensor(x), scene.tensor(distance), most_points)
         theta = solve_last_layer(field, terms, theta)
-        advance((round_number + 1) / ROUNDS)
+        advance((round_number + 1) / parameters.rounds)
         if not last:
-            trial = scene.places(TRIALS * scene.volume_count, rng)
+            trial = scene.places(parameters.trial_factor * scene.volume_count, rng)
             wrong, expected = search.ghosts(trial, partial(_value, field, theta, scene))
-            some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], WRONG_WEIGHT)
+            some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], parameters.wrong_sign_repeats)
             x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
     return theta
 
@@ -117,7 +101,14 @@ def _value(field: Siren, theta: Tensor, scene: Scene, x: Float) -> Float:
     return values
 
 
-def spectral_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random.Generator) -> Tensor:
+def spectral_start(
+    field: Siren,
+    scene: Scene,
+    terms_of: TermsOf,
+    rng: np.random.Generator,
+    *,
+    parameters: InitialisationParameters = InitialisationParameters(),
+) -> Tensor:
     """Return parameters, of shape (p,), of a network of several layers whose last one solves `terms_of` the volume.
 
     Raises
@@ -126,18 +117,28 @@ def spectral_start(field: Siren, scene: Scene, terms_of: TermsOf, rng: np.random
         When the linear system cannot be solved.
     """
     theta = random_network(field, rng, scene.points)
-    x, distance = scene.volume(SPECTRAL_SAMPLES, rng)
-    terms = terms_of(scene.tensor(x), scene.tensor(distance), SPECTRAL_SAMPLES)
+    count = parameters.spectral_samples
+    x, distance = scene.volume(count, rng)
+    terms = terms_of(scene.tensor(x), scene.tensor(distance), count)
     total = sum(float(torch.as_tensor(term.weight).mean()) for term in terms)
-    return solve_last_layer(field, terms, theta, SPECTRAL_RIDGE * total)
+    return solve_last_layer(field, terms, theta, parameters.spectral_ridge * total)
 
 
-def random_network(field: Siren, rng: np.random.Generator, like: Tensor) -> Tensor:
-    """Return random sine layers, of shape (p,), with a last layer of zeros."""
+def random_network(
+    field: Siren,
+    rng: np.random.Generator,
+    like: Tensor,
+    *,
+    first_layer_frequency: float = InitialisationParameters.first_layer_frequency,
+) -> Tensor:
+    """Return random sine layers, of shape (p,), with a last layer of zeros.
+
+    Frequencies of the first layer have the standard deviation `first_layer_frequency`, per radius.
+    """
     layers = []
     for number, (out, into) in enumerate(field.layout.shapes):
         if number == 0:
-            weights, bias = OMEGA * rng.standard_normal((out, into)), rng.uniform(0.0, 2 * np.pi, out)
+            weights, bias = first_layer_frequency * rng.standard_normal((out, into)), rng.uniform(0.0, 2 * np.pi, out)
         elif number == len(field.widths):
             weights, bias = np.zeros((out, into)), np.zeros(out)
         else:
@@ -147,7 +148,14 @@ def random_network(field: Siren, rng: np.random.Generator, like: Tensor) -> Tens
     return field.layout.flatten(layers)
 
 
-def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor, ridge: float | None = None) -> Tensor:
+def solve_last_layer(
+    field: Siren,
+    terms: Sequence[Term],
+    theta: Tensor,
+    ridge: float | None = None,
+    *,
+    parameters: InitialisationParameters = InitialisationParameters(),
+) -> Tensor:
     """Return theta, of shape (p,), with its last layer solved by least squares; exact for terms linear in f.
 
     The ridge damps the change of the last layer, by default as little as rounding allows.
@@ -162,8 +170,8 @@ def solve_last_layer(field: Siren, terms: Sequence[Term], theta: Tensor, ridge: 
     problem = FieldProblem(field, terms, theta, units)
     free = problem.free()
     system = Cholesky().linearise(*problem.linearise(free), identity)
-    ridge = RIDGE / max(len(term) for term in terms) if ridge is None else ridge
-    for _ in range(ATTEMPTS):
+    ridge = parameters.ridge / max(len(term) for term in terms) if ridge is None else ridge
+    for _ in range(parameters.ridge_attempts):
         step = system.solve(ridge)
         if step.failure is None:
             return problem.whole(free + step.direction)

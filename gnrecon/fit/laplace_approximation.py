@@ -13,7 +13,7 @@ theirs: g = tr(C J^T J) / s^2. What the features cannot follow counts as noise. 
 The plain mean square would be too small, because these networks nearly interpolate; but the noise is not less than
 that, because a fit that leaves residuals which the data alone would not ask for is no better than they are.
 
-*Prior.* Within each layer one variance for all parameters, such that they move f at the data by `PRIOR` radii in the
+*Prior.* Within each layer one variance for all parameters, such that they move f at the data by 10 radii in the
 root mean square: the fit's own ridge is as weak. The output weights have mean zero, all others stay where they are.
 
 The coarse distances of the volume are left out. Their errors are alike over whole regions, and taken as independent
@@ -30,20 +30,11 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.objective import FieldProblem, Term
+from gnrecon.fit.parameters import LaplaceParameters
 from gnrecon.least_squares import LayeredJacobian
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.residuals.constraints import Residual, interface
 from gnrecon.runtime.errors import FitError
-
-PRIOR = 10.0
-
-PASSES, SETTLED = 6, 0.02
-
-LEAST_NOISE = 1e-5
-"""In radii; below it rounding would decide."""
-
-ATTEMPTS, GROWTH = 6, 3.0
-"""How often, and by what factor, noise is raised where rounding makes C^-1 indefinite all the same."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +60,7 @@ class Laplace:
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class _NormalEquations:
     """J and r at the fitted parameters, J^T J (its lower triangle), J^T r, L, and the way from the prior's mean."""
 
     jacobian: LayeredJacobian
@@ -80,7 +71,7 @@ class _Evidence:
     offset: Tensor
 
 
-def laplace(data: DataRows) -> Laplace:
+def laplace(data: DataRows, *, parameters: LaplaceParameters = LaplaceParameters()) -> Laplace:
     """Return the distribution of the parameters that data points leave.
 
     Raises
@@ -89,60 +80,53 @@ def laplace(data: DataRows) -> Laplace:
         When the matrix of the data cannot be factored.
     """
     jacobian, residual = data.linearise()
-    evidence = _Evidence(jacobian, residual, jacobian.gram(), jacobian.tmv(residual), *_prior(data, jacobian))
-    least = max(float(residual.square().mean()) ** 0.5, LEAST_NOISE)
+    prior = _prior(data, jacobian, parameters.prior_deviation_radii)
+    equations = _NormalEquations(jacobian, residual, jacobian.gram(), jacobian.tmv(residual), *prior)
+    least = max(float(residual.square().mean()) ** 0.5, parameters.least_noise_radii)
     noise = least
-    for _ in range(PASSES):
-        before, noise = noise, max(_noise(evidence, _at(evidence, noise)), least)
-        if abs(noise / before - 1) < SETTLED:
+    for _ in range(parameters.noise_passes):
+        before, noise = noise, max(_noise(equations, _at(equations, noise, parameters)), least)
+        if abs(noise / before - 1) < parameters.noise_tolerance:
             break
-    return _at(evidence, noise)
+    return _at(equations, noise, parameters)
 
 
-def _prior(data: DataRows, jacobian: LayeredJacobian) -> tuple[Tensor, Tensor]:
+def _prior(data: DataRows, jacobian: LayeredJacobian, deviation: float) -> tuple[Tensor, Tensor]:
     """Return L and how far the fitted parameters lie from the prior's mean, both of shape (p,)."""
     squares = data.values(data.points).diagonal() / len(data)
     precision, offset = torch.empty_like(squares), torch.zeros_like(squares)
     for group in jacobian.groups:
-        precision[group] = squares[group].sum().clamp_min(torch.finfo(squares.dtype).tiny) / PRIOR**2
+        precision[group] = squares[group].sum().clamp_min(torch.finfo(squares.dtype).tiny) / deviation**2
     output = jacobian.groups[-1]
     offset[output] = data.theta[output.start - output.stop :]
     return precision, offset
 
 
-def _at(evidence: _Evidence, noise: float) -> Laplace:
-    """Return the distribution for a noise, or for a larger one where rounding asks for it."""
-    for _ in range(ATTEMPTS):
-        factor = damped_factor(evidence.product / noise**2, evidence.prior)
+def _at(equations: _NormalEquations, noise: float, parameters: LaplaceParameters) -> Laplace:
+    """Return the distribution for a noise, or for a larger one where rounding makes C^-1 indefinite."""
+    for _ in range(parameters.noise_attempts):
+        factor = damped_factor(equations.product / noise**2, equations.prior)
         if factor is not None:
-            slope = evidence.gradient / noise**2 + evidence.prior * evidence.offset
+            slope = equations.gradient / noise**2 + equations.prior * equations.offset
             return Laplace(factor, noise, -solve_factored(factor, slope))
-        noise *= GROWTH
+        noise *= parameters.noise_growth
     raise FitError("The uncertainty is not available: the matrix of the data has no Cholesky factor.")
 
 
-def _noise(evidence: _Evidence, posterior: Laplace) -> float:
+def _noise(equations: _NormalEquations, posterior: Laplace) -> float:
     """Return the noise from the residuals at the mode and the rows that remain for it."""
     covariance = torch.cholesky_inverse(posterior.factor).tril()
     # Halved, so that twice the sum over lower triangles is the trace of the product.
     covariance.diagonal().div_(2)
-    taken = 2 * float((covariance * evidence.product).sum()) / posterior.noise**2
-    squares = float((evidence.residual + evidence.jacobian.mv(posterior.shift)).square().sum())
-    return float((squares / max(len(evidence.residual) - taken, 1.0)) ** 0.5)
-
-
-MOST_PARAMETERS = 3000
-
-WIDE = 600
-"""Units of a last layer that spans the field by itself."""
-
-KEPT_BYTES = 200_000_000
+    taken = 2 * float((covariance * equations.product).sum()) / posterior.noise**2
+    squares = float((equations.residual + equations.jacobian.mv(posterior.shift)).square().sum())
+    return float((squares / max(len(equations.residual) - taken, 1.0)) ** 0.5)
 
 
 # The rows of the data in a fit's Jacobian, for what is asked of a fit once it is done.
 #
 # One interface row (f = 0) and the rows of the normal's residual a point, weighted as in the fit (`loss`), so that
-# residuals are positions in radii. Their columns are the free parameters: all of a network of up to `MOST_PARAMETERS`
+# residuals are positions in radii. Their columns are the free parameters: all of a network of up to 3,000
 # of them; of a larger one the last layer and, where that is narrow, as many evenly spaced units of the layers before it
 # as there is room for. The features of a wide last layer span the field by themselves: the uncertainty is the same with
 # all parameters (docs/research/2026-11-21-uncertainty-models.md).
@@ -185,15 +169,18 @@ class DataRows:
 
     def _linearise(self, terms: Sequence[Term]) -> tuple[LayeredJacobian, Tensor]:
         units = free_units(self.field, self.theta.device)
-        problem = FieldProblem(self.field, terms, self.theta, units, keep_bytes=KEPT_BYTES)
+        problem = FieldProblem(self.field, terms, self.theta, units, keep_bytes=LaplaceParameters.factor_bytes)
         return problem.linearise(problem.free())
 
 
-def free_units(field: Siren, device: torch.device) -> tuple[Tensor | None, ...] | None:
+def free_units(
+    field: Siren, device: torch.device, *, parameters: LaplaceParameters = LaplaceParameters()
+) -> tuple[Tensor | None, ...] | None:
     """Return which units of each layer are free, or None where all parameters are."""
-    if field.widths[-1] < WIDE and field.layout.count <= MOST_PARAMETERS:
+    narrow = field.widths[-1] < parameters.wide_units
+    if narrow and field.layout.count <= parameters.most_free_parameters:
         return None
-    room = MOST_PARAMETERS - field.widths[-1] - 1 if field.widths[-1] < WIDE else 0
+    room = parameters.most_free_parameters - field.widths[-1] - 1 if narrow else 0
     of_each = max(room, 0) // sum(into + 1 for _, into in field.layout.shapes[:-1])
     counts = [min(of_each, width) for width in field.widths]
     hidden = [

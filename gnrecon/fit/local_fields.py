@@ -26,8 +26,8 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.fit.regularised import Shaping
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import CoarseDistance
-from gnrecon.runtime.parallel import abreast
-from gnrecon.runtime.progress import ProgressCallback, ignore_progress, part
+from gnrecon.runtime.parallel import map_in_threads
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 _log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def fit_detail(
     coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
     shaping = None if shape is None else shape(belief.length)
     cubes = _Cubes.of(leftover, belief, features, rng, device, shaping, parameters)
-    return cubes.detail(sdf, coarse, rng, part(advance, parameters.selection_time_share, 1.0))
+    return cubes.detail(sdf, coarse, rng, subrange(advance, parameters.selection_time_share, 1.0))
 
 
 def cube_length(
@@ -142,7 +142,7 @@ class _Cubes:
             patch = self.leftover.patch(rows, center, volumes[number], self.device)
             return length, self._solved(PatchSystem(patch, self.features, length, patch.size), length, center)
 
-        cubes = abreast(solved, range(len(keys)), self.device, advance)
+        cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))

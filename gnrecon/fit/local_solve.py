@@ -18,23 +18,10 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
+from gnrecon.fit.parameters import LocalSolveParameters
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram
-from gnrecon.runtime.parallel import slices
-
-SIZE = 3.0
-"""Standard deviation s of the correction, over the root mean square of what is left over."""
-
-SHARE = 0.5
-"""Standard deviation of the correction in the volume, as a share of the distance from the data."""
-
-AGAIN, FIRMLY = 3, 0.1
-"""Times that samples beyond their bounds are asked for again, and that share then."""
-
-ATTEMPTS = 6
-
-ROWS = 16_384
-"""Points whose features are held at once: a cube that many scans have seen takes no more memory than others."""
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)
@@ -79,8 +66,13 @@ class Patch:
 
     @property
     def size(self) -> float:
-        """What the standard deviation of a correction is taken to be; a trace where there is nothing to correct."""
-        return SIZE * max(float(self.value.square().mean().sqrt()), 1e-6)
+        """Prior standard deviation of the correction; a tiny one where there is nothing to correct."""
+        return LocalSolveParameters.correction_rms_factor * max(float(self.value.square().mean().sqrt()), 1e-6)
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviation of what the correction should be at the samples of the volume, of shape (Q,)."""
+        return LocalSolveParameters.volume_deviation_share * self.distance
 
 
 class PatchSystem:
@@ -97,7 +89,9 @@ class PatchSystem:
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         self._scale = size * (2.0 / len(features)) ** 0.5
         like, count = patch.value, len(features)
-        parts = [_data_sums(patch, features, length, rows) for rows in slices(len(like), ROWS)]
+        parts = [
+            _data_sums(patch, features, length, rows) for rows in slices(len(like), LocalSolveParameters.chunk_points)
+        ]
         positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
         self._positions, self._angles = (positions, of_positions), (angles, of_angles)
         self._patch = patch
@@ -115,21 +109,24 @@ class PatchSystem:
         amplitudes: Tensor = self._scale * solve_factored(factor, right)
         return amplitudes
 
-    def solve_within(self, position: float, angle: float) -> Tensor:
+    def solve_within(
+        self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
+    ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
         A one-sided penalty by an active set: where c is beyond a bound, the bound is asked for with more weight. What
         was asked for stays in the system.
         """
         amplitudes, patch = self.solve(position, angle), self._patch
-        deviation = SHARE * patch.distance
-        for _ in range(AGAIN):
+        deviation = patch.deviation
+        weight = parameters.volume_deviation_share / parameters.bound_deviation_share
+        for _ in range(parameters.bound_passes):
             value = deviation * (self._free @ amplitudes)
             bound = value.clamp(patch.lower, patch.upper)
             beyond = bound != value
             if not beyond.any():
                 break
-            rows, wanted = (SHARE / FIRMLY * rows[beyond] for rows in (self._free, bound / deviation))
+            rows, wanted = (weight * rows[beyond] for rows in (self._free, bound / deviation))
             product, right = self._volume
             self._volume = product.addmm_(rows.T, rows), right + rows.T @ wanted
             amplitudes = self.solve(position, angle)
@@ -194,10 +191,12 @@ def patch_system(patch: Patch, features: Features, length: float, size: float) -
     return (RowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
 
 
-def _factor(product: Callable[[], Tensor], like: Tensor) -> Tensor | None:
+def _factor(
+    product: Callable[[], Tensor], like: Tensor, *, attempts: int = LocalSolveParameters.damping_attempts
+) -> Tensor | None:
     """Return the Cholesky factor of a product, made anew for each attempt, plus one or what more rounding asks."""
     damping = torch.ones_like(like)
-    for _ in range(ATTEMPTS):
+    for _ in range(attempts):
         factor = damped_factor(product(), damping, overwrite=True)
         if factor is not None:
             return factor
@@ -222,7 +221,7 @@ def _data_rows(patch: Patch, features: Features, length: float, rows: slice) -> 
 
 def _volume_rows(patch: Patch, features: Features, length: float) -> tuple[Tensor, Tensor]:
     """Return the features at the samples of the volume, of shape (Q, m), and what is wanted, over their deviation."""
-    deviation = SHARE * patch.distance
+    deviation = patch.deviation
     return features.phase(patch.volume, patch.center, length).sin() / deviation[:, None], patch.wanted / deviation
 
 

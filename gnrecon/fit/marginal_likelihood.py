@@ -24,24 +24,11 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.local_solve import Patch, data_kernel
-from gnrecon.fit.shape_priors.edge_completion import over_planes
+from gnrecon.fit.parameters import CleanScanParameters, MarginalLikelihoodParameters
+from gnrecon.fit.shape_priors.edge_completion import heights_over_planes
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import abreast
-
-POSITIONS = (0.005, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
-"""Noise of the positions to choose from, over the radius of a point's disk."""
-
-ANGLES = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.13, 0.17, 0.23, 0.3, 0.4)
-"""Noise of the normals to choose from, in radians."""
-
-FIRST = 6, 5
-
-STRIDES = 2, 1
-"""Where the search in both tables begins, and its strides."""
-
-PATCHES, POINTS, FEATURES = 20, 60, 700
-"""Patches, the nearest points about a place each, and features that make up their covariance."""
+from gnrecon.runtime.parallel import map_in_threads
 
 Place = tuple[int, int]
 
@@ -62,12 +49,21 @@ class Evidence:
     features: Features
     radius: float
     device: str
+    parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters()
 
     @classmethod
-    def of(cls, patches: Sequence[Patch], radius: float, rng: np.random.Generator, device: str) -> Evidence:
+    def of(
+        cls,
+        patches: Sequence[Patch],
+        radius: float,
+        rng: np.random.Generator,
+        device: str,
+        *,
+        parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters(),
+    ) -> Evidence:
         """Return the evidence of patches, drawing its features."""
-        features = Features.draw(FEATURES, rng, torch.zeros(0, dtype=torch.float64, device=device))
-        return cls(patches, features, radius, device)
+        features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
+        return cls(patches, features, radius, device, parameters)
 
     def noise(self, length: float) -> tuple[float, float]:
         """Return the noise of positions, unit coordinates, and of normals, radians, that has most evidence.
@@ -78,7 +74,7 @@ class Evidence:
         ----------
         length : over which the functions vary, unit coordinates
         """
-        kernels = abreast(
+        kernels = map_in_threads(
             lambda patch: data_kernel(patch, self.features, length, patch.size), self.patches, self.device
         )
         both = list(zip(self.patches, kernels, strict=True))
@@ -86,16 +82,24 @@ class Evidence:
         @cache
         def found(place: Place) -> float:
             position, angle = self._noise_at(place)
-            return sum(abreast(lambda one: log_density(*one, position, angle), both, self.device))
+            return sum(map_in_threads(lambda one: log_density(*one, position, angle), both, self.device))
 
-        best = FIRST
-        for stride in STRIDES:
-            while (better := max(_around(best, stride), key=found)) != best:
+        best = self.parameters.first_index
+        for stride in self.parameters.strides:
+            while (better := max(self._around(best, stride), key=found)) != best:
                 best = better
         return self._noise_at(best)
 
     def _noise_at(self, place: Place) -> tuple[float, float]:
-        return POSITIONS[place[0]] * self.radius, ANGLES[place[1]]
+        positions, angles = self.parameters.position_noises_disk_radii, self.parameters.angle_noises_radians
+        return positions[place[0]] * self.radius, angles[place[1]]
+
+    def _around(self, place: Place, stride: int) -> list[Place]:
+        """Return a place of both tables, and those a stride away from it in one of them."""
+        i, j = place
+        positions, angles = self.parameters.position_noises_disk_radii, self.parameters.angle_noises_radians
+        near = [(i, j), (i - stride, j), (i + stride, j), (i, j - stride), (i, j + stride)]
+        return [(p, a) for p, a in near if 0 <= p < len(positions) and 0 <= a < len(angles)]
 
 
 def log_density(patch: Patch, kernel: Tensor, position: float, angle: float) -> float:
@@ -119,39 +123,7 @@ def log_density(patch: Patch, kernel: Tensor, position: float, angle: float) -> 
     return -0.5 * float(white.square().sum()) - float(factor.diagonal().log().sum())
 
 
-def _around(place: Place, stride: int) -> list[Place]:
-    """Return a place of both tables, and those a stride beside it in one of them."""
-    i, j = place
-    beside = [(i, j), (i - stride, j), (i + stride, j), (i, j - stride), (i, j + stride)]
-    return [(p, a) for p, a in beside if 0 <= p < len(POSITIONS) and 0 <= a < len(ANGLES)]
-
-
 Noise = tuple[float, float]
-
-NEIGHBOURS, DISKS = 5, 2.0
-"""Neighbours of a point that are asked, and how far they are at most, in radii of its disk."""
-
-ALIKE = np.cos(np.radians(25.0))
-"""Cosine of the angle between two normals up to which they may belong to one smooth piece of surface."""
-
-CLEAN = 0.04
-"""Median of the heights, in radii of a disk or over the distance where that is longer, up to which a scan is clean.
-Vertices of scanned meshes have 0.017 to 0.024, a noise of 0.08 radii 0.06, range scans 0.14 and more."""
-
-LEAST_PAIRS, MOST_POINTS = 20, 50_000
-"""Fewest pairs that tell anything, and points whose neighbours are asked at most."""
-
-LEAST_OVER = 0.01
-"""Root mean square of what the global field leaves over, in radii of a disk, below which there is nothing to gain."""
-
-POSITION, ANGLE, TURNED = 0.005, 0.01, 2.0
-"""Least noise that is believed of positions, in radii of a disk, and of normals, in radians, and the latter over the
-former: where neighbours stand a radius apart, noise of the normals alone would make such heights."""
-
-ESTIMATED = 0.1
-"""Noise of normals that were estimated, in radians: their error, which no neighbours tell, as theirs is about the same.
-"""
-
 
 # Scans so clean that their noise need not be chosen.
 #
@@ -162,7 +134,15 @@ ESTIMATED = 0.1
 # where the shape that is not known matters far more than a noise of a hundredth of that.
 
 
-def clean_noise(points: Float, normals: Float, density: Density, over: float, estimated: bool) -> Noise | None:
+def clean_noise(
+    points: Float,
+    normals: Float,
+    density: Density,
+    over: float,
+    estimated: bool,
+    *,
+    parameters: CleanScanParameters = CleanScanParameters(),
+) -> Noise | None:
     """Return the noise of positions, unit coordinates, and normals, radians, of a clean scan; None of any other.
 
     It is also None where a field that is to be corrected leaves nothing over at the points.
@@ -174,29 +154,38 @@ def clean_noise(points: Float, normals: Float, density: Density, over: float, es
     over : root mean square of what is left over, unit coordinates
     estimated : whether the normals were found from the points
     """
-    if over < LEAST_OVER * density.radius:
+    if over < parameters.least_residual_disk_radii * density.radius:
         return None
-    height = heights(points, normals, density)
-    if not height <= CLEAN:
+    height = heights(points, normals, density, parameters=parameters)
+    if not height <= parameters.most_height:
         return None
+    least = parameters.least_position_noise_disk_radii
     if estimated:
-        return POSITION * density.radius, ESTIMATED
-    return max(height, POSITION) * density.radius, max(TURNED * height, ANGLE)
+        return least * density.radius, parameters.estimated_angle_noise_radians
+    angle = max(parameters.angle_over_position_noise * height, parameters.least_angle_noise_radians)
+    return max(height, least) * density.radius, angle
 
 
-def heights(points: Float, normals: Float, density: Density) -> float:
+def heights(
+    points: Float,
+    normals: Float,
+    density: Density,
+    *,
+    parameters: CleanScanParameters = CleanScanParameters(),
+) -> float:
     """Return the median height of neighbours over the surface that both their normals tell; NaN of too few pairs.
 
     It is half the sum of both heights over each other's planes, over the larger of their distance and a disk's radius.
     The parameters are those of `clean_noise`.
     """
-    asked = slice(None, None, -(-len(points) // MOST_POINTS))
+    asked = slice(None, None, -(-len(points) // parameters.most_points))
     disks = density.disks[asked, None]
-    ranks = list(range(2, min(NEIGHBOURS + 1, len(points)) + 1))
+    ranks = list(range(2, min(parameters.neighbours + 1, len(points)) + 1))
     distance, near = density.tree.query(points[asked], ranks)
     cosine = np.einsum("ikd,id->ik", normals[near], normals[asked])
-    paired = (distance > 0) & (distance < DISKS * disks) & (cosine > ALIKE)
-    if paired.sum() < LEAST_PAIRS:
+    least_cosine = np.cos(np.radians(parameters.most_normal_angle_degrees))
+    paired = (distance > 0) & (distance < parameters.reach_disk_radii * disks) & (cosine > least_cosine)
+    if paired.sum() < parameters.least_pairs:
         return np.nan
-    height, own = over_planes(points, normals, asked, near)
+    height, own = heights_over_planes(points, normals, asked, near)
     return float(np.median((np.abs(height - own) / 2 / np.maximum(distance, disks))[paired]))

@@ -25,49 +25,12 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.local_solve import Belief, Patch, patch_system
-from gnrecon.fit.marginal_likelihood import PATCHES as EVIDENT_PATCHES
-from gnrecon.fit.marginal_likelihood import POINTS, Evidence, clean_noise
+from gnrecon.fit.marginal_likelihood import Evidence, clean_noise
+from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import abreast
-
-LENGTHS = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)
-POSITIONS = (0.02, 0.1, 0.3, 0.8)
-"""Lengths and noise of the positions that are tried, over the radius of a point's disk."""
-
-ANGLES = (0.03, 0.1, 0.3)
-CHOICES = tuple(itertools.product(POSITIONS, ANGLES))
-ALIKE = 0.025
-"""Share by which a score may exceed the best and yet count as alike."""
-
-LEAST_NOISE = 1e-3
-"""Least noise of the positions, over the radius of a point's disk; below it rounding would decide."""
-
-FIRST = 2
-"""Number of the length that is tried first."""
-
-PATCHES, DENSE_PATCHES, HELD_NEAR = 10, 20, 20
-"""Patches, those of a dense scan, and how many left-out points each of them predicts."""
-
-DENSE = 8000
-"""Points beyond which patches are more, of fewer features; those of smaller scans would share what they predict."""
-
-SPARSE = 20_000
-"""Points up to which estimated normals are not heeded; those of denser scans are means over little of the surface, and
-where many scans do not quite match, distances alone are least for a field that winds through all of them."""
-
-MOST_POINTS = 2500
-FEATURES, DENSE_FEATURES = 700, 300
-LEAST_SLOPE = 0.05
-ABOUT = 0.7, 1.5
-"""The field in free space that is left as it is, over the coarse distance."""
-
-LEAST_SHARE = 0.5
-"""Least size that the field must have there, as a share of the coarse distance's."""
-
-BEYOND = 1.5
-"""How far a patch's data reaches beyond what it predicts, in lengths."""
+from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
@@ -131,7 +94,16 @@ class Volume:
     distance: Float
 
     @classmethod
-    def around(cls, points: Float, own: Float, signed: Float, certain: Mask, distance: Float) -> Volume:
+    def around(
+        cls,
+        points: Float,
+        own: Float,
+        signed: Float,
+        certain: Mask,
+        distance: Float,
+        *,
+        parameters: ModelSelectionParameters = ModelSelectionParameters(),
+    ) -> Volume:
         """Return samples at which a field is to be about the coarse distance, and of its sign where that is certain.
 
         A field that is somewhat steeper or flatter than a distance needs no correction: one that brought it to the
@@ -145,10 +117,10 @@ class Volume:
         certain : mask of shape (Q,), where the sign of that is beyond doubt
         distance : array of shape (Q,), of the data
         """
-        near, far = (share * signed for share in ABOUT)
+        near, far = parameters.least_field_share * signed, parameters.most_field_share * signed
         agreed = certain | (own * signed > 0)
         wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
-        bound = LEAST_SHARE * signed - own
+        bound = parameters.sign_bound_share * signed - own
         lower = np.where(certain & (signed > 0), bound, -np.inf)
         upper = np.where(certain & (signed < 0), bound, np.inf)
         return cls(points, wanted, lower, upper, distance)
@@ -201,16 +173,32 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     return trials.clean() or trials.choice().best
 
 
-def _evidence(leftover: Leftover, radius: float, rng: np.random.Generator, device: str) -> Evidence:
+def _evidence(
+    leftover: Leftover,
+    radius: float,
+    rng: np.random.Generator,
+    device: str,
+    *,
+    parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters(),
+) -> Evidence:
     """Return the evidence of points about places that are drawn; the other parameters as those of `choose`."""
-    centers = leftover.points[rng.choice(len(leftover), min(EVIDENT_PATCHES, len(leftover)), replace=False)]
-    near = leftover.density.tree.query(centers, list(range(1, min(POINTS, len(leftover)) + 1)))[1]
+    count = min(parameters.patches, len(leftover))
+    centers = leftover.points[rng.choice(len(leftover), count, replace=False)]
+    ranks = list(range(1, min(parameters.patch_points, len(leftover)) + 1))
+    near = leftover.density.tree.query(centers, ranks)[1]
     pairs = zip(np.sort(near), centers, strict=True)
     patches = [leftover.patch(rows, center, Volume.none(), device) for rows, center in pairs]
-    return Evidence.of(patches, radius, rng, device)
+    return Evidence.of(patches, radius, rng, device, parameters=parameters)
 
 
-def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
+def _noise_candidates(parameters: ModelSelectionParameters) -> list[tuple[float, float]]:
+    """Return the pairs of position noise, in disk radii, and angle noise, in radians, that are tried."""
+    return list(itertools.product(parameters.position_noises_disk_radii, parameters.angle_noises_radians))
+
+
+def _smoothest(
+    scores: dict[int, Float], *, parameters: ModelSelectionParameters = ModelSelectionParameters()
+) -> tuple[int, int]:
     """Return the number of the length and of the noise that assume most noise, and are as good as the best.
 
     As good is what lies within its standard error of the best, patch against patch, or within a share. Noise that is
@@ -226,8 +214,9 @@ def _smoothest(scores: dict[int, Float]) -> tuple[int, int]:
     mean = table.mean(axis=0)
     best = np.unravel_index(int(np.argmin(mean)), mean.shape)
     over = table - table[:, best[0], best[1]][:, None, None]
-    tolerance = np.maximum(over.std(axis=0) / np.sqrt(len(table)), ALIKE * mean[best])
-    alike = [(CHOICES[c][0], LENGTHS[numbers[n]], n, c) for n, c in np.argwhere(over.mean(axis=0) <= tolerance)]
+    tolerance = np.maximum(over.std(axis=0) / np.sqrt(len(table)), parameters.tie_share * mean[best])
+    noises, lengths = _noise_candidates(parameters), parameters.lengths_disk_radii
+    alike = [(noises[c][0], lengths[numbers[n]], n, c) for n, c in np.argwhere(over.mean(axis=0) <= tolerance)]
     _, _, row, choice = max(alike)
     return numbers[int(row)], int(choice)
 
@@ -261,6 +250,7 @@ class Trials:
     device: str
     known: tuple[float, float] | None = None
     evidence: Evidence | None = None
+    parameters: ModelSelectionParameters = ModelSelectionParameters()
     _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
@@ -272,22 +262,26 @@ class Trials:
         radius: float,
         rng: np.random.Generator,
         device: str,
-        cube_features: int = FEATURES,
+        cube_features: int = ModelSelectionParameters.features,
+        *,
+        parameters: ModelSelectionParameters = ModelSelectionParameters(),
     ) -> Trials:
         """Draw the patches, for cubes of so many features; the other parameters as those of `choose`."""
         out = np.flatnonzero(held)
-        dense = len(leftover) > DENSE
-        patches = DENSE_PATCHES if dense else PATCHES
+        dense = len(leftover) > parameters.dense_points
+        patches = parameters.dense_patches if dense else parameters.patches
         # What is to predict a cube of few features resolves no more than it.
-        count = DENSE_FEATURES if dense or cube_features <= DENSE_FEATURES else FEATURES
+        few = dense or cube_features <= parameters.dense_features
+        count = parameters.dense_features if few else parameters.features
         chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
-        ranks = list(range(1, min(HELD_NEAR, len(out)) + 1))
+        ranks = list(range(1, min(parameters.patch_validation_points, len(out)) + 1))
         near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = leftover.points[chosen]
         evidence = None if leftover.estimated else _evidence(leftover, radius, rng.spawn(1)[0], device)
-        return cls(leftover, leftover, radius, features, centers, list(out[near]), held, device, evidence=evidence)
+        found = list(out[near])
+        return cls(leftover, leftover, radius, features, centers, found, held, device, None, evidence, parameters)
 
     def clean(self) -> Belief | None:
         """Return the belief of a scan so clean that its points tell their noise by themselves, or None.
@@ -300,10 +294,10 @@ class Trials:
         if noise is None:
             return None
         known = replace(self, known=noise)
-        number = 0
-        while number + 1 < len(LENGTHS) and known._clearly_better(number + 1, number):
+        number, count = 0, len(self.parameters.lengths_disk_radii)
+        while number + 1 < count and known._clearly_better(number + 1, number):
             number += 1
-        return Belief(LENGTHS[number] * self.radius, *noise)
+        return Belief(self._length(number), *noise)
 
     def choice(self) -> Choice:
         """Return the belief that predicts best."""
@@ -311,17 +305,18 @@ class Trials:
 
         def least(number: int) -> float:
             """Return the least score of a length, over the noises."""
-            if not 0 <= number < len(LENGTHS):
+            if not 0 <= number < len(self.parameters.lengths_disk_radii):
                 return np.inf
-            scores[number] = self.scores(LENGTHS[number] * self.radius)
+            scores[number] = self.scores(self._length(number))
             return float(scores[number].mean(axis=0).min())
 
-        at = FIRST
+        at = self.parameters.first_length_index
         step = 1 if least(at + 1) < least(at) else -1
         while least(at + step) < least(at):
             at += step
-        tabled = {number: of_length[:, : len(CHOICES)] for number, of_length in scores.items()}
-        number, noise = _smoothest(tabled)
+        count = len(_noise_candidates(self.parameters))
+        tabled = {number: of_length[:, :count] for number, of_length in scores.items()}
+        number, noise = _smoothest(tabled, parameters=self.parameters)
         evident = None
         if self.evidence is not None:
             last, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
@@ -330,12 +325,16 @@ class Trials:
 
     def _belief(self, number: int, noise: int) -> Belief:
         """Return the belief of the numbers of a length and of one of its noises."""
-        length = LENGTHS[number] * self.radius
+        length = self._length(number)
         return Belief(length, *self.noises(length)[noise])
+
+    def _length(self, number: int) -> float:
+        """Return a length scale, unit coordinates, by its number."""
+        return self.parameters.lengths_disk_radii[number] * self.radius
 
     def _clearly_better(self, number: int, than: int) -> bool:
         """Return whether a length's score is better than another's by more than the standard error."""
-        gain = self.scores(LENGTHS[than] * self.radius)[:, 0] - self.scores(LENGTHS[number] * self.radius)[:, 0]
+        gain = self.scores(self._length(than))[:, 0] - self.scores(self._length(number))[:, 0]
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
@@ -346,9 +345,9 @@ class Trials:
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
-            tried = [(position * self.radius, angle) for position, angle in CHOICES]
+            tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
             tried += [] if self.evidence is None else [self.evidence.noise(length)]
-            most = max(self.leftover.over, LEAST_NOISE * self.radius)
+            most = max(self.leftover.over, self.parameters.least_position_noise_disk_radii * self.radius)
             self._noises[length] = [(min(position, most), angle) for position, angle in tried]
         return self._noises[length]
 
@@ -356,20 +355,24 @@ class Trials:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
         if length not in self._scored:
             self.noises(length)  # once, before the patches ask for them side by side
-            found = abreast(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
+            found = map_in_threads(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
             self._scored[length] = np.array(found) / self.radius
         return self._scored[length]
 
     def _scores(self, number: int, length: float) -> list[float]:
         """Return the scores of one patch for each choice of noise."""
         center, predicted = self.centers[number], self.predicted[number]
-        reach = np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max() + BEYOND * length
+        reach = (
+            np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max()
+            + self.parameters.margin_lengths * length
+        )
         rows = self.leftover.within(center, reach)
         rows = rows[~self.held[rows]]
         # Beyond this many the nearest tell enough, and time would grow with the length's square.
-        if len(rows) > MOST_POINTS:
+        most = self.parameters.most_patch_points
+        if len(rows) > most:
             far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
-            rows = rows[np.sort(np.argsort(far, kind="stable")[:MOST_POINTS])]
+            rows = rows[np.sort(np.argsort(far, kind="stable")[:most])]
         patch = self.leftover.patch(rows, center, Volume.none(), self.device)
         system = patch_system(patch, self.features, length, patch.size)
         target = self.told.patch(predicted, center, Volume.none(), self.device)
@@ -384,9 +387,9 @@ class Trials:
         # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
         missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
-        if self.leftover.estimated and len(self.leftover) <= SPARSE:
+        if self.leftover.estimated and len(self.leftover) <= self.parameters.sparse_points:
             # Such normals are means of their neighbours', which a field that is too smooth predicts best. So distances
             # alone count, and a field that is steep because it winds through every point is not nearer for that.
-            return float((missing.abs() / slope.clamp(LEAST_SLOPE, 1.0)).mean())
-        distance = missing.abs() / slope.clamp_min(LEAST_SLOPE)
+            return float((missing.abs() / slope.clamp(self.parameters.least_slope, 1.0)).mean())
+        distance = missing.abs() / slope.clamp_min(self.parameters.least_slope)
         return float(distance.mean() + self.radius * turn.norm(dim=1).mean())

@@ -17,16 +17,15 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.fit_options import FitOptions, normal_residual
+from gnrecon.fit.parameters import ObjectiveParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import Box, CoarseDistance, near_surface
-from gnrecon.least_squares.jacobian import Block, LayeredJacobian
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, sample_near_surface
+from gnrecon.least_squares.jacobian import Block
 from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.least_squares.layered_jacobian import LayeredJacobian
 from gnrecon.residuals.constraints import Linearised, Residual, eikonal, interface, signed_distance
-from gnrecon.runtime.parallel import slices
-
-CHUNK_POINTS, CHUNK_BYTES = 16_384, 64_000_000
-"""Points that are evaluated together: so many, or fewer where a layer's activations would take more bytes."""
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class FieldProblem:
     theta: Tensor
     units: tuple[Tensor | None, ...] | None = None
     precision: torch.dtype | None = None
-    keep_bytes: int = 1_500_000_000
+    keep_bytes: int = ObjectiveParameters.factor_bytes
 
     @cached_property
     def columns(self) -> Tensor | None:
@@ -122,9 +121,9 @@ class FieldProblem:
         shapes = self.field.layout.shapes
         return tuple(out * (into + 1) for out, (_, into) in zip(self._free_outs(), shapes, strict=True))
 
-    def _chunks(self, group: list[Term]) -> list[slice]:
-        """Return slices of the group's points, of which the activations take at most `CHUNK_BYTES` a layer."""
-        size = max(256, min(CHUNK_POINTS, CHUNK_BYTES // (8 * max(self.field.widths))))
+    def _chunks(self, group: list[Term], *, parameters: ObjectiveParameters = ObjectiveParameters()) -> list[slice]:
+        """Return slices of the group's points, with limited memory for the activations of a layer."""
+        size = max(256, min(parameters.chunk_points, parameters.chunk_bytes // (8 * max(self.field.widths))))
         return slices(len(group[0].points), size)
 
     def _factor_bytes(self, whole: Tensor) -> int:
@@ -216,18 +215,6 @@ def groups(terms: Sequence[Term]) -> list[list[Term]]:
     return list(by_points.values())
 
 
-LEAST_REACH = 0.012
-
-EIKONAL_REACH = 0.05
-
-DISTANCE_ROW, DISTANCE_WEIGHT = 1e-4, 4e-4
-
-EIKONAL_COUNT = 3000
-
-LINEAR = ("vector", "projection")
-"""Residuals of normals that are linear in the field."""
-
-
 # The terms of a fit, drawn afresh for each step.
 #
 # In the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
@@ -245,7 +232,7 @@ def start_terms(
 ) -> list[Term]:
     """Return the terms of a linear start: at most `most` data points, and volume samples x with their distances."""
     # The start is a linear solve, and other residuals than these two are not linear in f, or not known to be.
-    linear = options if options.normals in LINEAR else replace(options, normals="vector")
+    linear = options if options.normals in ("vector", "projection") else replace(options, normals="vector")
     return [*data_terms(scene, linear, rng, most), distance_term(scene, x, distance)]
 
 
@@ -256,6 +243,8 @@ def step_terms(
     volume: tuple[Tensor, Tensor],
     most: int,
     data_weight: float = 1.0,
+    *,
+    parameters: ObjectiveParameters = ObjectiveParameters(),
 ) -> list[Term]:
     """Draw the terms of one step: at most `most` data points, with `data_weight` times their weight, and the volume.
 
@@ -263,10 +252,10 @@ def step_terms(
     ----------
     volume : samples, of shape (Q, 3), and their coarse distances, of shape (Q,)
     """
-    eikonal_count = min(EIKONAL_COUNT, most)
-    near = near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
+    eikonal_count = min(parameters.eikonal_samples, most)
+    near = sample_near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
     around = np.concatenate([near, scene.box.sample(eikonal_count // 3, rng)])
-    eikonal_weight = (EIKONAL_REACH * scene.coarse.spacing) ** 2 * data_weight**0.5
+    eikonal_weight = (parameters.eikonal_reach_spacings * scene.coarse.spacing) ** 2 * data_weight**0.5
     return [
         *data_terms(scene, options, rng, most, data_weight),
         distance_term(scene, *volume),
@@ -289,28 +278,25 @@ def data_terms(
     ]
 
 
-REACH = 0.4
-"""Length over which an angle of a normal counts as a height, in spacings."""
+def normal_weight(
+    spacing: float,
+    reach: float = ObjectiveParameters.normal_reach_spacings,
+    *,
+    least_reach_radii: float = ObjectiveParameters.least_normal_reach_radii,
+) -> float:
+    """Return the weight of normals relative to that of the interface, for data of a spacing in radii.
+
+    An angle counts as a height over `reach` spacings, or over `least_reach_radii` if that is longer.
+    """
+    return max(reach * spacing, least_reach_radii) ** 2
 
 
-def normal_weight(spacing: float, reach: float = REACH) -> float:
-    """Return the weight of normals beside that of the interface, for data of a spacing in radii."""
-    return max(reach * spacing, LEAST_REACH) ** 2
-
-
-def distance_term(scene: Scene, x: Tensor, distance: Tensor) -> Term:
-    """The sparser the data, the more the free space must be told; the denser, the steeper a fit can turn in it."""
-    weight = max(DISTANCE_ROW * len(x) / len(scene.points), DISTANCE_WEIGHT)
+def distance_term(
+    scene: Scene, x: Tensor, distance: Tensor, *, parameters: ObjectiveParameters = ObjectiveParameters()
+) -> Term:
+    """Return the term of coarse distances at volume samples; it weighs more where data is sparse."""
+    weight = max(parameters.distance_weight_per_sample * len(x) / len(scene.points), parameters.least_distance_weight)
     return Term("distance", signed_distance, x, distance, weight)
-
-
-MARGIN = 0.1
-"""How far the box reaches beyond the data, in radii."""
-
-VOLUME_COUNT = 10000
-
-SHELL = 4.0
-"""Standard deviation of the samples near the data, in spacings."""
 
 
 # What a fit is made in: the samples as tensors, their coarse distance, and the box around them.
@@ -320,7 +306,7 @@ SHELL = 4.0
 class Scene:
     """Data points and normals, of shape (N, 3), on the device; the rest in numpy, for sampling.
 
-    `reach` says what the normals are worth beside the points: see `REACH`.
+    `reach` is the length, in spacings, over which an angle of a normal counts as a height; see `normal_weight`.
     """
 
     points: Tensor
@@ -328,8 +314,8 @@ class Scene:
     samples: Samples
     coarse: CoarseDistance
     box: Box
-    volume_count: int = VOLUME_COUNT
-    reach: float = REACH
+    volume_count: int = ObjectiveParameters.volume_samples
+    reach: float = ObjectiveParameters.normal_reach_spacings
 
     @classmethod
     def of(cls, samples: Samples, device: str, rng: np.random.Generator) -> Scene:
@@ -342,9 +328,11 @@ class Scene:
         """Return about `count` points of the box, (Q, 3), half of them near the data, and their coarse distances."""
         return self.coarse.sample(self.places(count, rng))
 
-    def places(self, count: int, rng: np.random.Generator) -> Float:
+    def places(
+        self, count: int, rng: np.random.Generator, *, shell_spacings: float = ObjectiveParameters.shell_spacings
+    ) -> Float:
         """Return such points, of shape (Q, 3), also where no distance is known because the data is too near."""
-        shell = near_surface(self.samples.points, SHELL * self.coarse.spacing, count // 2, rng)
+        shell = sample_near_surface(self.samples.points, shell_spacings * self.coarse.spacing, count // 2, rng)
         inside = ((shell > self.box.lower) & (shell < self.box.upper)).all(axis=1)
         return np.concatenate([self.box.sample(count - count // 2, rng), shell[inside]])
 
@@ -359,5 +347,5 @@ def bounds_of(samples: Samples) -> Float:
     return samples.frame.to_world(np.stack([box.lower, box.upper]))
 
 
-def _box(samples: Samples) -> Box:
-    return Box.around(samples.points, MARGIN)
+def _box(samples: Samples, *, margin_radii: float = ObjectiveParameters.box_margin_radii) -> Box:
+    return Box.around(samples.points, margin_radii)

@@ -34,8 +34,256 @@ class LocalFieldParameters:
 
 
 @dataclass(frozen=True)
+class OutlierParameters:
+    """Outliers near the surface, by the residuals of a first global field (`fit.consistency`)."""
+
+    neighbours: int = 8  # whose median a point's residual is compared with
+    quantile: float = 0.95  # of all differences: what points of the surface stay below
+    quantile_factor: float = 4.0  # an outlier's difference is at least so many times that quantile
+    least_distance_disk_radii: float = 0.75  # and at least so long, so that clean scans have none
+    least_share: float = 0.002  # of the points; fewer are chance, or edges, and do no harm
+    most_share: float = 0.04  # of the points; more mean that the field does not fit
+    least_points: int = 100  # below, the quantile rests on fewer than five points
+
+
+@dataclass(frozen=True)
+class GlobalFieldParameters:
+    """The smooth global field (`fit.global_field`)."""
+
+    units: int = 1000
+    wrong_sign_share: float = 4e-3  # of free space, that heavier normals may give the wrong sign
+    length_scales_radii: tuple[float, ...] = (0.25, 0.5, 1.0)  # candidates
+    # Candidates of the normals' weight: the length over which an angle counts as a height. The first is the default.
+    normal_reaches_spacings: tuple[float, ...] = (0.4, 1.2, 3.0, 8.0, 20.0)
+    least_length_spacings: float = 4.0  # shorter features oscillate between the points
+    tie_share: float = 0.01  # by which a longer length scale may predict worse than the best
+    selection_features: int = 600
+    selection_points: int = 2000
+    selection_volume_samples: int = 2000
+    position_noise_spacings: float = 0.1  # assumed in the selection; that of normals is this over the reach, in radians
+    least_validation_points: int = 5  # with fewer, nothing is selected
+    field_deviation_radii: float = 1.0  # prior standard deviation of the field
+
+
+@dataclass(frozen=True)
+class DenoisingParameters:
+    """Averaging of noisy points before the local fit (`fit.denoising`)."""
+
+    widths_disk_radii: tuple[float, ...] = (2.5, 4.0, 6.0)  # of the filter; the others are tried where the first helps
+    normal_difference: float = 0.4  # of unit normals, at which a neighbour's weight is 1/e
+    gain_standard_errors: float = 2.0  # by which averaging must predict better where no edges are detected
+    least_noise_disk_radii: float = 0.05  # noise above which averaging is tried
+
+
+@dataclass(frozen=True)
+class InitialisationParameters:
+    """Linear starts of sine networks (`fit.initialisation`)."""
+
+    length_scale_radii: float = 0.12  # of the features of one wide layer; measured, docs/research
+    degrees_of_freedom: float = 4.0  # of the Student t distribution of their frequencies: a Matern kernel of nu = 2
+    ridge: float = 1e-8  # over the number of points: as little as rounding allows
+    rounds: int = 3  # solves, each with samples where the last one had the wrong sign
+    trial_factor: int = 3  # volume samples that are searched for wrong signs, over those of a solve
+    wrong_sign_repeats: int = 5  # of such a sample in the next solve; without it, horns grow on sparse scans
+    ridge_attempts: int = 6  # each with ten times the ridge
+    first_layer_frequency: float = 4.0  # standard deviation, per radius, in networks of several layers
+    spectral_ridge: float = 1e-4  # of their last layer, per unit of the terms' weight
+    spectral_samples: int = 4000  # points and volume samples of that solve
+    search_points: int = 5000  # most data points of all rounds but the last
+    final_points: int = 20_000  # most data points of the last round
+
+
+@dataclass(frozen=True)
+class LocalSolveParameters:
+    """The linear solve of one cube (`fit.local_solve`)."""
+
+    correction_rms_factor: float = 3.0  # prior standard deviation of the correction, over the residuals' RMS
+    volume_deviation_share: float = 0.5  # standard deviation in free space, as a share of the distance from the data
+    bound_passes: int = 3  # active-set passes over samples beyond their bounds
+    bound_deviation_share: float = 0.1  # their standard deviation then, as a share of the distance
+    damping_attempts: int = 6  # each with ten times the damping
+    chunk_points: int = 16_384  # points whose features are held at once, so that memory does not grow with density
+
+
+@dataclass(frozen=True)
+class MarginalLikelihoodParameters:
+    """Noise by the marginal likelihood of a Gaussian process (`fit.marginal_likelihood`)."""
+
+    position_noises_disk_radii: tuple[float, ...] = (
+        *(0.005, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5),
+    )  # candidates
+    angle_noises_radians: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.13, 0.17, 0.23, 0.3, 0.4)
+    first_index: tuple[int, int] = (6, 5)  # in both tables, where the search begins
+    strides: tuple[int, ...] = (2, 1)  # of the search, coarse to fine
+    patches: int = 20
+    patch_points: int = 60  # nearest points of a patch; the covariance has four rows for each
+    features: int = 700  # that make up the covariance
+
+
+@dataclass(frozen=True)
+class CleanScanParameters:
+    """Detection of scans whose noise need not be selected (`fit.marginal_likelihood.clean_noise`)."""
+
+    neighbours: int = 5
+    reach_disk_radii: float = 2.0  # most distance of a neighbour
+    most_normal_angle_degrees: float = 25.0  # between normals on one smooth piece of surface
+    # Median pair height, over a disk radius or the distance if longer, up to which a scan is clean. Vertices of scanned
+    # meshes have 0.017 to 0.024, a noise of 0.08 disk radii gives 0.06, range scans 0.14 and more.
+    most_height: float = 0.04
+    least_pairs: int = 20  # fewer decide nothing
+    most_points: int = 50_000  # whose neighbours are looked up
+    least_residual_disk_radii: float = 0.01  # RMS of the global field's residuals; below, there is nothing to gain
+    least_position_noise_disk_radii: float = 0.005
+    least_angle_noise_radians: float = 0.01
+    angle_over_position_noise: float = 2.0  # if neighbours are a disk radius apart, normals alone make such heights
+    estimated_angle_noise_radians: float = 0.1  # of estimated normals, whose errors are alike among neighbours
+
+
+@dataclass(frozen=True)
+class ModelSelectionParameters:
+    """Length scale and noise by cross-validation (`fit.model_selection`)."""
+
+    lengths_disk_radii: tuple[float, ...] = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)  # candidates, sqrt(2) apart
+    position_noises_disk_radii: tuple[float, ...] = (0.02, 0.1, 0.3, 0.8)  # candidates
+    angle_noises_radians: tuple[float, ...] = (0.03, 0.1, 0.3)  # candidates
+    tie_share: float = 0.025  # by which a score may exceed the best and yet count as equal
+    least_position_noise_disk_radii: float = 1e-3  # below, rounding would decide
+    first_length_index: int = 2  # of the length that is tried first
+    patches: int = 10
+    dense_patches: int = 20
+    patch_validation_points: int = 20  # that each patch predicts
+    # Points from which patches are more, of fewer features; those of smaller scans would share what they predict.
+    dense_points: int = 8000
+    # Points up to which estimated normals are ignored. Those of denser scans are means over little of the surface; and
+    # where many scans do not quite match, distances alone are least for a field that winds through all of them.
+    sparse_points: int = 20_000
+    most_patch_points: int = 2500  # more change no score, and time grows with the square of the length
+    features: int = 700
+    dense_features: int = 300
+    least_slope: float = 0.05  # of the field along the normal, in a distance |f| / slope
+    least_field_share: float = 0.7  # of the coarse distance: a field between this
+    most_field_share: float = 1.5  # and this share of it needs no correction
+    sign_bound_share: float = 0.5  # of the coarse distance, that the field must keep where the sign is certain
+    margin_lengths: float = 1.5  # how far a patch's data reaches beyond what it predicts, in length scales
+
+
+@dataclass(frozen=True)
+class ObjectiveParameters:
+    """Terms of a fit of one network and the scene that they are sampled in (`fit.objective`)."""
+
+    chunk_points: int = 16_384  # most points that are evaluated together
+    chunk_bytes: int = 64_000_000  # most memory of one layer's activations
+    factor_bytes: int = 1_500_000_000  # most memory of the stored factors of the Jacobian
+    normal_reach_spacings: float = 0.4  # length over which an angle of a normal counts as a height
+    least_normal_reach_radii: float = 0.012
+    eikonal_reach_spacings: float = 0.05
+    eikonal_samples: int = 3000
+    distance_weight_per_sample: float = 1e-4  # times volume samples over points: sparse data needs free space more
+    least_distance_weight: float = 4e-4  # the denser the data, the steeper a fit can turn in free space
+    box_margin_radii: float = 0.1  # how far the box reaches beyond the data
+    volume_samples: int = 10_000
+    shell_spacings: float = 4.0  # standard deviation of the samples near the data
+
+
+@dataclass(frozen=True)
+class SingleNetworkParameters:
+    """Fits of one network (`fit.single_network`, `fit.fit_options`)."""
+
+    wide_steps: int = 4  # of Gauss-Newton after the start
+    deep_steps: int = 120
+    adam_steps: int = 2000
+    lbfgs_steps: int = 40  # each of 20 iterations
+    least_points_to_refine: int = 1000  # docs/research/2026-11-21-one-wide-layer.md
+    units_per_point: int = 3  # of one wide layer
+    least_units: int = 1000
+    points_per_unit: int = 4  # more units than data rows only make it slower and less smooth
+    most_sparse_units: int = 2000
+    most_units: int = 3000
+    wide_start_time_share: float = 0.4  # of the fit, measured, for the progress bar
+    deep_start_time_share: float = 0.05
+    pool_samples: int = 30_000  # volume samples of a deep fit: signing them takes as long as a step
+    least_points_to_hold_out: int = 1000
+    held_out_one_in: int = 20
+    held_out_patience_steps: int = 20
+    subspace_units: int = 400  # whose frequencies a step of a wide fit frees, so that J^T J stays small
+    step_points: int = 4000  # most data points of a step of a wide fit
+    krylov_tolerance: float = 0.3  # relative error in the energy norm: steps that a search shortens need no better
+
+
+@dataclass(frozen=True)
+class PenaltyFitParameters:
+    """Curvature penalties on the fitted surface (`fit.regularisers`, `fit.regularised`)."""
+
+    minimal_weight: float = 1e-2  # default of `fill`
+    developable_weight: float = 1e-3  # default of `prior`
+    crease_curvature: float = 8.0  # Gauss curvature, per squared radius, from which a place counts as a crease
+    global_steps: int = 8  # most Gauss-Newton steps of the global field
+    cube_steps: int = 3  # of a cube, which is nearly linear, because the global field has done most of it
+    least_decrease_share: float = 0.01  # of the loss, for a step to count as progress
+    patience_steps: int = 2  # without progress
+    newton_steps: int = 3  # that bring points onto the surface
+    global_step_radii: float = 0.05  # most that a point moves in one of them
+    cube_step_lengths: float = 0.5
+    samples_per_length: float = 2.0  # surface samples along one length scale of the features
+    rounds: int = 2  # of the global field, each with more samples where the last one has the wrong sign
+    ridge_attempts: int = 8  # each with ten times the ridge
+    free_space_weight: float = 100.0
+    free_space_clearance_radii: float = 0.05  # distance from the scan at which free space begins
+    free_space_factor: int = 3  # its samples, over the volume samples of the fit
+    most_free_space_distance_radii: float = 0.03  # the most that |f| is required to be there
+    near_disk_radii: float = 2.0  # one in fifty places of a uniformly sampled surface is farther from all points
+    far_disk_radii: float = 3.5  # five in a million are: from here on a place counts as a hole
+    least_surface_samples: int = 1000
+    most_surface_samples: int = 30_000
+    surface_nodes: int = 30_000  # of the grid that finds the surface
+    joined_spacings: float = 3.0  # distance between samples of one sheet, in their mean spacing
+
+
+@dataclass(frozen=True)
+class LaplaceParameters:
+    """The Laplace approximation of a fit (`fit.laplace_approximation`)."""
+
+    prior_deviation_radii: float = 10.0  # by which each layer's prior moves f; the fit's own ridge is as weak
+    noise_passes: int = 6
+    noise_tolerance: float = 0.02  # relative change of the noise at which the passes end
+    least_noise_radii: float = 1e-5  # below, rounding would decide
+    noise_attempts: int = 6  # where rounding makes the system indefinite
+    noise_growth: float = 3.0  # factor of the noise at each attempt
+    most_free_parameters: int = 3000
+    wide_units: int = 600  # of a last layer whose features span the field
+    factor_bytes: int = 200_000_000  # most memory of the stored factors of the Jacobian
+
+
+@dataclass(frozen=True)
+class UncertaintyParameters:
+    """Standard deviation of the surface and its calibration (`fit.uncertainty`)."""
+
+    most_points: int = 20_000  # of the data; thinned at random, so that sigma is rather too large
+    batch_points: int = 8192
+    least_slope: float = 0.1  # of the field; near its critical points the first order is meaningless
+    patch_sizes: tuple[int, ...] = (1, 8, 40)  # points that are left out together
+    patch_counts: tuple[int, ...] = (200, 40, 12)  # patches of each size
+    coverage: float = 0.9545  # of a normal distribution within two standard deviations
+    calibration_batch_points: int = 240
+    least_residual_variance: float = 1e-10  # eigenvalue of I - H, which rounding may make negative
+
+
+@dataclass(frozen=True)
 class FitParameters:
     """All tuning constants of the fit."""
 
     two_level: TwoLevelParameters = TwoLevelParameters()
+    global_field: GlobalFieldParameters = GlobalFieldParameters()
+    outliers: OutlierParameters = OutlierParameters()
+    denoising: DenoisingParameters = DenoisingParameters()
+    clean_scan: CleanScanParameters = CleanScanParameters()
+    marginal_likelihood: MarginalLikelihoodParameters = MarginalLikelihoodParameters()
+    model_selection: ModelSelectionParameters = ModelSelectionParameters()
+    local_solve: LocalSolveParameters = LocalSolveParameters()
     local_fields: LocalFieldParameters = LocalFieldParameters()
+    initialisation: InitialisationParameters = InitialisationParameters()
+    objective: ObjectiveParameters = ObjectiveParameters()
+    single_network: SingleNetworkParameters = SingleNetworkParameters()
+    penalties: PenaltyFitParameters = PenaltyFitParameters()
+    laplace: LaplaceParameters = LaplaceParameters()
+    uncertainty: UncertaintyParameters = UncertaintyParameters()

@@ -25,38 +25,16 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.initialisation import FINAL_POINTS, RIDGE
 from gnrecon.fit.local_solve import Belief, PatchSystem
 from gnrecon.fit.objective import FieldProblem, Scene, Term, data_terms, distance_term
+from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
 from gnrecon.fit.regularisers import Jet, Regulariser, Sines, Wish, bent
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.geometry.signed_distance import Density, least_values
+from gnrecon.geometry.signed_distance import Density, free_space_bounds
 from gnrecon.least_squares.direct import damped_factor
 from gnrecon.level_set import LevelSet, sample_surface
 from gnrecon.residuals import SecondOrder, free_space
 from gnrecon.runtime.errors import FitError
-
-GLOBAL_STEPS, CUBE_STEPS = 8, 3
-"""Steps of Gauss-Newton, at most; the detail is nearly linear, because the global field has done most of it."""
-
-FOLLOW = 0.05, 0.5
-"""How far points may go in one step to follow the global field's surface, in radii, and a cube's, in its lengths."""
-
-PER_LENGTH = 2.0
-"""Points of the surface along one length of the features."""
-
-ROUNDS = 2
-"""Times that the global field is bent, each with more samples where the last one has the wrong sign."""
-
-ATTEMPTS = 8
-
-FREE, CLEAR, MORE = 100.0, 0.05, 3
-"""Weight of the free space, how far from the scan it begins, in radii, and how many times the fit's samples it has."""
-
-DEEP = 0.03
-"""The most that is asked of f there, in magnitude."""
-
-_FREE_SPACE = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
 
 
 @dataclass(frozen=True)
@@ -73,14 +51,24 @@ class Free:
     least: Float
 
     @classmethod
-    def of(cls, scene: Scene, rng: np.random.Generator) -> Free:
+    def of(
+        cls, scene: Scene, rng: np.random.Generator, *, parameters: PenaltyFitParameters = PenaltyFitParameters()
+    ) -> Free:
         """Draw points of a scan's box."""
-        x = scene.places(MORE * scene.volume_count, rng)
+        x = scene.places(parameters.free_space_factor * scene.volume_count, rng)
         known, distance, _, certain = scene.coarse.at(x)
-        kept = certain & (np.abs(distance) > CLEAR)
-        return cls(x[known][kept], least_values(distance[kept], DEEP))
+        kept = certain & (np.abs(distance) > parameters.free_space_clearance_radii)
+        return cls(x[known][kept], free_space_bounds(distance[kept], parameters.most_free_space_distance_radii))
 
-    def wishes(self, rows: Mask, known: Float, scale: float, like: Tensor) -> list[Wish]:
+    def wishes(
+        self,
+        rows: Mask,
+        known: Float,
+        scale: float,
+        like: Tensor,
+        *,
+        weight: float = PenaltyFitParameters.free_space_weight,
+    ) -> list[Wish]:
         """Return what is asked at some of the points.
 
         Parameters
@@ -93,8 +81,9 @@ class Free:
         if not rows.any():
             return []
         points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
-        scales = torch.full_like(least, scale * (FREE / len(rows)) ** 0.5)[:, None]
-        return [Wish(_FREE_SPACE, points, scales, target=least, still=still)]
+        scales = torch.full_like(least, scale * (weight / len(rows)) ** 0.5)[:, None]
+        residual = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
+        return [Wish(residual, points, scales, target=least, still=still)]
 
 
 @dataclass(frozen=True)
@@ -127,7 +116,9 @@ class Shaping:
         rng: np.random.Generator,
     ) -> Shaping:
         """Draw points of the surface for features of a length, in radii."""
-        return cls(wanted, Sheet.of(sdf, density, length / PER_LENGTH, rng), sdf, density, free)
+        return cls(
+            wanted, Sheet.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng), sdf, density, free
+        )
 
     @cached_property
     def in_free(self) -> Float:
@@ -160,7 +151,15 @@ class Shaping:
         return found
 
     def bend_cube(
-        self, features: Features, length: float, center: Float, reach: float, belief: Belief, system: PatchSystem
+        self,
+        features: Features,
+        length: float,
+        center: Float,
+        reach: float,
+        belief: Belief,
+        system: PatchSystem,
+        *,
+        parameters: PenaltyFitParameters = PenaltyFitParameters(),
     ) -> Tensor:
         """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
         amplitudes = system.solve_within(belief.position, belief.angle)
@@ -177,11 +176,20 @@ class Shaping:
         def base(x: Tensor) -> Jet:
             return whole.jet(known, x, whole.known(x))
 
-        sines = Sines(features, torch.as_tensor(center).to(amplitudes), length, FOLLOW[1] * length, base)
-        return bent(sines, *equations, wishes, amplitudes, CUBE_STEPS)
+        sines = Sines(
+            features, torch.as_tensor(center).to(amplitudes), length, parameters.cube_step_lengths * length, base
+        )
+        return bent(sines, *equations, wishes, amplitudes, parameters.cube_steps)
 
 
-def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.random.Generator) -> NeuralSDF:
+def bend_global(
+    shaping: Shaping,
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    *,
+    parameters: PenaltyFitParameters = PenaltyFitParameters(),
+) -> NeuralSDF:
     """Return the global field with output weights that heed the regularisers.
 
     Raises
@@ -195,12 +203,12 @@ def bend_global(shaping: Shaping, scene: Scene, options: FitOptions, rng: np.ran
     # The global field is all of f.
     wishes += shaping.free.wishes(free, np.zeros(len(free)), 1.0, like)
     x, wanted = _volume(shaping, scene, scene.volume_count, rng)
-    for left in reversed(range(ROUNDS)):
+    for left in reversed(range(parameters.rounds)):
         volume = scene.tensor(x), scene.tensor(wanted)
-        terms = [*data_terms(scene, options, rng, FINAL_POINTS), distance_term(scene, *volume)]
+        terms = [*data_terms(scene, options, rng, InitialisationParameters.final_points), distance_term(scene, *volume)]
         sines, amplitudes = as_sines(sdf)
         problem, factor, right = _linear_part(sdf, terms, amplitudes)
-        sdf = replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, GLOBAL_STEPS)))
+        sdf = replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, parameters.global_steps)))
         if left:
             # Where the sign has become wrong, more samples bring it back, as at the fit's start.
             trial, expected = _volume(shaping, scene, 3 * scene.volume_count, rng)
@@ -215,14 +223,21 @@ def _volume(shaping: Shaping, scene: Scene, count: int, rng: np.random.Generator
     return x, shaping.volume_distances(x, distance)
 
 
-def _linear_part(sdf: NeuralSDF, terms: Sequence[Term], amplitudes: Tensor) -> tuple[FieldProblem, Tensor, Tensor]:
+def _linear_part(
+    sdf: NeuralSDF,
+    terms: Sequence[Term],
+    amplitudes: Tensor,
+    *,
+    ridge: float = InitialisationParameters.ridge,
+    attempts: int = PenaltyFitParameters.ridge_attempts,
+) -> tuple[FieldProblem, Tensor, Tensor]:
     """Return the last layer's problem, and L and b of its normal equations L L^T a = b."""
     none = torch.zeros(0, dtype=torch.long, device=amplitudes.device)
     problem = FieldProblem(sdf.field, terms, sdf.theta, (none, None))
     jacobian, residual = problem.linearise(problem.free())
-    product, ridge = jacobian.gram(), RIDGE / max(len(term) for term in terms)
+    product, ridge = jacobian.gram(), ridge / max(len(term) for term in terms)
     right = jacobian.tmv(jacobian.mv(amplitudes) - residual)
-    for _ in range(ATTEMPTS):
+    for _ in range(attempts):
         factor = damped_factor(product, torch.full_like(right, ridge))
         if factor is not None:
             # The ridge holds the amplitudes where they are, as damping does.
@@ -236,20 +251,8 @@ def as_sines(sdf: NeuralSDF) -> tuple[Sines, Tensor]:
     (weights, bias), (out, constant) = sdf.field.layout.layers(sdf.theta)
     frequencies = torch.cat([weights, weights.new_zeros(1, 3)])
     phases = torch.cat([bias, bias.new_full((1,), torch.pi / 2)])
-    sines = Sines(Features(frequencies, phases), weights.new_zeros(3), 1.0, FOLLOW[0])
+    sines = Sines(Features(frequencies, phases), weights.new_zeros(3), 1.0, PenaltyFitParameters.global_step_radii)
     return sines, torch.cat([out[0], constant])
-
-
-NEAR, FAR = 2.0, 3.5
-"""Where far begins to count, and where it counts fully."""
-
-LEAST, MOST = 1000, 30_000
-"""Fewest and most points."""
-
-NODES = 30_000
-
-JOINED = 3.0
-"""Mean distances between points within which two of them belong to one sheet."""
 
 
 # Points of a fitted field's surface, and how far each is from the scan, as in its holes.
@@ -276,17 +279,26 @@ class Sheet:
         return len(self.points)
 
     @classmethod
-    def of(cls, sdf: NeuralSDF, density: Density, spacing: float, rng: np.random.Generator) -> Sheet:
+    def of(
+        cls,
+        sdf: NeuralSDF,
+        density: Density,
+        spacing: float,
+        rng: np.random.Generator,
+        *,
+        parameters: PenaltyFitParameters = PenaltyFitParameters(),
+    ) -> Sheet:
         """Draw points of a field's zero level about `spacing` apart, in radii; none where there is no surface.
 
         Sheets on which no point is near the scan are no part of the shape, and are left out.
         """
         scanned = float(np.pi * np.square(density.disks).sum())
-        count = int(np.clip(scanned / spacing**2, LEAST, MOST))
-        points = sample_surface(_level_set(sdf), count, rng, NODES, sweeps=0).points.cpu().numpy()
+        count = int(np.clip(scanned / spacing**2, parameters.least_surface_samples, parameters.most_surface_samples))
+        points = sample_surface(_level_set(sdf), count, rng, parameters.surface_nodes, sweeps=0).points.cpu().numpy()
         distance, nearest = density.tree.query(points)
-        far = np.clip((distance / density.disks[nearest] - NEAR) / (FAR - NEAR), 0.0, 1.0)
-        kept = _joined(points, far == 0.0, JOINED * np.sqrt(scanned / count))
+        low, high = parameters.near_disk_radii, parameters.far_disk_radii
+        far = np.clip((distance / density.disks[nearest] - low) / (high - low), 0.0, 1.0)
+        kept = _joined(points, far == 0.0, parameters.joined_spacings * np.sqrt(scanned / count))
         return cls(points[kept], far[kept])
 
     def volume_distances(self, x: Float, signed: Float, value: Float, density: Density) -> Float:
@@ -303,8 +315,8 @@ class Sheet:
         if not len(film):
             return signed
         distance = cKDTree(film).query(x)[0]
-        told: Float = np.where(distance < density.tree.query(x)[0], np.sign(value) * distance, signed)
-        return told
+        signed_distance: Float = np.where(distance < density.tree.query(x)[0], np.sign(value) * distance, signed)
+        return signed_distance
 
 
 def _joined(points: Float, near: Mask, reach: float) -> Mask:

@@ -8,7 +8,7 @@ each beside half the mean square distance of the points from the surface. All le
 of wavenumber k costs f^2 by the data and W k^4 f^2 by the strain, so that bumps of the wavelength 2 pi W^(1/4) are
 halved, and shorter ones all but vanish. A closed surface cannot be developable everywhere: its Gauss curvature must add
 up, and it does so in creases and corners. So the square of k1 k2 counts as Geman and McClure's robust r^2 / (1 + r^2),
-r over `CREASE`, which pulls at creases no more.
+r over 8 per squared radius, which pulls at creases no more.
 Source: King et al., Gauss-Newton natural gradient descent for shape learning (its table of constraints); Geman and
 McClure, Statistical methods for tomographic image reconstruction (1987).
 """
@@ -23,18 +23,13 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
+from gnrecon.fit.parameters import PenaltyFitParameters
 from gnrecon.least_squares import identity
 from gnrecon.least_squares.jacobian import DenseJacobian
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 from gnrecon.optim.problem import loss_of
 from gnrecon.residuals import Linearised, SecondOrder, gauss_curvature, mean_curvature, surface_strain
 from gnrecon.runtime.errors import UsageError
-
-FILL, DEVELOPABLE = 1e-2, 1e-3
-"""Weights of `minimal` and of `developable` without one of their own."""
-
-CREASE = 8.0
-"""Gauss curvature, per squared radius, from which on a place counts as a crease."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,13 @@ class Regulariser:
     crease: float | None = None
 
 
-def regularisers(smooth: str | None, fill: str | None, prior: str | None) -> tuple[Regulariser, ...]:
+def regularisers(
+    smooth: str | None,
+    fill: str | None,
+    prior: str | None,
+    *,
+    parameters: PenaltyFitParameters = PenaltyFitParameters(),
+) -> tuple[Regulariser, ...]:
     """Return what was asked for, each None or a text such as ``"strain=1e-4"``, ``"minimal"`` or ``"developable"``.
 
     Raises
@@ -69,10 +70,11 @@ def regularisers(smooth: str | None, fill: str | None, prior: str | None) -> tup
     if smooth is not None:
         found.append(Regulariser("strain", surface_strain, _weight("smooth", smooth, "strain", None)))
     if fill is not None:
-        found.append(Regulariser("minimal", mean_curvature, _weight("fill", fill, "minimal", FILL), holes=True))
+        weight = _weight("fill", fill, "minimal", parameters.minimal_weight)
+        found.append(Regulariser("minimal", mean_curvature, weight, holes=True))
     if prior is not None:
-        weight = _weight("prior", prior, "developable", DEVELOPABLE)
-        found.append(Regulariser("developable", gauss_curvature, weight, crease=CREASE))
+        weight = _weight("prior", prior, "developable", parameters.developable_weight)
+        found.append(Regulariser("developable", gauss_curvature, weight, crease=parameters.crease_curvature))
     return tuple(found)
 
 
@@ -92,12 +94,6 @@ def _weight(option: str, text: str, known: str, default: float | None) -> float:
         raise UsageError(f"The weight of {option} must be a positive number, as in {known}=1e-4, not {number!r}.")
     return weight
 
-
-TOLERANCE, IN_VAIN = 0.01, 2
-"""The bending ends after so many steps in a row that have not lowered the surface's own loss by such a share."""
-
-FOLLOWED = 3
-"""Newton steps that bring points onto the surface."""
 
 Jet = tuple[Tensor, Tensor, Tensor]
 """Value (N,), gradient (N, 3) and second derivatives (N, 3, 3)."""
@@ -208,9 +204,11 @@ class Sines:
             made.append(scale * row)
         return torch.cat(made)
 
-    def on_surface(self, amplitudes: Tensor, x: Tensor) -> Tensor:
+    def on_surface(
+        self, amplitudes: Tensor, x: Tensor, *, newton_steps: int = PenaltyFitParameters.newton_steps
+    ) -> Tensor:
         """Return points, of shape (N, 3), moved along the gradient onto the zero level, as far as it is near."""
-        for _ in range(FOLLOWED):
+        for _ in range(newton_steps):
             known = self.known(x)
             value, gradient = self.features.sums(amplitudes, x, self.center, self.length, 1)
             value, gradient = known[0] + value, known[1] + gradient
@@ -290,7 +288,16 @@ class BendProblem:
                 yield wish.unmet(self.sines.value(free, wish.points, known))
 
 
-def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], amplitudes: Tensor, steps: int) -> Tensor:
+def bent(
+    sines: Sines,
+    factor: Tensor,
+    right: Tensor,
+    wishes: Sequence[Wish],
+    amplitudes: Tensor,
+    steps: int,
+    *,
+    parameters: PenaltyFitParameters = PenaltyFitParameters(),
+) -> Tensor:
     """Return amplitudes, of shape (p,), that heed the wishes beside the linear part.
 
     Parameters
@@ -309,5 +316,7 @@ def bent(sines: Sines, factor: Tensor, right: Tensor, wishes: Sequence[Wish], am
 
     # A step knows nothing of how the surface moves away from its points; what counts is how it is where it has gone.
     method = GaussNewton(GainRatioDamping(initial_damping=1e-9, metric=identity))
-    stop = StopRule(steps, TOLERANCE, patience=steps + 1, held_out_patience=IN_VAIN)
+    stop = StopRule(
+        steps, parameters.least_decrease_share, patience=steps + 1, held_out_patience=parameters.patience_steps
+    )
     return method.run(posed, amplitudes, stop, held_out=lambda theta: loss_of(posed(0, theta), theta)).theta

@@ -1,7 +1,7 @@
-"""How well a fitted field explains its points: its value there, and the angle between its gradient and their normals.
+"""Fit residuals in file units: the field's values at its points, and angles between its gradient and their normals.
 
-These are the residuals of `f = 0` and of the normals in a reader's units. For an exact signed distance, both vanish. A
-noisy scan leaves residuals as large as its noise, and smaller ones say that noise was fitted.
+Both vanish for an exact signed distance of exact points. A noisy scan leaves residuals as large as its noise; smaller
+ones mean that noise was fitted.
 """
 
 from __future__ import annotations
@@ -15,12 +15,6 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.statistics import Histogram
-
-MOST = 20_000
-"""Points that are asked; more would cost time and change no figure."""
-
-SHOWN = 99.0
-"""Percentile of the values that the histograms reach to."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +33,9 @@ class Misfit:
     angles: Float
 
     @classmethod
-    def of(cls, sdf: NeuralSDF, samples: Samples) -> Misfit:
-        """Measure the residuals at `samples`, or at every so-manieth of them where they are more than `MOST`."""
-        rows = slice(None, None, -(-len(samples) // MOST))
+    def of(cls, sdf: NeuralSDF, samples: Samples, *, most_points: int = 20_000) -> Misfit:
+        """Measure the residuals at evenly spaced rows of `samples`, at most `most_points`: more change no figure."""
+        rows = slice(None, None, -(-len(samples) // most_points))
         points, normals = samples.frame.to_world(samples.points[rows]), samples.normals[rows]
         cosines = np.einsum("ij,ij->i", sdf.normals(points), normals)
         return cls(sdf.sdf(points), np.degrees(np.arccos(np.clip(cosines, -1, 1))))
@@ -75,9 +69,9 @@ def _figures(sizes: Float) -> dict[str, float]:
     }
 
 
-def _reach(sizes: Float) -> float:
-    """Where a histogram of sizes of shape (N,) ends; any positive number where all are zero, or not finite."""
-    reach = float(np.percentile(sizes, SHOWN))
+def _reach(sizes: Float, *, percentile: float = 99.0) -> float:
+    """Return where a histogram of sizes, of shape (N,), ends: a percentile, or 1 where that is zero or not finite."""
+    reach = float(np.percentile(sizes, percentile))
     return reach if 0 < reach < np.inf else 1.0
 
 

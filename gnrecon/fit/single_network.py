@@ -20,8 +20,9 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.initialisation import COARSE, Spectrum, spectral_start, wide_start
+from gnrecon.fit.initialisation import Spectrum, spectral_start, wide_start
 from gnrecon.fit.objective import FieldProblem, Scene, data_terms, start_terms, step_terms
+from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import (
     LBFGS,
@@ -57,18 +58,14 @@ class Stage:
     precision: torch.dtype
 
 
-STAGES = (
-    Stage(0.1, 2000, 1.0, torch.float32),
-    Stage(0.3, 6000, 1.0, torch.float32),
-    Stage(0.6, 15000, 30.0, torch.float32),
-    Stage(1.0, 15000, 1000.0, torch.float64),
-)
-
-POOL = 30000
-
-LEAST_POINTS_TO_HOLD_OUT, HELD_OUT = 1000, 20
-
-HELD_OUT_PATIENCE = 20
+def continuation_stages() -> tuple[Stage, ...]:
+    """Return the stages of a deep fit, measured in docs/research."""
+    return (
+        Stage(0.1, 2000, 1.0, torch.float32),
+        Stage(0.3, 6000, 1.0, torch.float32),
+        Stage(0.6, 15000, 30.0, torch.float32),
+        Stage(1.0, 15000, 1000.0, torch.float64),
+    )
 
 
 def fit_deep(
@@ -78,17 +75,21 @@ def fit_deep(
     rng: np.random.Generator,
     callback: Callback | None,
     advance: ProgressCallback = ignore_progress,
+    *,
+    parameters: SingleNetworkParameters = SingleNetworkParameters(),
 ) -> Solution:
-    """Fit a network of several hidden layers; `advance` is told when the start is made."""
+    """Fit a network of several hidden layers; `advance` is called when the start is solved."""
     steps = options.steps_for(len(scene.points))
-    fitted, held = hold_out(scene, rng)
+    fitted, held = hold_out(scene, rng, parameters=parameters)
     theta = spectral_start(field, fitted, lambda x, d, n: start_terms(fitted, options, rng, x, d, n), rng)
     advance(1.0)
     # Signing volume samples takes as long as a step, so that one pool serves for all of them.
-    pool = tuple(scene.tensor(values) for values in fitted.volume(POOL, rng))
+    pool = tuple(scene.tensor(values) for values in fitted.volume(parameters.pool_samples, rng))
+
+    stages = continuation_stages()
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
-        stage = next(stage for stage in STAGES if number <= stage.until * steps or stage is STAGES[-1])
+        stage = next((stage for stage in stages if number <= stage.until * steps), stages[-1])
         rows = torch.as_tensor(np.sort(rng.permutation(len(pool[0]))[: min(stage.rows, scene.volume_count)]))
         x, distance = (values[rows.to(values.device)] for values in pool)
         terms = step_terms(fitted, options, rng, (x, distance), stage.rows, stage.data_weight)
@@ -96,18 +97,23 @@ def fit_deep(
 
     optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True))
     # No stage may end early, because each one looks converged before the next raises the weight of the data.
-    stop = StopRule(steps, tolerance=0.0, patience=steps + 1, held_out_patience=HELD_OUT_PATIENCE)
+    stop = StopRule(steps, tolerance=0.0, patience=steps + 1, held_out_patience=parameters.held_out_patience_steps)
     check = None if held is None else _held_out_loss(field, held, options, rng)
     return optimiser.run(problem_at, theta, stop, callback, check)
 
 
-def hold_out(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Scene | None]:
+def hold_out(
+    scene: Scene,
+    rng: np.random.Generator,
+    *,
+    parameters: SingleNetworkParameters = SingleNetworkParameters(),
+) -> tuple[Scene, Scene | None]:
     """Return the scene with the points to fit, and that with those to check on, or None where there are too few."""
     count = len(scene.points)
-    if count < LEAST_POINTS_TO_HOLD_OUT:
+    if count < parameters.least_points_to_hold_out:
         return scene, None
     order = torch.as_tensor(rng.permutation(count)).to(scene.points.device)
-    held, fitted = (rows.sort().values for rows in order.tensor_split([count // HELD_OUT]))
+    held, fitted = (rows.sort().values for rows in order.tensor_split([count // parameters.held_out_one_in]))
     return _only(scene, fitted), _only(scene, held)
 
 
@@ -127,14 +133,12 @@ def _held_out_loss(
     return loss
 
 
-ENERGY = 0.3
-"""Error at which conjugate gradients stop: steps that the search shortens or bends anyway need no better ones."""
-
-
 # From the options' names to an optimiser.
 
 
-def optimiser_for(options: FitOptions, auto: Search) -> Optimiser:
+def optimiser_for(
+    options: FitOptions, auto: Search, *, krylov_tolerance: float = SingleNetworkParameters.krylov_tolerance
+) -> Optimiser:
     """Return the optimiser that the options name; `auto` is the search that suits the network's start."""
     if options.optimiser == "adam":
         return Adam()
@@ -146,12 +150,7 @@ def optimiser_for(options: FitOptions, auto: Search) -> Optimiser:
         "geodesic": GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True),
         "line": LogLineSearch(),
     }
-    return GaussNewton(searches[options.search], SOLVERS[options.solver](ENERGY))
-
-
-SUBSPACE_UNITS = 400
-
-MAX_STEP_POINTS = 4000
+    return GaussNewton(searches[options.search], SOLVERS[options.solver](krylov_tolerance))
 
 
 # One wide layer: a linear start, then steps in random subspaces.
@@ -167,17 +166,19 @@ def fit_wide(
     rng: np.random.Generator,
     callback: Callback | None,
     advance: ProgressCallback = ignore_progress,
-    spectrum: Spectrum = COARSE,
+    spectrum: Spectrum = Spectrum(),
+    *,
+    parameters: SingleNetworkParameters = SingleNetworkParameters(),
 ) -> Solution:
-    """Fit a network of one hidden layer; `advance` is told of the share of the start that is done."""
+    """Fit a network of one hidden layer; `advance` is called with the share of the start that is done."""
     theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng, spectrum, advance)
     whole = options.optimiser != "gn"
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
         del number
-        units = torch.as_tensor(np.sort(rng.permutation(field.widths[0])[:SUBSPACE_UNITS])).to(theta.device)
+        units = torch.as_tensor(np.sort(rng.permutation(field.widths[0])[: parameters.subspace_units])).to(theta.device)
         x, distance = (scene.tensor(values) for values in scene.volume(scene.volume_count, rng))
-        terms = step_terms(scene, options, rng, (x, distance), MAX_STEP_POINTS)
+        terms = step_terms(scene, options, rng, (x, distance), parameters.step_points)
         return FieldProblem(field, terms, theta, None if whole else (units, None))
 
     optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1.0))

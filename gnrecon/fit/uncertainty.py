@@ -30,18 +30,11 @@ from gnrecon.fit.fit_field import fit
 from gnrecon.fit.fit_options import FitOptions, normal_residual
 from gnrecon.fit.laplace_approximation import DataRows, Laplace, laplace
 from gnrecon.fit.objective import normal_weight
+from gnrecon.fit.parameters import UncertaintyParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.runtime.parallel import slices
-
-MOST_POINTS = 20_000
-"""Data points that count; more of them are thinned at random, so that sigma is rather too large."""
-
-BATCH = 8192
-
-LEAST_SLOPE = 0.1
-"""Of the field, whose gradient should have length one; near its critical points the first order says nothing."""
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)
@@ -57,10 +50,10 @@ class NetworkDeviation:
     rows: DataRows
     whitener: Tensor
 
-    def at(self, x: Float) -> Float:
+    def at(self, x: Float, *, batch_points: int = UncertaintyParameters.batch_points) -> Float:
         """Return the standard deviation of the network's value, of shape (N,), at x, of shape (N, 3)."""
         points = torch.as_tensor(x).to(self.rows.theta)
-        parts = [self._at(points[rows]) for rows in slices(len(points), BATCH)]
+        parts = [self._at(points[rows]) for rows in slices(len(points), batch_points)]
         return np.concatenate([np.zeros(0), *parts])
 
     def _at(self, x: Tensor) -> Float:
@@ -88,7 +81,14 @@ class Uncertainty:
     factor: float
 
     @classmethod
-    def of(cls, sdf: NeuralSDF, samples: Samples, seed: int = 0) -> Uncertainty:
+    def of(
+        cls,
+        sdf: NeuralSDF,
+        samples: Samples,
+        seed: int = 0,
+        *,
+        parameters: UncertaintyParameters = UncertaintyParameters(),
+    ) -> Uncertainty:
         """Return the uncertainty of a field that was fitted to `samples`.
 
         Parameters
@@ -105,9 +105,9 @@ class Uncertainty:
             When the matrix of the data cannot be factored, because it is not finite.
         """
         if sdf.detail is not None:
-            return replace(cls.of(_stand_in(sdf, samples), samples, seed), sdf=sdf)
+            return replace(cls.of(_stand_in(sdf, samples), samples, seed, parameters=parameters), sdf=sdf)
         rng = np.random.default_rng(seed)
-        chosen = np.sort(rng.permutation(len(samples))[:MOST_POINTS])
+        chosen = np.sort(rng.permutation(len(samples))[: parameters.most_points])
         points, normals = (
             torch.as_tensor(values[chosen]).to(sdf.theta) for values in (samples.points, samples.normals)
         )
@@ -115,17 +115,17 @@ class Uncertainty:
         weight = normal_weight(Density(samples.points).spacing)
         rows = DataRows(sdf.field, sdf.theta, points, normals, residual, weight)
         posterior = laplace(rows)
-        factor = calibration(rows, posterior, seed)
+        factor = calibration(rows, posterior, seed, parameters=parameters)
         deviation = NetworkDeviation(rows, posterior.whitener().float())
         return cls(sdf, deviation, posterior.noise * sdf.frame.scale, factor)
 
-    def sigma(self, points: npt.ArrayLike) -> Float:
+    def sigma(self, points: npt.ArrayLike, *, least_slope: float = UncertaintyParameters.least_slope) -> Float:
         """Return the standard deviation of the surface, of shape (N,), at points on it, of shape (N, 3); file units.
 
         Away from the surface it is that of the level set through the point.
         """
         x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        slope = np.maximum(np.linalg.norm(self.sdf.gradient(x), axis=1), LEAST_SLOPE)
+        slope = np.maximum(np.linalg.norm(self.sdf.gradient(x), axis=1), least_slope)
         sigma: Float = self.factor * self.sdf.frame.scale * self.deviation.at(self.sdf.frame.to_unit(x)) / slope
         return sigma
 
@@ -136,19 +136,8 @@ class Uncertainty:
 
 def _stand_in(sdf: NeuralSDF, samples: Samples) -> NeuralSDF:
     """Return one layer of features that is fitted to the same samples by a linear solve."""
-    asked = FitOptions(steps=0, seed=int(sdf.options.get("seed", 0)), device=str(sdf.theta.device))
-    return fit(samples, asked)[0]
-
-
-PATCHES = {1: 200, 8: 40, 40: 12}
-"""Number of patches of each number of points."""
-
-COVERED = 0.9545
-"""Share of a normal distribution within two standard deviations."""
-
-BATCH_POINTS = 240
-
-LEAST_REST = 1e-10
+    options = FitOptions(steps=0, seed=int(sdf.options.get("seed", 0)), device=str(sdf.theta.device))
+    return fit(samples, options)[0]
 
 
 # How far off a fit is where data is left out: its own check of its uncertainty, without any truth.
@@ -163,19 +152,26 @@ LEAST_REST = 1e-10
 # between points and errors across holes count alike.
 
 
-def calibration(data: DataRows, posterior: Laplace, seed: int = 0) -> float:
+def calibration(
+    data: DataRows,
+    posterior: Laplace,
+    seed: int = 0,
+    *,
+    parameters: UncertaintyParameters = UncertaintyParameters(),
+) -> float:
     """Return the factor, at least one, by which predicted standard deviations must grow to cover what was left out.
 
     With it, 95.45 % of the left-out positions lie within two standard deviations, or more where it is one; each size of
     patch has the same say.
     """
     rng = np.random.default_rng(seed)
-    sizes = [size for size in PATCHES if size == 1 or 5 * size <= len(data)]
-    scores = [np.abs(left_out_scores(data, posterior, size, PATCHES[size], rng)) for size in sizes]
+    patches = zip(parameters.patch_sizes, parameters.patch_counts, strict=True)
+    kept = [(size, count) for size, count in patches if size == 1 or 5 * size <= len(data)]
+    scores = [np.abs(left_out_scores(data, posterior, size, count, rng)) for size, count in kept]
     weights = np.concatenate([np.full(len(z), 1 / len(z)) for z in scores]) / len(scores)
     together = np.concatenate(scores)
     order = np.argsort(together)
-    place = int(np.searchsorted(np.cumsum(weights[order]), COVERED))
+    place = int(np.searchsorted(np.cumsum(weights[order]), parameters.coverage))
     return max(1.0, float(together[order[min(place, len(order) - 1)]]) / 2)
 
 
@@ -184,7 +180,7 @@ def left_out_scores(data: DataRows, posterior: Laplace, size: int, count: int, r
     points = data.points.cpu().numpy()
     centres = rng.permutation(len(points))[:count]
     patches = cKDTree(points).query(points[centres], list(range(1, size + 1)))[1]
-    several = max(1, BATCH_POINTS // size)
+    several = max(1, UncertaintyParameters.calibration_batch_points // size)
     return np.concatenate([_scores(data, posterior, patches[rows]) for rows in slices(len(patches), several)])
 
 
@@ -204,11 +200,11 @@ def _scores(data: DataRows, posterior: Laplace, patches: Int) -> Float:
     return torch.cat(found).cpu().numpy()
 
 
-def _without(half: Tensor) -> Tensor:
+def _without(half: Tensor, *, least_variance: float = UncertaintyParameters.least_residual_variance) -> Tensor:
     """Return (I - H)^-1, of shape (m, m), for H = A A^T with A of shape (m, p)."""
     # By eigenvectors, because rounding may take an eigenvalue of H, which is less than one, beyond one.
     values, vectors = torch.linalg.eigh(half @ half.T)
-    spread: Tensor = (vectors / (1.0 - values).clamp(LEAST_REST, 1.0)) @ vectors.T
+    spread: Tensor = (vectors / (1.0 - values).clamp(least_variance, 1.0)) @ vectors.T
     return spread
 
 

@@ -1,1 +1,1 @@
-"""Point clouds, meshes, frames and regions, and the arithmetic on them that knows no file and no fit."""
+"""Point clouds, meshes, frames, regions, local PCA and signed distances; knows no file and no fit."""

@@ -1,4 +1,4 @@
-"""Names for the kinds of arrays that annotations use; shapes and units stand in each docstring."""
+"""Aliases for array types in annotations; docstrings give shapes and units."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 Float = npt.NDArray[np.float64]
-"""Coordinates, distances and other measured values."""
+"""Coordinates, distances and other real values."""
 
 Int = npt.NDArray[np.integer]
 """Indices and counts, of any width: faces of shape (F, 3), rows of shape (N,), labels."""
 
 Mask = npt.NDArray[np.bool_]
-"""Which rows are meant, of shape (N,)."""
+"""A selection of rows, of shape (N,)."""
 
 Values = npt.NDArray[np.generic]
-"""Attributes of points or vertices, of shape (N,) or (N, K), of any type that a file may hold."""
+"""Attributes of points or vertices, of shape (N,) or (N, K), of any type that a file can store."""

@@ -1,4 +1,4 @@
-"""Triangle meshes, as plain arrays."""
+"""Triangle meshes as plain arrays, with areas, volume and vertex normals."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
-from gnrecon.runtime.parallel import slices
-
-FOLDED = math.radians(45.0)
-"""Angle from the area-weighted normal at which edge-weighted ones are no longer believed."""
 
 
 @dataclass(frozen=True)
@@ -23,18 +20,18 @@ class Mesh:
     Parameters
     ----------
     vertices : array of shape (V, 3)
-        Positions, in file units unless said otherwise.
+        Positions, in file units unless stated otherwise.
     faces : integer array of shape (F, 3)
         Rows of vertex indices.
     normals : array of shape (V, 3), optional
         Unit vertex normals, outward.
     attributes : mapping of name to array of shape (V,) or (V, C)
-        Whatever else is known of each vertex: ``colors`` (8-bit, 3 or 4 columns) and scalar fields.
+        Per-vertex attributes: ``colors`` (8-bit, 3 or 4 columns) and scalar fields.
 
     Raises
     ------
     InputError
-        When a shape does not fit or an index points outside of the vertices.
+        When array shapes do not match, or a face refers to a vertex that does not exist.
     """
 
     vertices: Float
@@ -65,7 +62,7 @@ class Mesh:
 
     @property
     def face_vectors(self) -> Float:
-        """Area vectors of the faces, of shape (F, 3): along the normal, as long as the area."""
+        """Area vectors of the faces, of shape (F, 3): along the normal, with the area as length."""
         vectors = np.empty((len(self.faces), 3))
         for rows in slices(len(self.faces)):
             vectors[rows] = area_vectors(self.vertices, self.faces[rows])
@@ -83,45 +80,49 @@ class Mesh:
             return 0.0
         total = 0.0
         for rows in slices(len(self.faces)):
-            # Measured from the mesh's own corner, because far-off coordinates would cancel badly.
+            # Relative to a vertex of the mesh, because coordinates far from the origin would cancel badly.
             a, b, c = np.moveaxis(self.vertices[self.faces[rows]] - self.vertices[0], 1, 0)
             total += float(np.einsum("ij,ij->", a, np.cross(b, c)))
         return total / 6.0
 
     @property
     def euler_characteristic(self) -> int:
-        """V - E + F over the vertices that faces use."""
+        """V - E + F, counting only vertices that belong to a face."""
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         return len(np.unique(self.faces)) - len(np.unique(edges, axis=0)) + len(self.faces)
 
     def vertex_normals(self) -> Float:
-        """Unit vertex normals, of shape (V, 3): the stored ones, else the area-weighted mean of the faces'."""
+        """Unit vertex normals, of shape (V, 3): the stored ones, or else area-weighted means of face normals."""
         if self.normals is not None:
             return self.normals
         return self._directions([self.face_vectors] * 3)
 
-    def smooth_normals(self) -> Float:
-        """Unit normals of the smooth surface that the vertices sample, of shape (V, 3): the stored ones, else by faces.
+    def smooth_normals(self, *, folded_degrees: float = 45.0) -> Float:
+        """Unit normals of the smooth surface through the vertices, of shape (V, 3): the stored ones, or from the faces.
 
-        A corner between edges a and b of its face adds a x b / (|a|^2 |b|^2). On a sphere that is exact however
-        irregular the faces, where area weights of a hull of random points are off by degrees; noise counts for more,
-        the shorter the edges. So where faces are folded, and the result is beyond `FOLDED` of the area-weighted normal,
-        that one is taken. Source: Max, Weights for computing vertex normals from facet normals (1999).
+        A corner between edges a and b of its face adds a x b / (|a|^2 |b|^2). On a sphere this is exact for faces of
+        any shape, where area weights are off by degrees. Source: Max, *Weights for Computing Vertex Normals from Facet
+        Normals* (1999). Short edges amplify noise, so the area-weighted normal is used where the two differ widely.
+
+        Parameters
+        ----------
+        folded_degrees : angle between the two normals from which the area-weighted one is used; only folded faces
+            bring smooth surfaces that far apart
         """
         by_area = self.vertex_normals()
         if self.normals is not None:
             return by_area
         corners = self.corners
         squares = np.square(np.roll(corners, -1, axis=1) - corners).sum(axis=2)
-        both = squares * np.roll(squares, 1, axis=1)  # of the edges after and before each corner
+        both = squares * np.roll(squares, 1, axis=1)  # edges after and before each corner
         both = np.maximum(both, np.finfo(np.float64).tiny)
         vectors = self.face_vectors
         normals = self._directions([vectors / both[:, corner, None] for corner in range(3)])
-        folded = np.einsum("ij,ij->i", normals, by_area) < math.cos(FOLDED)
+        folded = np.einsum("ij,ij->i", normals, by_area) < math.cos(math.radians(folded_degrees))
         return np.where(folded[:, None], by_area, normals)
 
     def _directions(self, additions: Sequence[Float]) -> Float:
-        """Return the vertices' sums, of unit length, of what the faces' first, second and third corners add, (F, 3)."""
+        """Return unit sums at the vertices of the vectors, (F, 3) each, of first, second and third corners of faces."""
         sums = np.zeros_like(self.vertices)
         for corner, added in enumerate(additions):
             np.add.at(sums, self.faces[:, corner], added)
@@ -133,12 +134,12 @@ class Mesh:
         return replace(self, vertices=vertices)
 
     def with_attributes(self, attributes: Mapping[str, Values]) -> Mesh:
-        """Return the same mesh with these attributes, each of V rows, added to what it carries."""
+        """Return the same mesh with these attributes, of V rows each, added to its own."""
         return replace(self, attributes={**self.attributes, **attributes})
 
 
 def area_vectors(vertices: Float, faces: Int) -> Float:
-    """Area vectors, of shape (F, 3), of faces of shape (F, 3): along the normal, as long as the area."""
+    """Area vectors, of shape (F, 3), of faces of shape (F, 3): along the normal, with the area as length."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     vectors: Float = 0.5 * np.cross(b - a, c - a)
     return vectors

@@ -1,4 +1,4 @@
-"""Point clouds and the frame that maps a file's coordinates to the unit ball and back."""
+"""Point clouds, the frame that maps them to the unit ball and back, and regions that select points."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class PointCloud:
     points : array of shape (N, 3)
         Positions, kept in float64 so that projected (UTM-sized) coordinates stay exact.
     normals : array of shape (N, 3), optional
-        Outward directions; not necessarily of unit length as read from a file.
+        Outward directions, not necessarily of unit length.
     attributes : mapping of name to array of shape (N,) or (N, C)
-        Whatever else the file carries for each point (colour, intensity, labels).
+        Other values per point, such as colour, intensity and labels.
     origins : array of shape (N, 3), optional
-        Where the scanner stood when it saw each point; rows of NaN where that is not known.
+        Position of the scanner that measured each point; rows of NaN where it is unknown.
 
     Raises
     ------
     InputError
-        When a shape does not fit.
+        When array shapes do not match.
     """
 
     points: Float
@@ -117,7 +117,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Samples:
-    """What a fit sees: unit-ball positions with unit normals, and the frame that leads back to the file.
+    """Input of a fit: positions in the unit ball with unit normals, and the frame that maps them back.
 
     Parameters
     ----------
@@ -125,9 +125,9 @@ class Samples:
     normals : array of shape (N, 3), outward, of length one
     frame : Frame
     held_out : Samples, optional
-        Points that were kept from the fit, so that it can be checked at them, in the same frame.
+        Validation points, which the fit does not use, in the same frame.
     estimated : bool
-        Whether the normals, or their sides, were estimated from the points, so that they may be wrong in places.
+        Whether the normals or their signs were estimated from the points and may be wrong in places.
     """
 
     points: Float
@@ -140,37 +140,33 @@ class Samples:
         return len(self.points)
 
 
-Box = tuple[Sequence[float], Sequence[float]]
-
-
-# The part of space whose points are wanted: within one of some boxes, and on the kept side of all clipping planes.
+BoxCorners = tuple[Sequence[float], Sequence[float]]
 
 
 @dataclass(frozen=True)
 class Region:
-    """Boxes and half-spaces, in file units.
+    """The part of space to keep: inside any of the boxes and on the positive side of all planes; in file units.
 
     Parameters
     ----------
-    boxes : pairs of a lower and an upper corner; a point is wanted that lies in any of them, borders included, and
-        where there are no boxes each is
-    planes : rows of four numbers a, b, c, d; of the wanted ones stay those with a x + b y + c z + d >= 0 for all rows
+    boxes : pairs of a lower and an upper corner, borders included; without boxes, all of space
+    planes : rows of four numbers a, b, c, d; points with a x + b y + c z + d >= 0 are kept
     """
 
-    boxes: tuple[Box, ...] = ()
+    boxes: tuple[BoxCorners, ...] = ()
     planes: tuple[Sequence[float], ...] = ()
 
     @property
     def everything(self) -> bool:
-        """Whether nothing is cut away."""
+        """Whether it is all of space."""
         return not self.boxes and not self.planes
 
     def holds(self, points: Float) -> Mask:
-        """Return the mask, of shape (N,), of wanted points; one that is not finite is not told to lie outside."""
-        wanted = np.full(len(points), not self.boxes)
+        """Return the mask, of shape (N,), of points inside; points that are not finite count as inside."""
+        inside = np.full(len(points), not self.boxes)
         for lower, upper in self.boxes:
-            wanted |= ~((points < np.asarray(lower)) | (points > np.asarray(upper))).any(axis=1)
+            inside |= ~((points < np.asarray(lower)) | (points > np.asarray(upper))).any(axis=1)
         for *normal, offset in self.planes:
             with np.errstate(invalid="ignore", over="ignore"):
-                wanted &= ~(points @ np.asarray(normal) + offset < 0)
-        return wanted | ~np.isfinite(points).all(axis=1)
+                inside &= ~(points @ np.asarray(normal) + offset < 0)
+        return inside | ~np.isfinite(points).all(axis=1)

@@ -1,13 +1,13 @@
-"""Where a field is sampled: in the volume, near the surface; and a coarse signed distance to supervise it there.
+"""Coarse signed distance to an oriented point cloud, and the points at which a field is sampled.
 
-The sign is that of the generalised winding number w(x) = sum_j a_j n_j . (p_j - x) / (4 pi |p_j - x|^3) of the cloud,
-with a_j the area that point j stands for: above one half means inside. It closes holes and open scans much as a soap
-film would, and is right wherever x is farther from the surface than the points are from each other, where the nearest
-normals often are not. Source: Barill et al., Fast Winding Numbers for Soups and Clouds (2018).
+The sign is that of the generalised winding number w(x) = sum_j a_j n_j . (p_j - x) / (4 pi |p_j - x|^3), with a_j the
+area that point j represents: x is inside where w > 1/2. Holes and open scans are closed much as by a soap film. The
+sign is right wherever x is farther from the surface than the points are from each other, where the sign by nearest
+normals often is not. Source: Barill et al., *Fast Winding Numbers for Soups and Clouds* (2018).
 
-The size follows from the distance d to the nearest point. A surface seen through points of which each stands for a
-disk of radius rho is nearer than they are: for random points the nearest one lies rho beside the foot of x in the root
-mean square, so that sqrt(d^2 - rho^2) is used. Samples nearer than 2 rho tell nothing and are left out.
+The size follows from the distance d to the nearest point. Where each point represents a disk of radius rho, the nearest
+point of a random sample lies rho away from the foot of x in the root mean square, so the distance to the surface is
+about sqrt(d^2 - rho^2). It is unknown within 2 rho of the points.
 """
 
 from __future__ import annotations
@@ -20,26 +20,8 @@ import numpy as np
 import torch
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.runtime.parallel import abreast, slices
-
-_SOURCES = 4000
-_NEIGHBOURS = 8
-
-_TOGETHER = 64
-"""Points whose winding numbers are summed at once: their terms stay in the processor's cache."""
-
-KNOWN = 2.0
-"""How far from the points a distance is known at least, in radii of the disk that the nearest one stands for."""
-
-CERTAIN = 0.25
-"""How far from one half a winding number is beyond doubt: across a hole it passes through one half slowly."""
-
-STEEPNESS = 0.3
-"""Least magnitude of a field in the free space, as a share of the distance from the surface."""
-
-
-LEAST_HALF = 4
-"""Points that `halved` leaves together: their order within says nothing."""
+from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
@@ -59,51 +41,62 @@ class Box:
         return rng.uniform(self.lower, self.upper, (count, 3))
 
 
-def halved(points: Float) -> Int:
+def kd_tree_order(points: Float, *, leaf_points: int = 4) -> Int:
     """Return an order of points, of shape (N, 3), in which any aligned run of 4, 8, 16 ... of them is a compact patch.
 
-    Groups are cut in half across their longest side until four are left, the first half of each a power of two.
+    It is the order of a balanced k-d tree: groups are halved across their longest side, the first half a power of two.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3)
+    leaf_points : size of the groups that are not halved further; the shortest runs in use are of four
     """
     points = np.asarray(points)
     rows = np.arange(len(points))
     order = rows
     size = 1 << max(len(points) - 1, 0).bit_length()
-    while size > LEAST_HALF:
+    while size > leaf_points:
         ordered, group = points[order], rows // size
         lower = np.minimum.reduceat(ordered, rows[::size])
         sides = np.maximum.reduceat(ordered, rows[::size]) - lower
         longest = sides.argmax(axis=1)
         place = (ordered - lower[group])[rows, longest[group]]
-        # The groups stay in their order, and points of a group are sorted along its side.
+        # The order of groups is kept; the points of each are sorted along its longest side.
         order = order[np.argsort(group + 0.5 * place / np.maximum(sides.max(axis=1), np.finfo(float).tiny)[group])]
         size //= 2
     return order
 
 
-def near_surface(points: Float, spread: float, count: int, rng: np.random.Generator) -> Float:
-    """Return `count` points, of shape (count, 3): data points moved by normal noise of standard deviation `spread`."""
+def sample_near_surface(points: Float, spread: float, count: int, rng: np.random.Generator) -> Float:
+    """Return `count` points, of shape (count, 3): data points plus normal noise of standard deviation `spread`."""
     return points[rng.integers(len(points), size=count)] + spread * rng.standard_normal((count, 3))
 
 
-def least_values(signed: Float, most: float) -> Float:
-    """Return what a field should be at least where the free space has signed distances, of shape (Q,), on its own side.
+def free_space_bounds(signed: Float, most: float, *, steepness: float = 0.3) -> Float:
+    """Return the least values, of shape (Q,), that a field should have in free space, with the sign of the distance.
 
-    No more than `most` is asked: what is far from the surface does not matter, as long as the sign is right.
+    Parameters
+    ----------
+    signed : signed distances, of shape (Q,)
+    most : upper limit of the magnitude: far from the surface only the sign matters
+    steepness : magnitude as a share of the distance, well below the slope 1 of a distance
     """
-    least: Float = np.sign(signed) * np.minimum(STEEPNESS * np.abs(signed), most)
-    return least
+    bounds: Float = np.sign(signed) * np.minimum(steepness * np.abs(signed), most)
+    return bounds
 
 
 @dataclass(frozen=True)
 class Density:
-    """How densely points lie; everything is found when it is first asked for.
+    """Local density of points; all properties are computed on first use.
 
     Parameters
     ----------
     points : array of shape (N, 3)
+    neighbours : number of neighbours that determine the area that a point represents
     """
 
     points: Float
+    neighbours: int = 8
 
     @cached_property
     def tree(self) -> Any:
@@ -114,58 +107,74 @@ class Density:
 
     @cached_property
     def spacing(self) -> float:
-        """Median distance from a point to its nearest neighbour."""
+        """Median distance between a point and its nearest neighbour."""
         return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
 
     @cached_property
     def disks(self) -> Float:
-        """Radius of the disk that each point stands for, of shape (N,): that of its k-th neighbour's, shared by k."""
-        k = min(_NEIGHBOURS, len(self.points) - 1)
+        """Radius of the disk that each point represents, of shape (N,): 1/k of the area up to its k-th neighbour."""
+        k = min(self.neighbours, len(self.points) - 1)
         radii: Float = self.tree.query(self.points, k + 1)[0][:, -1] / np.sqrt(k)
         return radii
 
     @cached_property
     def radius(self) -> float:
-        """Median of the disks' radii."""
+        """Median radius of the disks."""
         return float(np.median(self.disks))
 
 
 class CoarseDistance:
-    """Signed distance to a cloud, coarse, its sign reliable beyond the spacing of the points; negative inside.
+    """Approximate signed distance to a cloud, negative inside; its sign is reliable beyond the points' spacing.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
-    rng : draws the subset of at most 4,000 points that the winding number sums over
-    density : of the points, where it is known already
+    rng : draws the points that the winding number sums over
+    density : of the points, if it is known already
+    max_sources : number of these points at most, which bounds the cost of a sum
     """
 
-    def __init__(self, points: Float, normals: Float, rng: np.random.Generator, density: Density | None = None) -> None:
+    def __init__(
+        self,
+        points: Float,
+        normals: Float,
+        rng: np.random.Generator,
+        density: Density | None = None,
+        *,
+        max_sources: int = 4000,
+    ) -> None:
         self._density = density or Density(points)
         self.spacing = self._density.spacing
-        chosen = np.sort(rng.permutation(len(points))[:_SOURCES])
+        chosen = np.sort(rng.permutation(len(points))[:max_sources])
         self._sources = points[chosen]
         self._radii = Density(self._sources).disks
         self._dipoles = normals[chosen] * (self._radii**2 / 4)[:, None]
 
     def sample(self, x: Float) -> tuple[Float, Float]:
-        """Return those of the points x, of shape (Q, 3), where the distance is known, and the distances there."""
+        """Return the points among x, of shape (Q, 3), where the distance is known, and the distances there."""
         known, signed, *_ = self.at(x)
         return x[known], signed
 
-    def at(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float, Mask]:
-        """Return which of the points x, of shape (Q, 3), lie more than `clear` disks' radii from their nearest point.
+    def at(self, x: Float, clear: float = 2.0) -> tuple[Mask, Float, Float, Mask]:
+        """Return signed distances at those points x, of shape (Q, 3), where they are known.
 
-        Of these, in their order, follow the signed distances, those to the nearest point itself, and where the sign is
-        beyond doubt.
+        Parameters
+        ----------
+        x : array of shape (Q, 3)
+        clear : least distance to the nearest point, in radii of its disk; nearer by, sqrt(d^2 - rho^2) has large errors
+
+        Returns
+        -------
+        The mask, of shape (Q,), of these points; and for them the signed distances, the distances to the nearest data
+        point, and whether the sign is certain.
         """
         known, size, nearest = self.size(x, clear)
         winding = self.winding_number(x[known])
-        return known, side_of(winding) * size, nearest, is_certain(winding)
+        return known, sign_of_winding(winding) * size, nearest, is_sign_certain(winding)
 
-    def size(self, x: Float, clear: float = KNOWN) -> tuple[Mask, Float, Float]:
-        """Return the first three of `at`, but for the sign, which is what takes time."""
-        # One worker: with several, Ctrl-C unwinds while scipy's threads still use the arrays, and the process crashes.
+    def size(self, x: Float, clear: float = 2.0) -> tuple[Mask, Float, Float]:
+        """Return the first three results of `at` with unsigned distances, which is much faster."""
+        # One worker: with several, Ctrl-C frees arrays that scipy's threads still use, and the process crashes.
         nearest, rows = self._density.tree.query(x)
         disks = self._density.disks[rows]
         known = nearest > clear * disks
@@ -174,37 +183,41 @@ class CoarseDistance:
 
     def sign(self, x: Float) -> Float:
         """Return the sign of the distance, of shape (Q,), at x, of shape (Q, 3)."""
-        return side_of(self.winding_number(x))
+        return sign_of_winding(self.winding_number(x))
 
-    def winding_number(self, x: Float, batch: int = _TOGETHER) -> Float:
-        """Return w, of shape (Q,), at points x, of shape (Q, 3); each term is bounded within its own disk."""
-        # Of so few sources none has a disk for which single precision would not do.
+    def winding_number(self, x: Float, batch: int = 64) -> Float:
+        """Return w, of shape (Q,), at points x, of shape (Q, 3); see the function `winding_number`."""
+        # With so few sources, disks are large enough for single precision.
         return winding_number(x, self._sources, self._dipoles, self._radii, batch, torch.float32)
 
 
-def side_of(winding: Float) -> Float:
-    """Return the sign of the distance, of shape (Q,), that winding numbers tell: negative inside."""
+def sign_of_winding(winding: Float) -> Float:
+    """Return the sign of the distance, of shape (Q,), for winding numbers: negative inside."""
     return np.where(winding > 0.5, -1.0, 1.0)
 
 
-def is_certain(winding: Float) -> Mask:
-    """Return where winding numbers, of shape (Q,), tell the sign beyond doubt."""
-    return np.asarray(np.abs(winding - 0.5) > CERTAIN)
+def is_sign_certain(winding: Float, *, margin: float = 0.25) -> Mask:
+    """Return where winding numbers, of shape (Q,), determine the sign: where they differ from 1/2 by the margin.
+
+    Across a hole the winding number passes through 1/2 slowly; the margin is half of the way to 0 or 1.
+    """
+    return np.asarray(np.abs(winding - 0.5) > margin)
 
 
 def winding_number(
-    x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = _TOGETHER, dtype: torch.dtype = torch.float64
+    x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = 64, dtype: torch.dtype = torch.float64
 ) -> Float:
-    """Return the winding number w, of shape (Q,), that dipoles make at points x, of shape (Q, 3).
+    """Return the winding number w, of shape (Q,), of dipoles at points x, of shape (Q, 3).
 
     Parameters
     ----------
-    sources : array of shape (J, 3), where the dipoles are
-    dipoles : array of shape (J, 3), each a normal times the area that it stands for, over 4 pi
-    radii : array of shape (J,), of the disks of those areas, within which a term is bounded
-    batch : points that are asked for at once
-    dtype : that the terms are computed in; single precision is several times as fast, and does where radii are not
-        below 1e-3 of the coordinates
+    x : array of shape (Q, 3)
+    sources : array of shape (J, 3), positions of the dipoles
+    dipoles : array of shape (J, 3), each a normal times its area, over 4 pi
+    radii : array of shape (J,), of disks of these areas; within its disk a term is bounded
+    batch : points per matrix product; with 64 the terms fit into the processor's cache
+    dtype : of the terms; single precision is several times faster, and accurate enough for radii above 1e-3 of the
+        coordinates
     """
     # sum_j d_j . (p_j - x) / |p_j - x|^3, with the squares expanded so that both factors are matrix products.
     ones = np.ones(len(x))
@@ -221,7 +234,7 @@ def winding_number(
         flux = (some[:, [0, 1, 2, 4]] @ to_flux).mul_(near).mul_(near).mul_(near)
         found[rows] = flux.sum(dim=1).numpy()
 
-    abreast(fill, slices(len(x), batch))
+    map_in_threads(fill, slices(len(x), batch))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Counts of values in equal bins, with what lies beyond them on either side."""
+"""Histograms, a robust standard deviation, and the widest gap between directions."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from gnrecon.geometry.arrays import Float
 
 @dataclass(frozen=True)
 class Histogram:
-    """How values spread.
+    """Counts of values in equal bins.
 
     Parameters
     ----------
     low, high : float
-        Where the first bin begins and the last one ends, in the values' unit.
+        Lower end of the first bin and upper end of the last, in the values' unit.
     counts : tuple of float
-        Values, or their weight, in each of the equal bins; the last bin holds its upper end too.
+        Number of values, or their weight, in each bin; the last bin includes its upper end.
     below, above : float
-        Likewise for what lies outside of the bins.
+        The same for values outside of the bins.
     """
 
     low: float
@@ -40,7 +40,7 @@ class Histogram:
         bins: int = 48,
         weights: npt.NDArray[np.floating[Any]] | None = None,
     ) -> Histogram:
-        """Count `values`, of shape (N,), each as one or by its weight, of shape (N,); NaN is not counted."""
+        """Return the histogram of `values`, of shape (N,), with weights of shape (N,) or 1; NaN is not counted."""
         weights = np.ones(len(values)) if weights is None else weights
         counts = np.histogram(values, bins=bins, range=(low, high), weights=weights)[0]
         below, above = float(weights[values < low].sum()), float(weights[values > high].sum())
@@ -48,12 +48,12 @@ class Histogram:
 
     @property
     def edges(self) -> Float:
-        """Borders of the bins, of shape (bins + 1,)."""
+        """Edges of the bins, of shape (bins + 1,)."""
         return np.linspace(self.low, self.high, len(self.counts) + 1)
 
     @property
     def total(self) -> float:
-        """All that was counted, in the bins and beyond."""
+        """Sum of all counts, inside and outside of the bins."""
         return sum(self.counts) + self.below + self.above
 
     def as_dict(self) -> dict[str, Any]:
@@ -61,27 +61,21 @@ class Histogram:
         return {**asdict(self), "counts": list(self.counts)}
 
 
-# Statistics that a few outliers hardly move.
+def robust_deviation(residuals: Float) -> float:
+    """Return the standard deviation of centred residuals, of shape (N,), from their median absolute deviation.
 
-
-def deviation(off: Float) -> float:
-    """Return the standard deviation of what is off its middle, of shape (N,), by the median of its size.
-
-    It is that of a normal distribution of as large a median.
+    For a normal distribution the median of |r| is 0.6745 of the standard deviation; 1.4826 is the inverse.
     """
-    return 1.4826 * float(np.median(np.abs(off)))
-
-
-# Angles about an axis.
+    return 1.4826 * float(np.median(np.abs(residuals)))
 
 
 def widest_gap(directions: Float, axis: Float) -> float:
-    """Return the widest angle about an axis, of shape (3,), into which none of the directions looks, in radians.
+    """Return the widest angle about an axis, of shape (3,), that contains none of the directions, in radians.
 
     Parameters
     ----------
     directions : array of shape (N, 3)
-        Their parts along the axis do not matter; without any the whole circle is bare.
+        Their components along the axis are ignored; without directions the angle is a full turn.
     """
     if not len(directions):
         return 2 * np.pi

@@ -1,4 +1,7 @@
-"""Lengths as people write them: a plain number is in the file's unit; with a suffix, that unit must be known."""
+"""Parsers for lengths, boxes and planes in options.
+
+A plain number is in the file's unit; to convert a length with a unit, the file's own unit must be known.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,6 @@ from gnrecon.runtime.errors import UsageError
 
 METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 
-_LENGTH = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", re.IGNORECASE)
-
-_SPACINGS = re.compile(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*s\s*", re.IGNORECASE)
-
 
 def parse_length(text: str, units: str | None) -> float:
     """Return a length in the file's unit.
@@ -20,16 +19,16 @@ def parse_length(text: str, units: str | None) -> float:
     Parameters
     ----------
     text : such as ``2mm``, ``-0.5`` or ``1e-3 m``
-    units : the file's unit, a name of `METRES`, or None where it is not known
+    units : the file's unit, a name of `METRES`, or None where it is unknown
 
     Raises
     ------
     UsageError
-        When `text` is no length, a unit is unknown, or it has a suffix and the file's unit is not known.
+        When `text` is not a length, a unit is not supported, or the file's unit is needed but unknown.
     """
     if units is not None and units not in METRES:
         raise UsageError(f"The file's unit must be one of {', '.join(METRES)}, not {units!r}.")
-    match = _LENGTH.fullmatch(text)
+    match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", text, re.IGNORECASE)
     if match is None or not math.isfinite(float(match[1])):
         raise UsageError(f"{text!r} is not a length such as 0.5 or 2mm.")
     suffix = match[2].lower()
@@ -43,7 +42,7 @@ def parse_length(text: str, units: str | None) -> float:
 
 
 def parse_reach(text: str, spacing: float, units: str | None) -> float:
-    """Return a positive distance in the file's unit, which may be given in spacings of the points.
+    """Return a positive distance in the file's unit, from a length or a multiple of the points' spacing.
 
     Parameters
     ----------
@@ -54,9 +53,9 @@ def parse_reach(text: str, spacing: float, units: str | None) -> float:
     Raises
     ------
     UsageError
-        When it is no positive length, or none that can be converted.
+        When it is not a positive length, or cannot be converted.
     """
-    match = _SPACINGS.fullmatch(text)
+    match = re.fullmatch(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*s\s*", text, re.IGNORECASE)
     reach = float(match[1]) * spacing if match else parse_length(text, units)
     if not 0 < reach < math.inf:
         raise UsageError(f"{text!r} is not a positive distance such as 2.5, 2mm or 3s (spacings).")
@@ -64,12 +63,12 @@ def parse_reach(text: str, spacing: float, units: str | None) -> float:
 
 
 def parse_box(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return lower and upper corner of a box written as six numbers ``xmin,ymin,zmin,xmax,ymax,zmax``.
+    """Return the lower and the upper corner of a box written as six numbers ``xmin,ymin,zmin,xmax,ymax,zmax``.
 
     Raises
     ------
     UsageError
-        When these are not six finite numbers, or an upper one is not above its lower one.
+        When these are not six finite numbers, or an upper one does not exceed its lower one.
     """
     try:
         x, y, z, u, v, w = (float(part) for part in text.split(","))

@@ -1,19 +1,19 @@
-"""Damped linear least squares: Jacobians as operators, metrics, and solvers; knows no geometry."""
+"""Damped linear least squares: Jacobians as operators, metrics, and solvers. Independent of geometry."""
 
 from collections.abc import Callable
 
 from gnrecon.least_squares.auto import Auto
 from gnrecon.least_squares.direct import QR, Averaged, Cholesky, RowSpace
 from gnrecon.least_squares.iterative import Iterative
-from gnrecon.least_squares.jacobian import Block, DenseJacobian, Jacobian, LayeredJacobian
+from gnrecon.least_squares.jacobian import Block, DenseJacobian, Jacobian
 from gnrecon.least_squares.kronecker import Kronecker
-from gnrecon.least_squares.krylov import KrylovResult, conjugate_gradients, gmres, minres
+from gnrecon.least_squares.krylov import KrylovResult, conjugate_gradients
 from gnrecon.least_squares.layer_products import LayerRows
-from gnrecon.least_squares.neighbour_sums import Neighbours
+from gnrecon.least_squares.layered_jacobian import LayeredJacobian
+from gnrecon.least_squares.neighbour_sums import NeighbourSums
+from gnrecon.least_squares.paper_solvers import BlockJacobi, Nystrom, gmres
 from gnrecon.least_squares.preconditioners import (
-    BlockJacobi,
     Jacobi,
-    Nystrom,
     Preconditioner,
     Prepared,
     SampledGram,
@@ -38,16 +38,15 @@ SOLVERS: dict[str, Callable[..., LinearSolver]] = {
     "cg-jacobi": lambda energy=0.0: Iterative("cg", Jacobi(), energy=energy),
     "cg-block-jacobi": lambda energy=0.0: Iterative("cg", BlockJacobi(), energy=energy),
     "cg-nystrom": lambda energy=0.0: Iterative("cg", Nystrom(100), energy=energy),
-    "cg-neighbours": lambda energy=0.0: Iterative("cg", Neighbours(), energy=energy),
+    "cg-neighbours": lambda energy=0.0: Iterative("cg", NeighbourSums(), energy=energy),
     "cg-sampled": lambda energy=0.0: Iterative("cg", SampledGram(4000), energy=energy),
     "cg-kronecker": lambda energy=0.0: Iterative("cg", Kronecker(), energy=energy),
-    "minres": lambda energy=0.0: Iterative("minres", Jacobi()),  # noqa: ARG005
     "gmres": lambda energy=0.0: Iterative("gmres", Jacobi()),  # noqa: ARG005
     "sketched": lambda energy=0.0: Iterative("cg", Sketch(), energy=energy),
 }
-"""Makes each solver by its name.
+"""Creates each solver by its name.
 
-`energy` is where conjugate gradients stop, see `Iterative`; "cg-kronecker" needs a `LayeredJacobian`.
+`energy` is the stopping tolerance of conjugate gradients, see `Iterative`; "cg-kronecker" needs a `LayeredJacobian`.
 """
 
 __all__ = [
@@ -69,7 +68,7 @@ __all__ = [
     "LayeredJacobian",
     "LinearSolver",
     "Metric",
-    "Neighbours",
+    "NeighbourSums",
     "Nystrom",
     "Preconditioner",
     "Prepared",
@@ -83,5 +82,4 @@ __all__ = [
     "jacobian_layer_scaled",
     "jacobian_scaled",
     "layer_scaled",
-    "minres",
 ]

@@ -10,8 +10,6 @@ from torch import Tensor
 from gnrecon.least_squares.jacobian import Jacobian
 from gnrecon.least_squares.system import Equations, Linearisation, Metric, Step
 
-INDEFINITE = "The damped matrix is not positive definite; a larger damping may help."
-
 
 @dataclass(frozen=True)
 class NormalSystem(Linearisation):
@@ -27,7 +25,7 @@ class NormalSystem(Linearisation):
             return equations.failed(obstacle)
         factor = self._factor(damping, lambda: damped_factor(self.product, damping * equations.metric))
         if factor is None:
-            return equations.failed(INDEFINITE)
+            return equations.indefinite()
         return equations.step(solve_factored(factor, -equations.gradient), damping)
 
 
@@ -51,7 +49,7 @@ class Cholesky:
 def damped_factor(product: Tensor, diagonal: Tensor, overwrite: bool = False) -> Tensor | None:
     """Return the lower Cholesky factor of `product` + diag(`diagonal`), or None where that is not positive definite.
 
-    With `overwrite`, `product` is not kept as it was, which spares a copy.
+    With `overwrite`, `product` is changed in place, which saves a copy.
     """
     damped = product if overwrite else product.clone()
     damped.diagonal().add_(diagonal)
@@ -69,8 +67,8 @@ def solve_factored(factor: Tensor, right: Tensor) -> Tensor:
 
 # Least squares by QR, without squaring the condition number.
 #
-# J = Q R is reduced chunk by chunk: R <- qr([R; chunk]), and the residual beside it as one more column, so that Q^T r
-# comes out too and J is never held. For each damping, [R; sqrt(damping D)] is reduced once more; its R' gives R'^T R' =
+# J = Q R is reduced chunk by chunk: R <- qr([R; chunk]), with the residual as one more column, which gives Q^T r.
+# J is never stored. For each damping, [R; sqrt(damping D)] is reduced once more; its R' gives R'^T R' =
 # J^T J + damping D, and R' s = -Q'^T (Q^T r, 0). Source: Demmel, Grigori, Hoemmen, Langou, Communication-optimal
 # parallel and sequential QR (2012); the paper solves its normal equations by QR as well, on the square matrix J^T J +
 # damping I.
@@ -78,7 +76,7 @@ def solve_factored(factor: Tensor, right: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class ReducedSystem(Linearisation):
-    """R and Q^T r beside each other, of shape (min(M, p + 1), p + 1)."""
+    """The matrix [R, Q^T r], of shape (min(M, p + 1), p + 1)."""
 
     reduced: Tensor
 
@@ -106,7 +104,7 @@ class ReducedSystem(Linearisation):
         below = torch.cat([torch.diag((damping * metric).sqrt()), self.reduced.new_zeros(p, 1)], 1)
         full = torch.linalg.qr(torch.cat([self.reduced, below]), mode="r").R
         diagonal = full.diagonal()[:p].abs()
-        # A column that depends on those before it leaves a zero, or what rounding made of it, on the diagonal.
+        # A column that is linearly dependent on those before it leaves a zero, up to rounding, on the diagonal.
         lengths = torch.linalg.vector_norm(full[:, :p], dim=0)
         return full if bool((diagonal > torch.finfo(full.dtype).eps * lengths).all()) else None
 
@@ -169,7 +167,7 @@ class RowSystem(Linearisation):
         right = equations.residual
         factor = self._factor(damping, lambda: damped_factor(self.kernel, torch.full_like(right, damping)))
         if factor is None:
-            return equations.failed(INDEFINITE)
+            return equations.indefinite()
         dual = solve_factored(factor, -right)
         return equations.step(equations.jacobian.tmv(dual) / equations.metric, damping)
 
@@ -206,11 +204,11 @@ def constant_on_groups(metric: Tensor, jacobian: Jacobian) -> bool:
     return all(bool((part == part[0]).all()) for part in parts)
 
 
-# Normal equations whose matrix is averaged over steps: for points that are drawn afresh at each.
+# Normal equations with a matrix averaged over steps, for points that are resampled at each step.
 #
-# Where there are few more rows than parameters, J^T J of one draw tells nothing of some directions, and a step runs off
-# along them. From step to step the matrix of all rows changes little, so the mean over the last few steps, which costs
-# nothing more, stands for several times as many rows. The gradient is that of the step's own rows.
+# If there are few more rows than parameters, J^T J of one sample is nearly singular, and steps along its null space
+# become too long. The expected matrix changes little from step to step, so the mean over the last few steps is as good
+# as that of several times as many rows, at no cost. The gradient is that of the current rows.
 #
 # Source: the averaged curvature of stochastic natural-gradient methods, such as Martens and Grosse, Optimizing neural
 # networks with Kronecker-factored approximate curvature (2015), section 5.
@@ -222,7 +220,7 @@ class Averaged:
 
     Parameters
     ----------
-    keep : share of the former mean in the new one, below 1; among the first steps each counts alike
+    keep : weight of the previous mean in the new one, below 1; the first steps have equal weights
     """
 
     keep: float = 0.8
@@ -230,7 +228,7 @@ class Averaged:
     _steps: int = field(default=0, init=False, repr=False)
 
     def linearise(self, jacobian: Jacobian, residual: Tensor, metric: Metric) -> NormalSystem:
-        """Assemble J^T J, and take it into the mean."""
+        """Assemble J^T J and update the mean."""
         product = jacobian.gram()
         if self._mean is None or self._mean.shape != product.shape:
             self._mean, self._steps = product, 0

@@ -6,13 +6,12 @@ is given, the other that makes |G - B (x) A|_F least is
 
     A = sum_n M_n^T B M_n / |B|_F^2,        B = sum_n M_n A M_n^T / |A|_F^2,
 
-and a few turns of this find the best pair, as a power iteration on G with its indices in the order of Van Loan and
-Pitsianis (Approximation with Kronecker products, 1993). The M_n are never formed: with C = l.B l and so on, row by
-row,
+and a few alternations find the best pair, as a power iteration on G with its indices in the order of Van Loan and
+Pitsianis (Approximation with Kronecker products, 1993). The M_n are never formed: with l.B l and so on, row by row,
 
     sum_n M_n^T B M_n = i^T diag(l.B l) i + i^T diag(l.B r) t + t^T diag(r.B l) i + t^T diag(r.B r) t.
 
-Where there are many rows, sums over some of them, drawn by their lengths (see `linalg.draw`), stand for those over all.
+If there are many rows, the sums are estimated from rows sampled by length (see `preconditioners.draw_rows`).
 With A = Q_a a Q_a^T and B = Q_b b Q_b^T the inverse of B (x) A + mu I is exact and cheap,
 
     V -> Q_b [(Q_b^T V Q_a) / (b a^T + mu)] Q_a^T.
@@ -30,10 +29,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gnrecon.least_squares.jacobian import Block, Jacobian, LayeredJacobian
+from gnrecon.least_squares.jacobian import Block, Jacobian
 from gnrecon.least_squares.krylov import Apply
 from gnrecon.least_squares.layer_products import LayerRows
-from gnrecon.least_squares.preconditioners import draw, positive
+from gnrecon.least_squares.layered_jacobian import LayeredJacobian
+from gnrecon.least_squares.preconditioners import draw_rows, positive
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Kronecker:
         """
         if not isinstance(jacobian, LayeredJacobian):
             raise ValueError(
-                "Kronecker factors are made of a layered Jacobian's outer products, which this one has not."
+                "Kronecker factors need the outer products of a layered Jacobian, which this Jacobian does not have."
             )
         blocks = self._blocks(jacobian, generator)
         widths = [layer.left.shape[1] for layer in blocks[0]]
@@ -100,7 +100,7 @@ class Kronecker:
     def _blocks(self, jacobian: LayeredJacobian, generator: torch.Generator) -> list[Block]:
         if jacobian.rows <= self.rows:
             return list(jacobian.blocks())
-        drawn, scales = draw(jacobian, self.rows, generator)
+        drawn, scales = draw_rows(jacobian, self.rows, generator)
         blocks: list[Block] = []
         start = 0
         for block in jacobian.sample(drawn).blocks():
@@ -115,7 +115,7 @@ class Kronecker:
 
 
 Sides = tuple[list[Tensor], list[Tensor]]
-"""The vectors of a layer's outer products that a given factor applies to, and those that the wanted one is made of."""
+"""The vectors of a layer's outer products on the side of the given factor, and those on the side of the other one."""
 
 
 def _by_outputs(layer: LayerRows) -> Sides:

@@ -1,4 +1,4 @@
-"""One layer's share of Jacobian rows as sums of outer products, and what can be done without multiplying them out.
+"""One layer's columns of Jacobian rows as sums of outer products, and products with them that never form the rows.
 
 Row n is  l_n (i_n, 1)^T + r_n (t_n, 0)^T,  an (out, in + 1) matrix laid out as the weights row by row and then the
 biases; rows of second derivatives have further pairs r, t. With V and b the same layout of a vector v:
@@ -89,7 +89,7 @@ class LayerRows:
         out, into = self.left.shape[1], self.inputs.shape[1]
         weights = block[:, : out * into].view(len(block), out, into)
         if self.further:
-            # One small product a row passes over the block once, where sums of outer products pass over it each time.
+            # One small product per row passes over the block once; adding outer products would pass over it for each.
             lefts, rights = self._stacked
             torch.bmm(lefts.mT, rights, out=weights)
         else:
@@ -121,7 +121,7 @@ class LayerRows:
         out, into = self.left.shape[1], self.inputs.shape[1]
         weights = v[: out * into].view(out, into)
         if self.further:
-            # One product for all pairs; where there are two, stacking them costs more than it spares.
+            # One product for all pairs; for a single pair, stacking would cost more than it saves.
             lefts, rights = self._stacked
             product = (rights.flatten(0, 1) @ weights.T).view_as(lefts)
             product[:, 0] += v[out * into :]
@@ -193,29 +193,28 @@ def _runs(rows: int, length: int) -> list[tuple[slice, int, slice]]:
     return [(part, run, place) for part, run, place in parts if part.stop > part.start]
 
 
-BLOCK = 192
-
-
 # Accumulating J^T J from chunks of rows, as a symmetric rank-k update.
 #
-# Only the blocks on and below the diagonal are multiplied, which halves the work of a full product and reaches the
-# matrix-product rate of the device; J itself is never held.
+# Only the blocks on and below the diagonal are computed, which halves the work of a full product at the same rate. J
+# itself is never stored.
 
 
-def gram(chunks: Iterable[Tensor], size: int, like: Tensor) -> Tensor:
+def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: int = 192) -> Tensor:
     """Return J^T J, of shape (size, size), its lower triangle valid, summed in `like`'s precision and on its device.
 
     Parameters
     ----------
-    chunks : J's rows, of shape (m, size); products of chunks in a lower precision are made in theirs, which is faster,
-        and only their sums are kept in `like`'s
+    chunks : J's rows, of shape (m, size); a chunk in lower precision is multiplied in that precision, which is faster,
+        and only the sums have that of `like`
     size : number of columns of J
     like : tensor whose dtype and device are used
+    block_columns : columns of a block; large enough for fast matrix products, and small enough that little is computed
+        above the diagonal
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
     for rows in chunks:
-        for start in range(0, size, BLOCK):
-            stop = min(start + BLOCK, size)
+        for start in range(0, size, block_columns):
+            stop = min(start + block_columns, size)
             place = product[start:stop, :stop]
             if rows.dtype == like.dtype:
                 place.addmm_(rows[:, start:stop].T, rows[:, :stop])

@@ -1,8 +1,8 @@
-"""What every linear solver offers: linearise once, then solve for as many dampings as a search asks for.
+"""The interface of linear solvers: linearise once, then solve for any number of dampings.
 
 A Gauss-Newton step minimises |r + J s|^2 + damping |s|_D^2, so that  (J^T J + damping D) s = -g  with g = J^T r. Its
 predicted decrease of the loss |r|^2 / 2 is  -s.g - |J s|^2 / 2. With the residual of the solve, rho = -g - (J^T J +
-damping D) s, it equals (damping |s|_D^2 - s.g + s.rho) / 2, which is free of cancellation and needs no product with J.
+damping D) s, it equals (damping |s|_D^2 - s.g + s.rho) / 2, which avoids cancellation and needs no product with J.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gnrecon.least_squares.jacobian import Jacobian
 class Step:
     """A damped step, of shape (p,), and the decrease of the loss that the linear model predicts for it.
 
-    Where there is none, `failure` says why in a sentence, and the direction is zero.
+    If there is no step, `failure` says why in a sentence, and the direction is zero.
     """
 
     direction: Tensor
@@ -45,9 +45,9 @@ class DampedSystem(Protocol):
         ...
 
     def solve(self, damping: float, residual: Tensor | None = None) -> Step:
-        """Return the step for a damping, or that of other residuals, of shape (M,), in the place of r.
+        """Return the step for a damping, with other residuals, of shape (M,), in place of r if given.
 
-        It never raises for want of a solution.
+        It does not raise if there is no solution; see `Step.failure`.
         """
         ...
 
@@ -60,13 +60,13 @@ class LinearSolver(Protocol):
         ...
 
     def describe(self) -> str:
-        """Return what this solver does, and if it chose, why, in a sentence."""
+        """Return the name of the method, and why it was chosen if it was, in a sentence."""
         ...
 
 
 @dataclass(frozen=True)
 class Equations:
-    """What the solvers have in common: J, r, g and D, and how a solution becomes a step."""
+    """The data of a system, J, r, g and D, and the conversion of a solution to a step."""
 
     jacobian: Jacobian
     residual: Tensor
@@ -95,7 +95,7 @@ class Equations:
         return replace(self, residual=residual, gradient=self.jacobian.tmv(residual))
 
     def obstacle(self, damping: float) -> str | None:
-        """Return why no step can be had whatever the solver, or None."""
+        """Return why no solver can find a step, or None."""
         if self.jacobian.rows == 0:
             return "There are no residuals to lower."
         if self.gradient.numel() == 0:
@@ -107,7 +107,7 @@ class Equations:
         return None
 
     def step(self, solution: Tensor, damping: float, rest: Tensor | None = None, iterations: int = 0) -> Step:
-        """Return the step of a solution, of shape (p,), whose equations are left with `rest` (rho, by default 0)."""
+        """Return the step of a solution, of shape (p,), with the residual `rest` (rho, by default 0)."""
         if not bool(torch.isfinite(solution).all()):
             return self.failed("The solution is not finite.")
         twice = damping * (self.metric * solution) @ solution - solution @ self.gradient
@@ -115,16 +115,20 @@ class Equations:
             twice = twice + solution @ rest
         return Step(solution, 0.5 * float(twice), iterations)
 
+    def indefinite(self) -> Step:
+        """Return a zero step for a damped matrix without a Cholesky factor."""
+        return self.failed("The damped matrix is not positive definite; a larger damping may help.")
+
     def failed(self, sentence: str, iterations: int = 0) -> Step:
-        """Return no step, and why."""
+        """Return a zero step with the reason."""
         return Step(torch.zeros_like(self.gradient), 0.0, iterations, sentence)
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """A system as its equations; the solvers add what they made of J.
+    """The base of the solvers' systems.
 
-    The factor of the last damping is kept, for other residuals at the same damping.
+    The factor of the last damping is cached, for other residuals at the same damping.
     """
 
     equations: Equations
@@ -145,13 +149,8 @@ class Linearisation:
 Metric = Callable[[Jacobian], Tensor]
 """Gives D's diagonal, of shape (p,), positive."""
 
-SHARE = 0.1
-"""What a parameter's unit has of its layer's, beside its own."""
-
-
-# What a damping is measured in: diagonal metrics D of the parameters.
-#
-# A damped step minimises |r + J s|^2 + damping |s|_D^2 with |s|_D^2 = s.D s.
+# Diagonal metrics D of the parameters, in which the damping is measured: a damped step minimises
+# |r + J s|^2 + damping |s|_D^2  with  |s|_D^2 = s.D s.
 
 
 def identity(jacobian: Jacobian) -> Tensor:
@@ -160,7 +159,7 @@ def identity(jacobian: Jacobian) -> Tensor:
 
 
 def jacobian_scaled(jacobian: Jacobian) -> Tensor:
-    """Damp in units of J^T J's diagonal (Marquardt), with a floor for parameters that no residual sees."""
+    """Damp in units of J^T J's diagonal (Marquardt), with a floor for parameters that no residual depends on."""
     diagonal = jacobian.diagonal()
     return _bounded(diagonal)
 
@@ -168,20 +167,20 @@ def jacobian_scaled(jacobian: Jacobian) -> Tensor:
 def layer_scaled(jacobian: Jacobian) -> Tensor:
     """Damp each layer in units of the mean of its part of J^T J's diagonal, with a floor as above.
 
-    Layers differ by orders of magnitude in how much the field answers to them, the parameters within a layer do not.
+    The sensitivity of the field differs by orders of magnitude between layers, but not within a layer.
     """
     return _bounded(_layer_means(jacobian, jacobian.diagonal()))
 
 
-def jacobian_layer_scaled(jacobian: Jacobian) -> Tensor:
-    """Damp in units of J^T J's diagonal, to each of which a tenth of its layer's mean is added.
+def jacobian_layer_scaled(jacobian: Jacobian, *, layer_share: float = 0.1) -> Tensor:
+    """Damp in units of J^T J's diagonal plus `layer_share` times the mean over the layer.
 
-    In units of the diagonal alone, parameters that the residuals hardly see yet move beyond where the linear model
-    holds, and the damping must rise for all; with units of layers alone, late steps are shorter
-    (docs/research/2026-11-23-learning-scans.md).
+    With the diagonal alone, parameters to which the residuals are not yet sensitive move beyond the range of the linear
+    model, and the damping must rise for all; with layer means alone, late steps are shorter. The share is measured, see
+    docs/research/2026-11-23-learning-scans.md.
     """
     diagonal = jacobian.diagonal()
-    return _bounded(diagonal + SHARE * _layer_means(jacobian, diagonal))
+    return _bounded(diagonal + layer_share * _layer_means(jacobian, diagonal))
 
 
 def _layer_means(jacobian: Jacobian, diagonal: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Moving level sets: even samples of them, distances to known surfaces, transport, and connectedness."""
+"""Level sets: sampling, distances to known surfaces, transport of residuals, and connectedness."""
 
 from gnrecon.level_set.known_surfaces import (
     ChamferDivergence,
@@ -9,23 +9,32 @@ from gnrecon.level_set.known_surfaces import (
     cone,
     enneper,
 )
+from gnrecon.level_set.lagged_worker import LaggedWorker
 from gnrecon.level_set.level_set import LevelSet, Value, ValueAndGradient
+from gnrecon.level_set.newton_projection import Projection, nearest, project
 from gnrecon.level_set.sampling import SurfaceSample, sample_surface
-from gnrecon.level_set.surface_search import Beside, Crossings, Projection, find_crossings, nearest, project
-from gnrecon.level_set.topology import Joints, Region, Separate, joints, refined, separate_components
+from gnrecon.level_set.surface_search import Crossings, find_crossings
+from gnrecon.level_set.topology import (
+    ConnectionTargets,
+    GridRegion,
+    SeparateComponents,
+    joints,
+    refined,
+    separate_components,
+)
 from gnrecon.level_set.transport import derivative_along, transported
 
 __all__ = [
-    "Beside",
     "ChamferDivergence",
+    "ConnectionTargets",
     "Crossings",
-    "Joints",
+    "GridRegion",
     "KnownSurface",
+    "LaggedWorker",
     "LevelSet",
     "ParametricSurface",
     "Projection",
-    "Region",
-    "Separate",
+    "SeparateComponents",
     "SurfaceSample",
     "Value",
     "ValueAndGradient",

@@ -1,4 +1,4 @@
-"""The surfaces that the paper's problems have for their solutions, as far as they are known in closed form.
+"""The solutions of the paper's problems that are known in closed form, and the Chamfer divergence from them.
 
 The catenoid (cosh z cos t, cosh z sin t, z), |z| <= 1, is the minimal surface between its two circles of radius
 cosh 1. Enneper's surface
@@ -21,12 +21,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.level_set.level_set import LevelSet
+from gnrecon.level_set.newton_projection import nearest
 from gnrecon.level_set.sampling import SurfaceSample, sample_surface
-from gnrecon.level_set.surface_search import nearest
-
-ENNEPER_RADIUS = 0.9
-
-CONE_RADII = (1.0, 0.4)
 
 Profile = Callable[[Tensor], Tensor]
 
@@ -36,14 +32,13 @@ def catenoid() -> ParametricSurface:
     return _revolved(torch.cosh, torch.sinh, -1.0, 1.0)
 
 
-def cone() -> ParametricSurface:
-    """Return the mantle of the truncated cone between z = 0 and 1, with parameters (t, z)."""
-    base, top = CONE_RADII
+def cone(base: float = 1.0, top: float = 0.4) -> ParametricSurface:
+    """Return the mantle of a truncated cone with the radii `base` at z = 0 and `top` at z = 1; parameters (t, z)."""
     return _revolved(lambda z: base + (top - base) * z, lambda z: torch.full_like(z, top - base), 0.0, 1.0)
 
 
-def enneper(radius: float = ENNEPER_RADIUS) -> ParametricSurface:
-    """Return Enneper's surface over the disk of a radius, below sqrt(3), where it does not meet itself."""
+def enneper(radius: float = 0.9) -> ParametricSurface:
+    """Return Enneper's surface over a disk; below a radius of sqrt(3) it does not intersect itself."""
 
     def position(p: Tensor) -> Tensor:
         u, v = p.unbind(1)
@@ -82,29 +77,19 @@ def _revolved(radius: Profile, slope: Profile, low: float, high: float) -> Param
     return ParametricSurface(position, tangents, parameters, lambda p: (p[:, 1] >= low) & (p[:, 1] <= high))
 
 
-# What a level set can be measured against: a surface that can be sampled, and whose nearest points are found.
-
-
 class KnownSurface(Protocol):
-    """A surface, or a patch of one, that is known."""
+    """A known surface, or a patch of one, to compare a level set with."""
 
     def sample(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return about `count` points, of shape (M, 3), and the share of the area that each stands for, (M,)."""
+        """Return about `count` points, of shape (M, 3), and the share of the area that each represents, (M,)."""
         ...
 
     def nearest(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest points, of shape (N, 3), to queries, (N, 3), and whether they are of the patch, (N,)."""
+        """Return the nearest points, of shape (N, 3), to queries, (N, 3), and whether they are in the patch, (N,)."""
         ...
 
 
-_STARTS = 20_000
-
-_ITERATIONS = 60
-
-_GOLDEN = (5**0.5 - 1) / 2
-
-
-# Surfaces that are known by a chart: points by area, and the nearest point, found in the chart's own parameters.
+# Parametric surfaces: sampling by area, and nearest points, found in the parameters.
 #
 # The nearest point X(u) to q minimises |X(u) - q|^2 / 2 over the parameters u. With the tangents T = dX/du, of shape
 # (3, 2), Gauss-Newton steps solve
@@ -112,8 +97,8 @@ _GOLDEN = (5**0.5 - 1) / 2
 #     (T^T T + m tr(T^T T) I) du = T^T (q - X),
 #
 # with a damping m for each point that falls while the distance does and rises when it does not (Levenberg-Marquardt).
-# They start at the nearest of many points of the surface, so that they find the nearest point and not just a near one;
-# to a query at distance d they contract by d x curvature, which for surfaces that agree is all but zero.
+# They start at the nearest of many sampled points, so that they find the global minimum. For a query at distance d they
+# contract by d x curvature, which is nearly zero for surfaces that agree.
 
 
 @dataclass(frozen=True)
@@ -124,7 +109,7 @@ class ParametricSurface:
     ----------
     position : X of parameters of shape (N, 2), of shape (N, 3); also somewhat beyond the patch
     tangents : dX/du, of shape (N, 3, 2)
-    parameters : takes the unit square, (N, 2), to the patch's parameters, (N, 2), by a constant factor of area
+    parameters : maps the unit square, (N, 2), to the patch's parameters, (N, 2), with a constant factor of area
     inside : whether parameters belong to the patch, of shape (N,)
     """
 
@@ -134,19 +119,24 @@ class ParametricSurface:
     inside: Callable[[Tensor], Tensor]
 
     def sample(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return points of the patch, of shape (count, 3), and the share of its area that each stands for, (count,)."""
-        parameters = self._spread(count)
+        """Return points of the patch, of shape (count, 3), and the share of the area of each, of shape (count,)."""
+        parameters = self._lattice(count)
         t = self.tangents(parameters)
         areas = torch.linalg.vector_norm(torch.linalg.cross(t[:, :, 0], t[:, :, 1]), dim=1)
         return self.position(parameters), areas / areas.sum()
 
-    def nearest(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest points, of shape (N, 3), of the surface to queries, (N, 3), and whether in the patch."""
+    def nearest(self, queries: Tensor, *, iterations: int = 60) -> tuple[Tensor, Tensor]:
+        """Return the nearest points, of shape (N, 3), of the surface to queries, (N, 3), and whether in the patch.
+
+        Parameters
+        ----------
+        iterations : Levenberg-Marquardt steps
+        """
         u = self._starts(queries)
         position = self.position(u)
         square = (position - queries).square().sum(1)
         damping = torch.full_like(square, 1e-3)
-        for _ in range(_ITERATIONS):
+        for _ in range(iterations):
             tried = u + self._step(u, queries - position, damping)
             new_position = self.position(tried)
             new_square = (new_position - queries).square().sum(1)
@@ -166,24 +156,20 @@ class ParametricSurface:
         step: Tensor = torch.linalg.solve(damped, t.mT @ toward[:, :, None])[:, :, 0]
         return step
 
-    def _starts(self, queries: Tensor) -> Tensor:
-        """Return the parameters, of shape (N, 2), of the nearest among many points of the patch."""
+    def _starts(self, queries: Tensor, samples: int = 20_000) -> Tensor:
+        """Return the parameters, of shape (N, 2), of the nearest of so many points of the patch."""
         from scipy.spatial import cKDTree
 
-        parameters = self._spread(_STARTS)
+        parameters = self._lattice(samples)
         nearest = cKDTree(self.position(parameters).numpy()).query(queries.numpy())[1]
         return parameters[torch.as_tensor(nearest)]
 
-    def _spread(self, count: int) -> Tensor:
-        """Return parameters, of shape (count, 2), spread over the patch by the golden ratio's lattice."""
+    def _lattice(self, count: int) -> Tensor:
+        """Return parameters, of shape (count, 2), evenly distributed over the patch by the golden-ratio lattice."""
+        golden = (5**0.5 - 1) / 2
         number = np.arange(count)
-        square = np.stack([(number + 0.5) / count, (number * _GOLDEN) % 1.0], axis=1)
+        square = np.stack([(number + 0.5) / count, (number * golden) % 1.0], axis=1)
         return self.parameters(torch.as_tensor(square))
-
-
-_COUNT = 4000
-
-_CURVE_STARTS = 10_000
 
 
 # The paper's Chamfer divergence between a level set and a known surface, by projection.
@@ -192,26 +178,27 @@ _CURVE_STARTS = 10_000
 #
 #     CD_1(P, Q)^2 = (1 / |Q|) sum over x in Q of min over y in P of |x - y|^2
 #
-# and finds the nearest y not among samples of P, whose spacing would drown the result, but by projecting x onto P. Here
-# P is the level set and Q the known surface, of which points with their shares of the area stand for all:
+# and finds the nearest y by projecting x onto P, not among samples of P, whose spacing would dominate the result. Here
+# P is the level set and Q the known surface, sampled with weights a_i in proportion to area:
 #
 #     CD_1 = sqrt(sum_i a_i |x_i - y(x_i)|^2),      y(x) the nearest point of the level set.
 #
-# Two starts are tried for each nearest point (`newton.nearest`): x itself, right where the surfaces agree, and the
-# nearest of many points of the level set, right where they do not. Where neither arrives, the latter counts as it is.
+# Two starts are tried for each nearest point (`newton_projection.nearest`): x itself, which is good where the surfaces
+# agree, and the nearest of many points of the level set, which is good where they do not. If neither converges, the
+# distance to the latter is used.
 #
-# The other direction, from the level set to the known surface (`to_known`), sees what the first cannot: sheets that the
-# level set has and the known surface has not. A level set goes on where a patch ends, so only those of its points count
-# whose foot lies inside the patch.
+# The other direction, from the level set to the known surface (`to_known`), also detects sheets of the level set that
+# the known surface does not have. A level set continues beyond the border of a patch, so only points whose foot is
+# inside the patch count.
 
 
 @dataclass(frozen=True)
 class ChamferDivergence:
-    """Root mean square distances, in the coordinates' unit; infinite where the level set is empty.
+    """Root mean square distances, in the unit of the coordinates; infinite if the level set is empty.
 
     Parameters
     ----------
-    from_known : CD_1, from points of the known surface to the level set: the paper's figure
+    from_known : CD_1, from points of the known surface to the level set, as the paper reports
     to_known : from points of the level set, whose foot is in the patch, to the known surface
     """
 
@@ -220,16 +207,23 @@ class ChamferDivergence:
 
 
 def chamfer_divergence(
-    level_set: LevelSet, known: KnownSurface, rng: np.random.Generator, count: int = _COUNT
+    level_set: LevelSet,
+    known: KnownSurface,
+    rng: np.random.Generator,
+    count: int = 4000,
+    *,
+    start_samples: int = 10_000,
 ) -> ChamferDivergence:
-    """Measure a level set against a known surface within its box, each by `count` points of the other.
+    """Measure the distance between a level set and a known surface within its box.
 
     Parameters
     ----------
     level_set : on the CPU
-    rng : draws the sample of the level set
+    rng : for the sample of the level set
+    count : points of each surface from which the distance is measured
+    start_samples : points of the level set among which the starts of projections are chosen
     """
-    sample = sample_surface(level_set, max(_CURVE_STARTS, count), rng)
+    sample = sample_surface(level_set, max(start_samples, count), rng)
     if not len(sample):
         return ChamferDivergence(float("inf"), float("inf"))
     points, shares = known.sample(count)
@@ -238,7 +232,7 @@ def chamfer_divergence(
 
 
 def distances_to(level_set: LevelSet, queries: Tensor, sample: SurfaceSample) -> Tensor:
-    """Return the distances, of shape (N,), of queries, (N, 3), from the level set, of which `sample` has points."""
+    """Return the distances, of shape (N,), of queries, (N, 3), from the level set, with starts from `sample`."""
     from scipy.spatial import cKDTree
 
     distances, rows = cKDTree(sample.points.numpy()).query(queries.numpy())
@@ -246,14 +240,14 @@ def distances_to(level_set: LevelSet, queries: Tensor, sample: SurfaceSample) ->
     cap = level_set.diagonal / 20
     for starts in (sample.points[torch.as_tensor(rows)], queries):
         feet = nearest(level_set, queries, starts, cap)
-        arrived = feet.converged & level_set.contains(feet.points)
+        converged = feet.converged & level_set.contains(feet.points)
         found = torch.linalg.vector_norm(feet.points - queries, dim=1)
-        least = torch.where(arrived, torch.minimum(least, found), least)
+        least = torch.where(converged, torch.minimum(least, found), least)
     return least
 
 
 def _to_known(sample: SurfaceSample, known: KnownSurface, count: int) -> float:
-    # The sample is ordered along a curve through space, so that every n-th point is as even a sample.
+    # The sample is ordered along a space-filling curve, so every n-th point is an even sample too.
     points = sample.points[:: max(1, len(sample) // count)]
     feet, inside = known.nearest(points)
     squares = (feet - points).square().sum(1)[inside]

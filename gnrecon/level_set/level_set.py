@@ -1,4 +1,4 @@
-"""A differentiable field with its box: values, gradients and curvature in chunks, for sampling and measuring."""
+"""A differentiable field with its box: values, gradients and curvature in batches, for sampling and measuring."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Box
-from gnrecon.runtime.parallel import slices
+from gnrecon.level_set.level_set_parameters import LevelSetParameters
+from gnrecon.runtime.chunks import slices
 
 Value = Callable[[Tensor], Tensor]
 """Takes points, of shape (N, 3), and returns f there, of shape (N,)."""
@@ -19,11 +20,7 @@ Value = Callable[[Tensor], Tensor]
 ValueAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Takes points, of shape (N, 3), and returns f, of shape (N,), and grad f, of shape (N, 3)."""
 
-# So many points at a time keep the layers of a small network in a processor's cache.
-_CHUNK = 8192
 
-
-# A level set: the points of a box where a function of space is zero, of which nothing but its values is known.
 @dataclass(frozen=True)
 class LevelSet:
     """The zero level of a function within a box, in float64.
@@ -32,10 +29,9 @@ class LevelSet:
     ----------
     value : f of points of shape (N, 3), of shape (N,)
     value_and_gradient : the same with grad f, of shape (N, 3)
-    box : where the surface is looked for, in the coordinates that f takes
-    device : where f wants its points
-    roughly : f to about a millionth, such as in float32, which is enough to find where it changes its sign; by default
-        `value`
+    box : where the surface is searched for, in the coordinates of f
+    device : device of the points that f takes
+    roughly : f to about a millionth, such as in float32, which is enough to find sign changes; by default `value`
     """
 
     value: Value
@@ -55,21 +51,21 @@ class LevelSet:
 
     @torch.no_grad()
     def values(self, points: Tensor) -> Tensor:
-        """Return f, of shape (N,), at any number of points, of shape (N, 3), by chunks."""
-        return self._by_chunks(self.value, points)
+        """Return f, of shape (N,), at any number of points, of shape (N, 3), in batches."""
+        return self._in_batches(self.value, points)
 
     @torch.no_grad()
     def rough_values(self, points: Tensor) -> Tensor:
-        """Return f as `roughly` gives it, of shape (N,), at any number of points, of shape (N, 3), by chunks."""
-        return self._by_chunks(self.roughly or self.value, points)
+        """Return f as `roughly` gives it, of shape (N,), at any number of points, of shape (N, 3), in batches."""
+        return self._in_batches(self.roughly or self.value, points)
 
-    def _by_chunks(self, value: Value, points: Tensor) -> Tensor:
-        return torch.cat([value(points[rows]) for rows in _chunks(len(points))])
+    def _in_batches(self, value: Value, points: Tensor) -> Tensor:
+        return torch.cat([value(points[rows]) for rows in _batches(len(points))])
 
     @torch.no_grad()
     def values_and_gradients(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return f, of shape (N,), and grad f, of shape (N, 3), by chunks."""
-        pairs = [self.value_and_gradient(points[rows]) for rows in _chunks(len(points))]
+        """Return f, of shape (N,), and grad f, of shape (N, 3), in batches."""
+        pairs = [self.value_and_gradient(points[rows]) for rows in _batches(len(points))]
         return torch.cat([value for value, _ in pairs]), torch.cat([gradient for _, gradient in pairs])
 
     def contains(self, points: Tensor) -> Tensor:
@@ -78,6 +74,6 @@ class LevelSet:
         return ((points >= lower) & (points <= upper)).all(1)
 
 
-def _chunks(count: int) -> list[slice]:
-    """Return slices that cover `count` rows; one of no rows where there are none, so that shapes stay known."""
-    return slices(count, _CHUNK) or [slice(0, 0)]
+def _batches(count: int, *, batch_points: int = LevelSetParameters.batch_points) -> list[slice]:
+    """Return slices that cover `count` rows, and one empty slice for no rows, so that results keep their shapes."""
+    return slices(count, batch_points) or [slice(0, 0)]

@@ -1,10 +1,10 @@
-"""Nonlinear least squares: Gauss-Newton and its ways of choosing a step, Adam and L-BFGS; knows no geometry."""
+"""Nonlinear least squares: Gauss-Newton with several step controls, Adam and L-BFGS. Independent of geometry."""
 
 from collections.abc import Callable
 
 from gnrecon.optim.first_order import LBFGS, Adam
 from gnrecon.optim.gauss_newton import GaussNewton
-from gnrecon.optim.loop import Callback, HeldOut, Optimiser, Record, Solution, StopRule, Watch
+from gnrecon.optim.loop import Callback, Optimiser, Record, RunMonitor, Solution, StopRule, ValidationLoss
 from gnrecon.optim.problem import Problem, ProblemAt
 from gnrecon.optim.step_control import FixedStep, GainRatioDamping, LogLineSearch, Move, Search
 
@@ -13,7 +13,7 @@ OPTIMISERS: dict[str, Callable[[], Optimiser]] = {
     "adam": Adam,
     "lbfgs": LBFGS,
 }
-"""Makes each optimiser by its name."""
+"""Creates each optimiser by its name."""
 
 __all__ = [
     "LBFGS",
@@ -23,15 +23,15 @@ __all__ = [
     "FixedStep",
     "GainRatioDamping",
     "GaussNewton",
-    "HeldOut",
     "LogLineSearch",
     "Move",
     "Optimiser",
     "Problem",
     "ProblemAt",
     "Record",
+    "RunMonitor",
     "Search",
     "Solution",
     "StopRule",
-    "Watch",
+    "ValidationLoss",
 ]

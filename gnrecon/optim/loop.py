@@ -1,6 +1,6 @@
-"""What all optimisers offer, and the loop that they share: freeze a problem, take a step, ask whether to stop.
+"""The interface of the optimisers and their common loop: freeze a problem, take a step, check the stopping rules.
 
-They differ in how they take an outer step. Whatever they do, a loss that is not finite ends the run with the parameters
+The optimisers differ only in how they take an outer step. A loss that is not finite ends the run with the parameters
 before it, and an interrupt (Ctrl-C) with those of the last finished step.
 """
 
@@ -26,7 +26,7 @@ class Optimiser(Protocol):
         theta: Tensor,
         stop: StopRule,
         callback: Callback | None = None,
-        held_out: HeldOut | None = None,
+        held_out: ValidationLoss | None = None,
     ) -> Solution:
         """Minimise |r|^2 / 2 from theta, of shape (p,), which is left unchanged.
 
@@ -36,63 +36,60 @@ class Optimiser(Protocol):
         theta : starting parameters, of shape (p,)
         stop : when to stop
         callback : called with each step's record
-        held_out : gives the loss of residuals that are kept from the fit, from all parameters; evaluated at the start
-            and after each step, and the parameters of its least value are returned
+        held_out : returns the loss of held-out residuals, which are not fitted, from all parameters; evaluated at the
+            start and after each step; the parameters with the least value are returned
         """
         ...
 
     def describe(self) -> str:
-        """Return what this optimiser does, in sentences."""
+        """Return a description of the method, in sentences."""
         ...
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an outer step led to: all parameters, of shape (p,), its record, and why the solver failed, if it did."""
+    """The result of an outer step: all parameters, of shape (p,), its record, and why the solver failed, if it did."""
 
     theta: Tensor
     record: Record
     failure: str | None = None
 
 
-Advance = Callable[[int, Problem], Outcome]
-"""Takes the outer step of a number on its frozen problem."""
+OuterStep = Callable[[int, Problem], Outcome]
+"""Takes one outer step, from its number and its frozen problem."""
 
 
-def iterate(advance: Advance, problem_at: ProblemAt, watch: Watch, describe: Callable[[], str]) -> Solution:
-    """Take steps until a rule says stop."""
-    status = f"Stopped at the limit of {watch.stop.steps} steps."
+def iterate(take_step: OuterStep, problem_at: ProblemAt, monitor: RunMonitor, describe: Callable[[], str]) -> Solution:
+    """Take steps until a stopping rule applies."""
+    status = f"Stopped at the limit of {monitor.stop.steps} steps."
     try:
-        watch.begin()
-        for number in range(1, watch.stop.steps + 1):
-            outcome = advance(number, problem_at(number, watch.theta))
+        monitor.start()
+        for number in range(1, monitor.stop.steps + 1):
+            outcome = take_step(number, problem_at(number, monitor.theta))
             if not math.isfinite(outcome.record.before) or not math.isfinite(outcome.record.loss):
-                return watch.solution(f"The loss was not finite at step {number}.", describe())
-            ended = watch.note(outcome.theta, outcome.record, outcome.failure)
+                return monitor.solution(f"The loss was not finite at step {number}.", describe())
+            ended = monitor.update(outcome.theta, outcome.record, outcome.failure)
             if ended is not None:
-                return watch.solution(ended, describe())
+                return monitor.solution(ended, describe())
     except KeyboardInterrupt:
-        return watch.solution(f"Interrupted after {len(watch.history)} steps.", describe(), interrupted=True)
-    return watch.solution(status, describe())
+        return monitor.solution(f"Interrupted after {len(monitor.history)} steps.", describe(), interrupted=True)
+    return monitor.solution(status, describe())
 
 
-HeldOut = Callable[[Tensor], float]
-"""Gives the held-out residuals' loss from all parameters, of shape (p,)."""
+ValidationLoss = Callable[[Tensor], float]
+"""Returns the loss of the held-out residuals from all parameters, of shape (p,)."""
 
 
-# When a run ends, and with which sentence.
+# Stopping rules, checked after each outer step in this order:
 #
-# After each outer step, in this order:
-#
-#     idle       `patience` steps in a row each lowered their loss by less than `tolerance` of it
-#     held-out   residuals that the fit does not see have not fallen by `tolerance` of their least value for
-#                `held_out_patience` steps: the fit has begun to follow noise
+#     idle       `patience` steps in a row each decreased the loss by less than the fraction `tolerance`
+#     held-out   the loss of held-out residuals has not decreased by the fraction `tolerance` of its least value for
+#                `held_out_patience` steps: the fit has begun to overfit
 #     time       `seconds` have passed
 #     limit      `steps` are done
 #
-# Held-out residuals also decide which parameters are returned, whatever ends the run: those of their least value, the
-# start's included. Source: Prechelt, Early stopping - but when? (1998), whose criterion of successive failures this is,
-# with a threshold.
+# With held-out residuals, the parameters of their least loss, the start included, are returned whatever ends the run.
+# Source: Prechelt, Early stopping - but when? (1998), the criterion of successive failures, with a threshold.
 
 
 @dataclass(frozen=True)
@@ -101,10 +98,10 @@ class StopRule:
 
     Parameters
     ----------
-    steps : stop after so many
+    steps : most steps
     tolerance : relative decrease of a loss below which a step is idle
     patience : idle steps in a row after which the run has converged
-    seconds : time after which no further step begins, or None
+    seconds : time after which no further step begins, or None for no limit
     held_out_patience : steps in a row without a decrease of the held-out residuals after which the run ends
     """
 
@@ -116,62 +113,62 @@ class StopRule:
 
 
 @dataclass
-class Best:
+class BestParameters:
     """The parameters of the least held-out value so far.
 
     Parameters
     ----------
     theta, step, value : of the least value
-    bar : value that the next ones are measured against, the last one that was a decrease by the tolerance
-    idle : steps in a row since then
+    reference : the last value that was a decrease by the tolerance, with which the next ones are compared
+    idle : steps since then
     """
 
     theta: Tensor
     step: int = 0
     value: float = math.inf
-    bar: float = math.inf
+    reference: float = math.inf
     idle: int = 0
 
-    def note(self, theta: Tensor, step: int, value: float, tolerance: float) -> None:
-        """Take note of the value at a step; as long as none was a number, the newest parameters are the best."""
+    def update(self, theta: Tensor, step: int, value: float, tolerance: float) -> None:
+        """Compare the value at a step; until one is finite, the newest parameters are the best."""
         if value < self.value or math.isinf(self.value):
             self.theta, self.step = theta, step
         if value < self.value:
             self.value = value
-        falls = value < (1 - tolerance) * self.bar
-        self.bar, self.idle = (value, 0) if falls else (self.bar, self.idle + 1)
+        falls = value < (1 - tolerance) * self.reference
+        self.reference, self.idle = (value, 0) if falls else (self.reference, self.idle + 1)
 
 
 @dataclass
-class Watch:
-    """A run as it goes on: its history, its parameters after the last finished step, and whether it is to end.
+class RunMonitor:
+    """The state of a run: its history, its parameters after the last finished step, and its stopping rules.
 
     Parameters
     ----------
     theta : starting parameters, of shape (p,)
     stop : the rules
     callback : called with each step's record
-    held_out : gives the held-out residuals' loss
+    held_out : returns the loss of the held-out residuals
     """
 
     theta: Tensor
     stop: StopRule
     callback: Callback | None = None
-    held_out: HeldOut | None = None
+    held_out: ValidationLoss | None = None
     history: list[Record] = field(default_factory=list, init=False)
     idle: int = field(default=0, init=False)
-    best: Best | None = field(default=None, init=False)
+    best: BestParameters | None = field(default=None, init=False)
     started: float = field(default_factory=perf_counter, init=False)
 
-    def begin(self) -> None:
-        """Take note of the held-out residuals at the start."""
+    def start(self) -> None:
+        """Evaluate the held-out residuals at the start."""
         if self.held_out is not None:
-            self.best = Best(self.theta)
+            self.best = BestParameters(self.theta)
             value = self.held_out(self.theta)
-            self.best.note(self.theta, 0, value, self.stop.tolerance)
+            self.best.update(self.theta, 0, value, self.stop.tolerance)
 
-    def note(self, theta: Tensor, record: Record, failure: str | None = None) -> str | None:
-        """Take note of a finished step; return why the run ends with it, or None.
+    def update(self, theta: Tensor, record: Record, failure: str | None = None) -> str | None:
+        """Add a finished step; return why the run ends with it, or None.
 
         Parameters
         ----------
@@ -182,8 +179,8 @@ class Watch:
         value = None if self.held_out is None else self.held_out(theta)
         record = replace(record, held_out=value, seconds=perf_counter() - self.started)
         if self.best is not None and value is not None:
-            self.best.note(theta, record.step, value, self.stop.tolerance)
-        # Not strictly greater, so that a problem without any loss left is idle too.
+            self.best.update(theta, record.step, value, self.stop.tolerance)
+        # Not strictly greater, so that a problem with zero loss is idle too.
         self.idle = self.idle + 1 if record.loss >= (1 - self.stop.tolerance) * record.before else 0
         self.theta = theta
         self.history.append(record)
@@ -210,9 +207,6 @@ class Watch:
         return Solution(theta, status, tuple(self.history), interrupted, method)
 
 
-# What an optimiser returns: parameters, a sentence that says why it stopped, and its history.
-
-
 @dataclass(frozen=True)
 class Record:
     """One outer step.
@@ -221,9 +215,9 @@ class Record:
     ----------
     step : its number, from 1
     before, loss : |r|^2 / 2 on the step's own sample of points, before and after the step
-    damping : with which the step was solved, or zero for methods that do not damp
-    gain_ratio : decrease of the loss over the predicted one, or zero for methods that predict none
-    length : multiple of the solved direction that was taken, zero when no trial improved; Adam's learning rate
+    damping : damping of the step, or zero for methods without
+    gain_ratio : actual over predicted decrease of the loss, or zero for methods without a prediction
+    length : multiple of the solved direction, zero if no trial decreased the loss; Adam's learning rate
     held_out : value of the held-out residuals after the step, if there are any
     iterations : of an iterative linear solver
     seconds : since the start of the run
@@ -247,7 +241,7 @@ Callback = Callable[[Record], None]
 class Solution:
     """Parameters theta, of shape (p,), the history, and `status`, the reason for stopping as a sentence.
 
-    `method` is what the optimiser said of itself at the end.
+    `method` is the optimiser's description of itself at the end.
     """
 
     theta: Tensor

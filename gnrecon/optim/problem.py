@@ -1,4 +1,4 @@
-"""What the optimisers ask of a nonlinear least-squares problem; they know nothing else of it."""
+"""The interface of a nonlinear least-squares problem, all that the optimisers use of it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Problem(Protocol):
     """
 
     def free(self) -> Tensor:
-        """Return the free parameters, of shape (k,), where the problem was posed."""
+        """Return the free parameters, of shape (k,), at which the problem was frozen."""
         ...
 
     def whole(self, free: Tensor) -> Tensor:
@@ -35,7 +35,7 @@ class Problem(Protocol):
 
 
 ProblemAt = Callable[[int, Tensor], Problem]
-"""Gives the frozen problem of an outer step from its number, from 1, and all current parameters, of shape (p,)."""
+"""Returns the frozen problem of an outer step from its number, from 1, and all current parameters, of shape (p,)."""
 
 
 def loss_of(problem: Problem, free: Tensor) -> float:
@@ -52,9 +52,9 @@ def loss_and_gradient(problem: Problem, free: Tensor) -> tuple[float, Tensor]:
 
 
 def places_of(problem: Problem) -> Tensor:
-    """Return where in theta the free parameters stand, of shape (k,)."""
+    """Return the indices of the free parameters in theta, of shape (k,)."""
     free = problem.free()
-    # Ones less zeros are one where a parameter is free, and numbers tell the free ones apart.
+    # The difference between ones and zeros shows which parameters are free; distinct numbers show their order.
     chosen = (problem.whole(torch.ones_like(free)) - problem.whole(torch.zeros_like(free)) == 1.0).nonzero()[:, 0]
     numbers = torch.arange(len(free), dtype=torch.float64, device=free.device).to(free.dtype)
     places = torch.empty_like(chosen)

@@ -1,14 +1,15 @@
-"""Levenberg-Marquardt: the damping follows the gain ratio, and the step may bend with the residuals.
+"""Levenberg-Marquardt: the damping follows the gain ratio, optionally with geodesic acceleration.
 
-*Gain ratio.* The loss's true decrease over the one that the linear model predicts. A step is taken when it improves,
-and the damping follows Nielsen's smooth rule, damping *= max(1/3, 1 - (2 gain - 1)^3), rising by growing factors while
-trials fail. Source: Madsen, Nielsen, Tingleff, Methods for Non-linear Least Squares Problems (2004), section 3.2.
+*Gain ratio.* The actual decrease of the loss over the decrease that the linear model predicts. A step that decreases
+the loss is accepted, and the damping follows Nielsen's rule, damping *= max(1/3, 1 - (2 gain - 1)^3); it rises by
+growing factors while trials fail. Source: Madsen, Nielsen, Tingleff, Methods for Non-linear Least Squares Problems
+(2004), section 3.2.
 
 *Geodesic acceleration.* Along theta + t s the residuals leave their linear model by t^2 r_ss / 2, their second
-derivative along s. The step that undoes this within the model solves the same system for r_ss in the place of r, and
-half of that solution a is added:  s + a / 2. r_ss comes from one more evaluation,
-2 / h ((r(theta + h s) - r(theta)) / h - J s). A trial with |a|_D > 3/4 |s|_D is refused, because the step is then
-longer than the model can follow. In the long, bent valleys of sine networks this halves the steps
+derivative along s. The step that compensates for this within the model solves the same system with r_ss in place of r,
+and half of that solution a is added:  s + a / 2. r_ss takes one more evaluation,
+2 / h ((r(theta + h s) - r(theta)) / h - J s). A trial with |a|_D > 3/4 |s|_D is rejected, because the step is then
+longer than the range of the model. In the long, curved valleys of sine networks this halves the number of steps
 (docs/research/2026-11-21-step-control.md).
 Source: Transtrum and Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
 minimization (2012).
@@ -26,10 +27,6 @@ from torch import Tensor
 from gnrecon.least_squares.system import DampedSystem, Metric, Step, identity, jacobian_scaled
 from gnrecon.optim.problem import Problem, loss_of
 
-PROBE = 0.1
-
-BENT = 0.75
-
 
 @dataclass(frozen=True)
 class GainRatioDamping:
@@ -39,11 +36,11 @@ class GainRatioDamping:
     ----------
     initial_damping : of the first step
     metric : what the damping is measured in
-    geodesic : whether steps bend with the residuals, at one more evaluation and solve a step
-    length : share of an accepted step that is gone; where points are fresh at each step and the residuals do not vanish
-        in the end, shorter steps average over more of them
+    geodesic : whether to add the geodesic acceleration, at one more evaluation and solve per step
+    length : fraction of an accepted step that is taken; if points are resampled at each step and the residuals do not
+        vanish at the minimum, shorter steps average over more samples
     smallest : least damping
-    trials : rejected steps after which there is no move
+    trials : rejected trials after which the parameters stay
     """
 
     initial_damping: float = 1e-3
@@ -54,15 +51,15 @@ class GainRatioDamping:
     trials: int = 10
 
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
-        """Raise the damping until a step improves the loss."""
+        """Raise the damping until a step decreases the loss."""
         start, growth, gain, iterations, failure = damping, 2.0, 0.0, 0, None
         for _ in range(self.trials):
             step = system.solve(damping)
-            bend = self._bend(problem, system, free, damping, step)
-            iterations += step.iterations + bend.iterations
+            acceleration = self._acceleration(problem, system, free, damping, step)
+            iterations += step.iterations + acceleration.iterations
             failure = step.failure
-            if step.predicted > 0.0 and _follows(system.equations.metric, step, bend):
-                trial = free + (step.direction + bend.direction / 2).to(free.dtype)
+            if step.predicted > 0.0 and _within_model(system.equations.metric, step, acceleration):
+                trial = free + (step.direction + acceleration.direction / 2).to(free.dtype)
                 loss = loss_of(problem, trial)
                 gain = (system.loss - loss) / step.predicted
                 if math.isfinite(loss) and gain > 0.0:
@@ -74,35 +71,48 @@ class GainRatioDamping:
                     return Move(trial, loss, damping, gain, self.length, following, iterations)
             damping *= growth
             growth *= 2.0
-        # Nothing helped here; the next step, with points of its own, begins not much above where this one did.
+        # No trial decreased the loss; the next step, with other points, starts ten times as damped as this one did.
         return Move(free, system.loss, damping, gain, 0.0, start * 10, iterations, failure)
 
-    def _bend(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float, step: Step) -> Step:
-        """Return a, or zero where steps do not bend or there is no step."""
+    def _acceleration(
+        self,
+        problem: Problem,
+        system: DampedSystem,
+        free: Tensor,
+        damping: float,
+        step: Step,
+        *,
+        probe_length: float = 0.1,
+    ) -> Step:
+        """Return a, or zero without geodesic acceleration or without a step.
+
+        `probe_length` is h, as a fraction of the step; Transtrum and Sethna recommend 0.1.
+        """
         s = step.direction
         if not self.geodesic or not step.predicted > 0.0:
             return Step(torch.zeros_like(s), 0.0)
         J, r = system.equations.jacobian, system.equations.residual
-        there = problem.residual(free + PROBE * s.to(free.dtype)).to(r)
+        ahead = problem.residual(free + probe_length * s.to(free.dtype)).to(r)
         # r_ss from r(theta + h s) = r + h J s + h^2 r_ss / 2
-        return system.solve(damping, 2 / PROBE * ((there - r) / PROBE - J.mv(s)))
+        return system.solve(damping, 2 / probe_length * ((ahead - r) / probe_length - J.mv(s)))
 
     def describe(self) -> str:
         """Name the search."""
         return f"Gauss-Newton with gain-ratio damping{' and geodesic acceleration' if self.geodesic else ''}."
 
 
-def _follows(metric: Tensor, step: Step, bend: Step) -> bool:
-    """Whether |a|_D <= 3/4 |s|_D."""
-    return float(metric @ bend.direction.square()) <= BENT**2 * float(metric @ step.direction.square())
+def _within_model(metric: Tensor, step: Step, acceleration: Step, *, largest_ratio: float = 0.75) -> bool:
+    """Whether |a|_D <= 3/4 |s|_D, the acceptance criterion of Transtrum and Sethna."""
+    square = float(metric @ acceleration.direction.square())
+    return square <= largest_ratio**2 * float(metric @ step.direction.square())
 
 
 # Lengths along one direction: the paper's log-spaced line search, and a fixed multiple.
 #
-# The direction has a tiny fixed damping, so that it is the natural gradient of the paper's function space. *Log-
-# spaced*: lengths spaced evenly in their logarithm are all tried from the same start, and the best one is taken;
-# nothing is kept of a trial that lost. *Fixed*: the same multiple each step, as the paper steps on resampled moving
-# surfaces, where losses of different samples do not compare.
+# The direction has a tiny fixed damping, so it is the natural gradient in the paper's function space. *Log-spaced*:
+# lengths spaced evenly in the logarithm are all tried from the same start, and the best is taken. *Fixed*: the same
+# multiple at each step, as in the paper on resampled moving surfaces, where losses of different samples cannot be
+# compared.
 
 
 @dataclass(frozen=True)
@@ -117,7 +127,7 @@ class LogLineSearch:
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
         """Try all lengths along one direction, each from the same start."""
         step = system.solve(damping)
-        # At a stationary point nothing is predicted, and what the loss falls by is rounding.
+        # At a stationary point no decrease is predicted, and any decrease is rounding.
         if step.predicted <= 0.0:
             return Move(free, system.loss, damping, 0.0, 0.0, damping * 10, step.iterations, step.failure)
         best = Move(free, system.loss, damping, 0.0, 0.0, self.initial_damping, step.iterations)
@@ -137,7 +147,7 @@ class LogLineSearch:
 
 @dataclass(frozen=True)
 class FixedStep:
-    """Fixed damping, and `length` times the direction, whatever it does to the loss as long as that stays finite."""
+    """Fixed damping, and `length` times the direction, even if the loss increases, as long as it stays finite."""
 
     length: float = 0.1
     initial_damping: float = 1e-6
@@ -158,14 +168,11 @@ class FixedStep:
         return f"Gauss-Newton with steps of {self.length:g} times the direction."
 
 
-# How a search turns a linearisation into a move; the ways to do so are `damping` and `line`.
-
-
 @dataclass(frozen=True)
 class Move:
-    """Where a search ended: new free parameters and loss (the old ones when `length` is zero), and the next damping.
+    """The result of a step control: new free parameters and loss (the old ones if `length` is zero), and next damping.
 
-    `iterations` counts those of iterative solvers, `failure` says why a solver found no step, if it did not.
+    `iterations` counts those of iterative solvers; `failure` says why a solver found no step, if it did not.
     """
 
     free: Tensor
@@ -179,7 +186,7 @@ class Move:
 
 
 class Search(Protocol):
-    """Turns a damped system into a move."""
+    """A step control: chooses a step from a damped system."""
 
     @property
     def initial_damping(self) -> float:
@@ -196,5 +203,5 @@ class Search(Protocol):
         ...
 
     def describe(self) -> str:
-        """Return what this search does, in a sentence."""
+        """Return a description of the method, in a sentence."""
         ...

@@ -1,7 +1,7 @@
 """Residuals of a field's value f and gradient g, linearised:  dr = by_value df + by_gradient . dg.
 
 The names follow the paper's table of constraints; each function takes values of shape (N,), gradients of shape (N, 3)
-and its targets, and returns m residuals for every point. What a network is, or how it is sampled, is not known here.
+and its targets, and returns m residuals for every point. It does not depend on networks or sampling.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def interface(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lineari
 
 
 def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
-    """The point, which lies outside of the design region, is not inside of the shape: r = min(0, f).
+    """A point outside of the design region is not inside the shape: r = min(0, f).
 
     With least values as targets, of shape (N,), r = min(0, f - target).
     """
@@ -60,7 +60,7 @@ def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lin
 def free_space(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
     """The surface keeps away: f has its target's sign, and is not less in magnitude, r = min(0, sign(t) (f - t)).
 
-    Targets t are of shape (N,); what is nearer to zero, or beyond it, has a residual, and nothing else has.
+    Targets t are of shape (N,). Only points where f is nearer to zero, or has the other sign, have a residual.
     """
     del gradient
     assert target is not None, "free space has targets"
@@ -71,8 +71,8 @@ def free_space(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linear
 def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
     """The value is known: r = f - target, targets of shape (N,).
 
-    In the paper's table this is *supervised*; and it is *connectedness*, where the points are the critical ones that
-    join components and the targets the values that would join them.
+    This is *supervised* in the paper's table. It is also *connectedness*, with critical points that join components and
+    the values that would join them as targets.
     """
     del gradient
     assert target is not None, "signed distances are the targets of this residual"
@@ -127,10 +127,6 @@ def _below_zero(excess: Tensor, by_value: Tensor) -> Linearised:
     return Linearised(torch.where(below, excess, 0.0)[:, None], torch.where(below, by_value, 0.0)[:, None], None)
 
 
-SHORTEST = 1e-12
-"""Least |grad f| that is divided by: a critical point of f has finite curvatures, though no meaningful ones."""
-
-
 # Residuals of curvature, linearised: dr = by_gradient . dg + by_hessian : dH with g = grad f and H = Hess f.
 #
 # The level set of f through a point has the unit normal n = g / |g| and, with P = I - n n^T, the shape operator S = P H
@@ -141,10 +137,9 @@ SHORTEST = 1e-12
 #     Gauss     k1 k2         =  g . adj(H) g / |g|^4
 #     strain    k1^2 + k2^2   =  |S|^2
 #
-# The strain's own root has no derivative where both curvatures vanish, and k1 and k2 have none where they agree. The
-# entries of S in a tangent frame, S_11, sqrt(2) S_12, S_22, are smooth everywhere and their squares sum to the strain.
-# A frame that turns along with n only as far as n itself turns has d(t_i . S t_j) = t_i . dS t_j, so that it counts as
-# fixed here.
+# The root of the strain has no derivative where both curvatures vanish, and k1 and k2 have none where they are equal.
+# The entries of S in a tangent frame, S_11, sqrt(2) S_12, S_22, are smooth everywhere and their squares sum to the
+# strain. For a frame that rotates only as n does, d(t_i . S t_j) = t_i . dS t_j, so it is treated as fixed.
 #
 # Sources: Goldman, Curvature formulas for implicit curves and surfaces (2005); King et al., Gauss-Newton natural
 # gradient descent for shape learning, its table of constraints, whose mean curvature is div n as well.
@@ -158,8 +153,8 @@ class SecondOrder:
     ----------
     name : str
     linearise : takes values (N,), gradients (N, 3), Hessians (N, 3, 3) and targets or None
-    tangential : whether n . H n is not looked at, and only tangential parts of H have a derivative, as with all
-        curvatures of a level set; the second derivative across it then need not be known
+    tangential : whether it depends only on the tangential parts of H and not on n . H n, as all curvatures of a level
+        set do; the second derivative across the level set is then not needed
     """
 
     name: str
@@ -235,14 +230,14 @@ gauss_curvature = SecondOrder("Gauss curvature", _gauss, tangential=True)
 """The surface is developable, or k1 k2 is the target, of shape (N,)."""
 
 surface_strain = SecondOrder("surface strain", _strain, tangential=True)
-"""The surface is as flat as can be: k1^2 + k2^2 as the sum of three squares."""
+"""The surface bends as little as possible: k1^2 + k2^2 as the sum of three squares."""
 
 
 def clipped_strain(maximum: float) -> SecondOrder:
-    """Return the strain that counts as `maximum`, in squared inverse lengths, wherever it is more.
+    """Return the strain clipped to `maximum`, in squared inverse lengths.
 
-    There the loss is constant, so that edges and creases neither dominate it nor are pulled at. Targets, of shape (N,),
-    are maxima of their own.
+    Where it is clipped the loss is constant, so that sharp edges neither dominate it nor are smoothed. Targets, of
+    shape (N,), replace the maximum at each point.
     """
 
     def linearise(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | None) -> Linearised:
@@ -279,14 +274,17 @@ def tangent_frame(normals: Tensor) -> Tensor:
     return torch.stack([first, second], 2)
 
 
-def _unit(gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Return |g|, of shape (N,), bounded below, and g / |g|, of shape (N, 3)."""
+def _unit(gradient: Tensor, *, shortest: float = 1e-12) -> tuple[Tensor, Tensor]:
+    """Return |g|, of shape (N,), at least `shortest`, and g / |g|, of shape (N, 3).
+
+    The bound gives critical points of f finite, though meaningless, curvatures.
+    """
     length: Tensor = torch.linalg.vector_norm(gradient, dim=1)
-    # A gradient of zero has no direction; any will do.
+    # A zero gradient has no direction; use any.
     upright = torch.zeros_like(gradient)
     upright[:, 2] = 1.0
-    n = torch.where(length[:, None] > SHORTEST, gradient / length.clamp_min(SHORTEST)[:, None], upright)
-    return length.clamp_min(SHORTEST), n
+    n = torch.where(length[:, None] > shortest, gradient / length.clamp_min(shortest)[:, None], upright)
+    return length.clamp_min(shortest), n
 
 
 def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
@@ -310,10 +308,10 @@ Formula = Callable[[Tensor, Tensor, Tensor], Tensor]
 """From one point's value (), gradient (3,) and Hessian (3, 3) to m residuals, of shape (m,)."""
 
 
-# A residual from its formula alone, for constraints that have no closed form here.
+# A residual defined by a formula, for constraints that have no closed form here.
 #
-# The formula is differentiated automatically by the 13 numbers f, grad f and Hess f at each point, never through the
-# network, so that it costs little; the network's part stays in closed form.
+# The formula is differentiated automatically by the 13 numbers f, grad f and Hess f at each point and not through the
+# network, which is cheap; the network's derivatives remain in closed form.
 
 
 def from_formula(name: str, formula: Formula, tangential: bool = False) -> SecondOrder:
@@ -321,11 +319,11 @@ def from_formula(name: str, formula: Formula, tangential: bool = False) -> Secon
 
     Parameters
     ----------
-    name : what the history calls it
+    name : its name in the history
     formula : from one point's value (), gradient (3,) and Hessian (3, 3) to residuals, of shape (m,), by torch
         functions that can be differentiated where they are evaluated
-    tangential : whether it is the same whatever n . H n is, with n the normal g / |g|, as all curvatures of level sets
-        are; two tangents then serve for three axes
+    tangential : whether it is independent of n . H n, with n the normal g / |g|, as all curvatures of level sets are;
+        two tangents are then enough instead of three axes
     """
 
     def linearise(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | None) -> Linearised:

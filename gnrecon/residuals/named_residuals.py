@@ -1,7 +1,7 @@
-"""Residuals by name: those of this library, and those that other packages bring.
+"""Residuals by name: those of this library, and those of other packages.
 
 Another package's entry point in the group ``gnrecon.residuals`` names a function of values, gradients and targets that
-returns `Linearised`, or a `SecondOrder` one. What it returns is checked at each call, because a derivative of a wrong
+returns `Linearised`, or a `SecondOrder` residual. The result is checked at each call, because a derivative of the wrong
 shape would otherwise fail far from its cause.
 """
 
@@ -25,7 +25,6 @@ from gnrecon.residuals.constraints import (
     surface_strain,
 )
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.runtime.plugins import RESIDUALS as GROUP
 from gnrecon.runtime.plugins import Plugin, find, installed
 
 RESIDUALS: dict[str, Residual | SecondOrder] = {
@@ -52,9 +51,9 @@ def named(name: str) -> Residual | SecondOrder:
     """
     if name in RESIDUALS:
         return RESIDUALS[name]
-    plugin = find(GROUP, name)
+    plugin = find("residual", name)
     if plugin is None:
-        known = ", ".join([*RESIDUALS, *(one.entry.name for one in installed(GROUP))])
+        known = ", ".join([*RESIDUALS, *(one.entry.name for one in installed("residual"))])
         raise UsageError(f"There is no residual {name!r}; there are {known}.")
     found = plugin.load()
     return _second(plugin, found) if isinstance(found, SecondOrder) else _first(plugin, found)
@@ -77,12 +76,12 @@ def _second(plugin: Plugin, residual: SecondOrder) -> SecondOrder:
 
 
 def _require(plugin: Plugin, found: object, count: int) -> Linearised:
-    """Refuse what is not linearised residuals of so many points.
+    """Check that the result is linearised residuals of `count` points, and return it.
 
     Raises
     ------
     FitError
-        Naming the first thing that is wrong.
+        With the first problem found.
     """
     if not isinstance(found, Linearised):
         raise FitError(f"{plugin.subject} returned {type(found).__name__}, but must return Linearised.")

@@ -1,1 +1,1 @@
-"""What every stage stands on and none is about: failures, files, logs, progress, memory, threads, plug-ins."""
+"""The process and its surroundings: errors, files, logging, memory, threads, progress and plugins."""

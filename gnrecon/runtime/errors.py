@@ -1,6 +1,6 @@
-"""Failures that end a run, each with the exit code that the command line returns for it.
+"""Errors that end a run, each with the exit code of the command line.
 
-Every message is one sentence for the person who ran the command: it names the offending thing and what was expected.
+Every message is one sentence for the user: it names what is wrong and what was expected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class ExitCode(enum.IntEnum):
 
 
 class GnreconError(Exception):
-    """Base of all failures that gnrecon foresees; ``exit_code`` is what the command line returns."""
+    """Base of all errors that gnrecon raises on purpose; ``exit_code`` is what the command line returns."""
 
     exit_code: ExitCode = ExitCode.USAGE
 
@@ -36,7 +36,7 @@ class UsageError(GnreconError, ValueError):
 
 
 class InputError(GnreconError, ValueError):
-    """A file or array cannot be read, or what it holds cannot be reconstructed."""
+    """A file or array cannot be read, or its contents cannot be reconstructed."""
 
     exit_code = ExitCode.INPUT
 
@@ -59,8 +59,8 @@ class OutputError(GnreconError, OSError):
     exit_code = ExitCode.OUTPUT
 
 
-class Cancelled(GnreconError):  # noqa: N818 - it is no error
-    """Not a failure: the caller's own `Progress` raises this to end a run, which then writes and returns nothing."""
+class Cancelled(GnreconError):  # noqa: N818 - not an error
+    """Raised by the caller's own `Progress` to cancel a run, which then writes and returns nothing."""
 
     exit_code = ExitCode.INTERRUPTED
 
@@ -69,19 +69,19 @@ class Cancelled(GnreconError):  # noqa: N818 - it is no error
 
 
 class MemoryLimitError(GnreconError, MemoryError):
-    """The work needs more memory than there is."""
+    """The work needs more memory than is available."""
 
     exit_code = ExitCode.MEMORY
 
 
 def failure(error: BaseException) -> tuple[str, ExitCode]:
-    """Return the sentence and the exit code that whatever ended a run is told by."""
+    """Return the message and the exit code for the exception that ended a run."""
     if isinstance(error, GnreconError):
         return str(error), error.exit_code
     if isinstance(error, KeyboardInterrupt):
         return "Interrupted; nothing was written.", ExitCode.INTERRUPTED
     if isinstance(error, MemoryError):
         return f"There is not enough memory. {error}".strip(), ExitCode.MEMORY
-    # A fault of gnrecon itself: the user still gets one sentence, and a way to report it.
+    # A bug in gnrecon: the user still gets one sentence, and a way to report it.
     name = type(error).__name__
     return f"Unforeseen {name}: {error} Please report it with the output of --debug.", ExitCode.UNFORESEEN

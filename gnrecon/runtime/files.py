@@ -1,9 +1,9 @@
-"""Writing that either succeeds as a whole or leaves nothing behind.
+"""Atomic writing, and checks of input and output paths before any work is done.
 
-Bytes go to a hidden temporary file in the target's own folder (so the last step never crosses file systems), are
-verified there and flushed to the disk, and only then receive the target's name. A process killed at any moment leaves
-the target as it was. Without permission to overwrite, the name is given by a hard link, which fails if somebody else
-created the target meanwhile, so nobody's file is lost.
+`atomic_write` writes to a hidden temporary file in the target's own folder (so the last step never crosses file
+systems), verifies it, flushes it to the disk, and only then renames it to the target. A process killed at any moment
+leaves the target unchanged. Where overwriting is not allowed, the name is given by a hard link, which fails if another
+process has created the target in the mean time, so no file is lost.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from gnrecon.runtime.errors import GnreconError, InputError, OutputError, UsageE
 def atomic_write(
     path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
 ) -> Iterator[Path]:
-    """Yield a temporary path with the target's suffix; rename it to the target when the block ends well.
+    """Yield a temporary path with the target's suffix; rename it to the target if the block succeeds.
 
     Parameters
     ----------
     path : the target; where it is a symbolic link, the file that it points to
     overwrite : whether an existing file may be replaced
-    verify : called with the temporary path before the renaming; whatever it raises prevents that
+    verify : called with the temporary path before the renaming; if it raises, nothing is renamed
 
     Raises
     ------
@@ -38,7 +38,7 @@ def atomic_write(
     _check(target, path, overwrite)
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
     try:
-        # Created here, and exclusively, so that the user's umask holds and no other file is hit.
+        # Created exclusively: the user's umask applies, and no existing file can be hit.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         if verify is not None:
@@ -67,7 +67,7 @@ def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
 
 
 def _check(target: Path, path: str | Path, overwrite: bool) -> None:
-    """Refuse early what cannot succeed, in words that say what to do."""
+    """Raise early, with a message that says what to do, where writing cannot succeed."""
     if not target.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {target.parent} does not exist.")
     if not target.exists():
@@ -85,15 +85,17 @@ def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
     try:
         os.link(temporary, target)
     except FileExistsError:
-        raise OutputError(f"{target} was created by somebody else meanwhile, and is left alone.") from None
+        raise OutputError(
+            f"{target} was created by another process in the mean time and was not overwritten."
+        ) from None
     except OSError:
-        # Some file systems (exFAT, network shares) have no hard links; looking once more is the best that is left.
+        # Some file systems (exFAT, network shares) have no hard links; then only a second check is possible.
         _check(target, target, overwrite)
         temporary.replace(target)
 
 
 def sync(path: Path) -> None:
-    """Wait until what was written to a file, or the names in a folder, are on the disk."""
+    """Flush a file's contents, or a folder's entries, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -101,15 +103,13 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-STANDARD_INPUT = Path("-")
-"""How standard input is named among the inputs."""
-
-
-# Which files a command may read and write, decided before any work: what would fail after it is refused.
+def is_standard_input(path: Path) -> bool:
+    """Return whether a path among the inputs stands for standard input: ``-``."""
+    return path == Path("-")
 
 
 def require_files(inputs: Sequence[Path], targets: Sequence[Path], overwrite: bool) -> None:
-    """Refuse missing inputs, and targets that could not or must not be written.
+    """Check before any work that the inputs exist and the targets can and may be written.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def require_files(inputs: Sequence[Path], targets: Sequence[Path], overwrite: bo
         When a target exists and may not be overwritten, or its folder is missing.
     """
     for path in inputs:
-        if path != STANDARD_INPUT and not path.exists():
+        if not is_standard_input(path) and not path.exists():
             raise InputError(f"There is no file {path}.")
     for index, target in enumerate(targets):
         if any(_same(target, other) for other in [*inputs, *targets[:index]]):

@@ -1,7 +1,7 @@
-"""What a run writes down: the library's loggers, shown on a console and appended to a file while a command runs.
+"""Log output of the command line: to the console and to a file, while a command runs.
 
-The library itself is silent: its modules log under their own names, below ``gnrecon``, and what becomes of that is for
-the program that uses it to say, by Python's `logging`. The command line says it here, and undoes it at the end.
+The library configures no logging. Its modules log under their own names, below ``gnrecon``, and the program that uses
+it decides what happens to the records, by Python's `logging`. The command line does so here, and undoes it at the end.
 """
 
 from __future__ import annotations
@@ -17,20 +17,19 @@ from gnrecon.runtime.errors import OutputError, UsageError
 if TYPE_CHECKING:
     from rich.console import Console
 
-FORM = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-TOLD = {"told": True}
-"""Marks, as `extra`, what the caller's `Progress` is told as well, so that a console does not show it twice."""
+ALREADY_SHOWN = {"already_shown": True}
+"""Given as `extra` to a log call whose message the caller's `Progress` shows as well; the console then skips it."""
 
 _log = logging.getLogger(__name__)
 
 
-class _OnConsole(logging.Handler):
-    """Prints messages as they are, above a bar that may be there."""
+class _ConsoleHandler(logging.Handler):
+    """Prints messages above the progress bar, if there is one."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(logging.INFO)
         self._console = console
-        self.addFilter(lambda record: not getattr(record, "told", False))
+        self.addFilter(lambda record: not getattr(record, "already_shown", False))
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""
@@ -39,13 +38,13 @@ class _OnConsole(logging.Handler):
 
 @contextmanager
 def logged(console: Console | None, file: Path | None, others: Sequence[Path] = ()) -> Iterator[None]:
-    """Show what the library logs while the block runs, and how the block failed, if it did.
+    """Show what the library logs while the block runs, and the exception if the block fails.
 
     Parameters
     ----------
-    console : prints choices, counts and the ends of stages; None for nothing
-    file : everything is appended to, with the time; None for no file
-    others : files that the block reads and writes, of which `file` must be none
+    console : shows records from level INFO; None for no output
+    file : all records are appended here, with the time; None for no file
+    others : files that the block reads and writes; `file` must not be one of them
 
     Raises
     ------
@@ -56,18 +55,18 @@ def logged(console: Console | None, file: Path | None, others: Sequence[Path] = 
     """
     with ExitStack() as stack:
         if console is not None:
-            stack.enter_context(_attached(_OnConsole(console), logging.INFO))
+            stack.enter_context(_attached(_ConsoleHandler(console), logging.INFO))
         if file is not None:
-            stack.enter_context(_attached(_appending(file, others), logging.DEBUG))
+            stack.enter_context(_attached(_file_handler(file, others), logging.DEBUG))
         try:
             yield
         except BaseException as error:
-            _log.error("%s: %s", type(error).__name__, error, extra=TOLD)
+            _log.error("%s: %s", type(error).__name__, error, extra=ALREADY_SHOWN)
             _log.debug("Where it happened:", exc_info=True)
             raise
 
 
-def _appending(file: Path, others: Sequence[Path]) -> logging.Handler:
+def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
     if any(file.resolve() == other.resolve() for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
     try:
@@ -75,13 +74,13 @@ def _appending(file: Path, others: Sequence[Path]) -> logging.Handler:
     except OSError as error:
         raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error
     handler.setLevel(logging.DEBUG)
-    handler.setFormatter(logging.Formatter(FORM))
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler
 
 
 @contextmanager
 def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
-    """Let the library's loggers reach a handler, and be as talkative as it needs, while the block runs."""
+    """Attach a handler to the library's logger, and lower its level as needed, while the block runs."""
     logger = logging.getLogger("gnrecon")
     before = logger.level
     logger.addHandler(handler)

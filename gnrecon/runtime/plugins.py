@@ -1,8 +1,8 @@
-"""What other installed packages add: readers and writers of files, and residuals, by their entry points.
+"""Plugins: file readers, file writers and residuals that other installed packages provide as entry points.
 
-A package names an object of its own in its metadata, under one of the groups below. To list them, metadata alone is
-read; a package's code is imported when one of its names is asked for, and not before. What is looked up is what is
-installed at that moment: nothing is registered, and nothing is kept.
+A package names an object in its metadata, in the group ``gnrecon.readers``, ``gnrecon.writers`` or
+``gnrecon.residuals``. Listing plugins reads metadata only; a package's code is imported when one of its plugins is
+loaded. Every look-up reads the installed packages anew: nothing is registered or cached.
 """
 
 from __future__ import annotations
@@ -12,39 +12,37 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, Literal
 
 from gnrecon.runtime.errors import GnreconError, UsageError
 
-READERS, WRITERS, RESIDUALS = "gnrecon.readers", "gnrecon.writers", "gnrecon.residuals"
-
-KINDS = {READERS: "reader", WRITERS: "writer", RESIDUALS: "residual"}
-"""Groups of entry points, and what each holds."""
+PluginKind = Literal["reader", "writer", "residual"]
+"""What a plugin is; the group of its entry points is ``gnrecon.`` and the plural."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """One entry point: its group, its name there, and where it comes from."""
+    """One entry point and its kind."""
 
-    group: str
+    kind: PluginKind
     entry: EntryPoint
 
     def __str__(self) -> str:
-        """Say what it is and which package brings it."""
-        return f"the {KINDS[self.group]} {self.entry.name!r} of {self.package}"
+        """Return its kind, its name and its package, for messages."""
+        return f"the {self.kind} {self.entry.name!r} of {self.package}"
 
     @property
     def package(self) -> str:
-        """The package that it comes from, or its object where the metadata is too damaged to say."""
+        """Name and version of its package, or the entry point's object where the metadata is damaged."""
         with suppress(Exception):
             if self.entry.dist is not None:
                 return f"the package {self.entry.dist.name} {self.entry.dist.version}"
         return self.entry.value
 
     def load(self) -> Any:
-        """Return the object, importing its package.
+        """Import the package and return the object.
 
         Raises
         ------
@@ -56,46 +54,47 @@ class Plugin:
         except MemoryError:
             raise
         except (Exception, SystemExit) as error:
-            raise UsageError(f"{_capital(self)} cannot be loaded ({told(error)}).") from error
+            raise UsageError(f"{_capital(self)} cannot be loaded ({describe_error(error)}).") from error
         if not callable(found):
             raise UsageError(f"{_capital(self)} is {type(found).__name__!r}, which cannot be called.")
         _log.info("Loaded %s.", self)
         return found
 
     def guarded(self, kind: type[GnreconError]) -> AbstractContextManager[None]:
-        """Guard a block of the package's own code; whatever goes wrong in it is one sentence.
+        """Guard a block that runs the package's code: turn its exceptions into one sentence.
 
         Raises
         ------
         GnreconError
-            Of the given kind, when the block fails by its own fault; see `gnrecon.runtime.plugins.guarded`.
+            Of the given kind, when the block fails; see `gnrecon.runtime.plugins.guarded` for the exceptions.
         """
-        return guarded(kind, lambda error: f"{self.subject} failed ({told(error)}).")
+        return guarded(kind, lambda error: f"{self.subject} failed ({describe_error(error)}).")
 
     @property
     def subject(self) -> str:
-        """What it is, as the subject of the sentence that says what it did."""
-        # What is said of a reader follows the name of the file.
-        return str(self) if self.group == READERS else _capital(self)
+        """Its description as the subject of a sentence."""
+        # A message about a reader begins with the name of the file.
+        return str(self) if self.kind == "reader" else _capital(self)
 
 
-def installed(group: str) -> list[Plugin]:
-    """Return all that installed packages offer of a group, by name."""
-    return sorted((Plugin(group, entry) for entry in entry_points(group=group)), key=lambda one: one.entry.name)
+def installed(kind: PluginKind) -> list[Plugin]:
+    """Return all installed plugins of a kind, sorted by name."""
+    found = (Plugin(kind, entry) for entry in entry_points(group=f"gnrecon.{kind}s"))
+    return sorted(found, key=lambda plugin: plugin.entry.name)
 
 
-def find(group: str, name: str) -> Plugin | None:
-    """Return what is installed of a group under a name, or None.
+def find(kind: PluginKind, name: str) -> Plugin | None:
+    """Return the installed plugin of a kind and a name, or None.
 
     Raises
     ------
     UsageError
-        When several packages offer it, so that chance would decide.
+        When several packages provide it.
     """
-    found = [one for one in installed(group) if one.entry.name == name]
+    found = [plugin for plugin in installed(kind) if plugin.entry.name == name]
     if len(found) > 1:
         raise UsageError(
-            f"Several packages offer a {KINDS[group]} {name!r}: {' and '.join(one.package for one in found)}; "
+            f"Several packages offer a {kind} {name!r}: {' and '.join(plugin.package for plugin in found)}; "
             f"uninstall all but one of them."
         )
     return found[0] if found else None
@@ -105,50 +104,43 @@ def _capital(plugin: Plugin) -> str:
     return str(plugin).replace("the", "The", 1)
 
 
-_LONGEST = 200
-
-
-# Code of other people that runs on files: whatever it raises on damaged ones becomes one sentence.
-
-
 @contextmanager
 def guarded(kind: type[GnreconError], sentence: Callable[[BaseException], str]) -> Iterator[None]:
-    """Run a block of other people's code.
+    """Run a block of third-party code, and turn its exceptions into one sentence.
 
-    Failures of gnrecon's own kinds, want of memory, what the system says of a file, and interrupts come through as they
-    are.
+    `GnreconError`, `MemoryError`, operating system errors with a number, and interrupts pass through unchanged.
 
     Parameters
     ----------
-    kind : of the failure that the block's own ones become
-    sentence : says what failed, given what was raised; see `told`
+    kind : class of the exception that is raised instead
+    sentence : returns the message, given the original exception; see `describe_error`
 
     Raises
     ------
     GnreconError
-        Of the given kind, when the block fails in any other way.
+        Of the given kind, for any other exception.
     """
     try:
         yield
     except (GnreconError, MemoryError):
         raise
     except BaseException as error:
-        if not _fails(error):
+        if not _is_own_failure(error):
             raise
-        said = sentence(error)
-        _log.info("%s", said, exc_info=True)
-        raise kind(said) from error
+        message = sentence(error)
+        _log.info("%s", message, exc_info=True)
+        raise kind(message) from error
 
 
-def told(error: BaseException) -> str:
-    """Return what was raised in one line: its type, and the beginning of what it says."""
-    said = " ".join(str(error).split())[:_LONGEST]
-    return f"{type(error).__name__}{': ' if said else ''}{said}"
+def describe_error(error: BaseException, *, max_characters: int = 200) -> str:
+    """Return an exception in one line: its type, and its message cut to `max_characters`, about two lines."""
+    message = " ".join(str(error).split())[:max_characters]
+    return f"{type(error).__name__}{': ' if message else ''}{message}"
 
 
-def _fails(error: BaseException) -> bool:
-    """Whether this is the code's own failure."""
+def _is_own_failure(error: BaseException) -> bool:
+    """Return whether the third-party code itself failed."""
     if isinstance(error, OSError):
         return error.errno is None
-    # What goes wrong inside of a library written in Rust is a `PanicException`, which is no `Exception`.
+    # A panic in a Rust library is a `PanicException`, which is not an `Exception`.
     return isinstance(error, Exception | SystemExit) or type(error).__name__ == "PanicException"

@@ -1,10 +1,10 @@
-"""Importing the heavy libraries ahead of their use, so that processes that are forked later need not."""
+"""Imports the heavy libraries in the parent process, so that forked processes do not have to."""
 
 from __future__ import annotations
 
 
 def preload() -> None:
-    """Import every library that most runs come to."""
+    """Import all libraries that most runs need."""
     import manifold3d  # noqa: F401
     import open3d  # noqa: F401
     import PIL.Image  # noqa: F401

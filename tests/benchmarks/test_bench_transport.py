@@ -12,13 +12,11 @@ from benchmarks.__main__ import main as bench
 from gnrecon.field import TANH, Network
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.shape_learning import PROBLEMS, catenoid
-from gnrecon.shape_learning import learn as pretrain
 
 
 def test_figures_of_a_small_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pretrain, "STEPS", 15)
     monkeypatch.setitem(PROBLEMS, "catenoid", lambda: replace(catenoid(), network=Network((8, 8), TANH)))
     out = tmp_path / "figures.json"
     assert bench(["transport", "--problem", "catenoid", "--steps", "0,2", "--json", str(out)]) == ExitCode.OK

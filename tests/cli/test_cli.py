@@ -119,7 +119,10 @@ def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -
         (("-o", "{out}/mesh.obj", "--fraction", "1.5"), "fraction of points is 1.5"),
         (("-o", "{out}/mesh.obj", "--fraction", "half"), "Invalid value for '--fraction'"),
         (("-o", "{out}/mesh.obj", "--resolution", "3"), "at least 16 cells, not 3"),
-        (("-o", "{out}/mesh.obj", "--widths", "32;32"), "'32;32' is not a list of whole numbers"),
+        (
+            ("-o", "{out}/mesh.obj", "--widths", "32;32"),
+            "widths must be a list of whole numbers such as 2000 or 32,32,32, not '32;32'",
+        ),
         (("-o", "{out}/mesh.obj", "--smoothness", "1"), "No such option: --smoothness"),
         (("-o", "{out}/mesh.obj", "--preview", "{out}/picture.jpg"), "picture.jpg"),
         (("-o", "{out}/mesh.obj", "--html", "{out}/page.pdf"), "page.pdf"),
@@ -229,7 +232,7 @@ def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path) -
     scan = write_scan(tmp_path / "far.ply", points + place, normals)
     done = gnrecon(scan, "-o", out / "far.stl", "--report", out / "report.json", *FAST_WORDS)
     assert done.returncode == 0, done.stderr
-    assert "relative to the origin 500000 4000000 100, which its header names" in done.stderr
+    assert "relative to the origin 500000 4000000 100. The file's header states it" in done.stderr
     assert json.loads((out / "report.json").read_text())["origin"] == [500_000, 4_000_000, 100]
     assert (out / "far.stl").read_bytes().startswith(b"STL, origin 500000 4000000 100 ")
     facts = verify_file(out / "far.stl")
@@ -306,7 +309,7 @@ def test_an_interrupt_during_the_fit_keeps_the_best_mesh(out: Path, scan: Path) 
         process.send_signal(signal.SIGINT)
         code, stderr = end(process)
     assert code == ExitCode.INTERRUPTED, stderr
-    assert stderr.endswith(f"gnrecon: Interrupted; {out / 'mesh.obj'} shows the best field until then.\n")
+    assert stderr.endswith(f"gnrecon: Interrupted; {out / 'mesh.obj'} is the mesh of the best field so far.\n")
     assert_torus(out / "mesh.obj")
     assert json.loads((out / "report.json").read_text())["fit"]["interrupted"]
 
@@ -390,6 +393,14 @@ def test_version_and_help() -> None:
     assert details.returncode == 0
     for option in ("--output", "--fraction", "--widths", "--resolution", "--reference", "--overwrite", "--debug"):
         assert option in details.stdout
+
+
+def test_the_command_line_starts_without_the_stages() -> None:
+    code = "import sys, gnrecon.cli.app; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("gnrecon.")}
+    assert rooms == {"cli", "deprecated_paths", "geometry", "option_table", "runtime", "version"}
+    assert "scipy" not in loaded
 
 
 def test_a_scan_from_standard_input_makes_all_files(scan: Path, out: Path) -> None:

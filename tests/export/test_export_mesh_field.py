@@ -15,7 +15,7 @@ from gnrecon.export import mesh_field as meshing
 from gnrecon.export.export_parameters import ExportParameters, ResolutionParameters
 from gnrecon.export.mesh_field import MeshOptions, cells_for_curvature, mesh_field
 from gnrecon.export.resolution import chord_error
-from gnrecon.ingest.noise import neighbour_spacing
+from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError

@@ -1,4 +1,4 @@
-"""Local detail against its formula written plainly, and against finite differences."""
+"""Local detail against a direct implementation of its formula, and against finite differences."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gnrecon.field.partition_of_unity import AROUND, TOGETHER, Detail, Partition
+from gnrecon.field.field_parameters import FieldParameters
+from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
-from gnrecon.pipeline import limited
+from gnrecon.runtime.compute_limits import limited
 
 
 def detail(rng: np.random.Generator, cubes: int = 5, features: int = 7) -> Detail:
@@ -65,7 +66,7 @@ def test_around_centres_it_is_what_it_is_at_each_point(reach: float, rng: np.ran
 def test_around_many_centres_threads_change_nothing(rng: np.random.Generator) -> None:
     of = detail(rng)
     offsets = rng.uniform(-0.1, 0.1, (64, 3))
-    x = points(of, rng, 2 * AROUND // len(offsets) + 5)
+    x = points(of, rng, 2 * FieldParameters.batch_stencil_values // len(offsets) + 5)
     found = []
     for count in (1, 2):
         with limited(count):
@@ -88,14 +89,14 @@ def test_derivatives_are_those_of_differences(rng: np.random.Generator) -> None:
 
 def test_many_points_are_what_each_is_alone_with_any_number_of_threads(rng: np.random.Generator) -> None:
     of = detail(rng)
-    x = points(of, rng, 2 * TOGETHER + 5)
+    x = points(of, rng, 2 * FieldParameters.batch_points + 5)
     found = []
     for count in (1, 2):
         with limited(count):
             found.append(of.value_and_gradient(x))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
-    some = [0, TOGETHER - 1, TOGETHER, len(x) - 1]
+    some = [0, FieldParameters.batch_points - 1, FieldParameters.batch_points, len(x) - 1]
     np.testing.assert_allclose(found[0][0][some], [plainly(of, point) for point in x[some]], atol=1e-12)
 
 

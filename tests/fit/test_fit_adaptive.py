@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
 from gnrecon.fit import two_level as adaptive
-from gnrecon.fit.model_selection import ANGLES, LENGTHS, POSITIONS, Leftover, _smoothest, choose
+from gnrecon.fit.model_selection import Leftover, _smoothest, choose
+from gnrecon.fit.parameters import ModelSelectionParameters
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.runtime.errors import InputError
 
@@ -182,8 +183,8 @@ def test_estimated_normals_do_not_smooth_ripples_away() -> None:
     )
     assert free.angle > heeding.angle or free.position < heeding.position
     # The points are believed, and the normals are not.
-    assert free.angle == max(ANGLES)
-    assert free.position == pytest.approx(min(POSITIONS) * 0.03)
+    assert free.angle == max(ModelSelectionParameters.angle_noises_radians)
+    assert free.position == pytest.approx(min(ModelSelectionParameters.position_noises_disk_radii) * 0.03)
 
 
 def test_scans_that_do_not_match_are_not_wound_through() -> None:
@@ -206,7 +207,7 @@ def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
     better = alike.copy()
     better[:, 4] -= 0.5
     assert _smoothest({2: alike, 3: better}) == (3, 4)
-    assert len(LENGTHS) > 3
+    assert len(ModelSelectionParameters.lengths_disk_radii) > 3
 
 
 def test_left_over_is_in_unit_coordinates(clean: tuple[Samples, NeuralSDF]) -> None:

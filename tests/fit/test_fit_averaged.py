@@ -9,10 +9,11 @@ import pytest
 
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import denoising as averaged
-from gnrecon.fit.denoising import NOISY, LocalData, _best, choose_local_data, has_edges
+from gnrecon.fit.denoising import LocalData, _best, _candidates, choose_local_data, has_edges
 from gnrecon.fit.local_solve import Belief
 from gnrecon.fit.model_selection import Choice, Leftover
-from gnrecon.fit.shape_priors.bilateral_filter import Averaging
+from gnrecon.fit.parameters import DenoisingParameters
+from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.geometry.point_cloud import Frame, Samples
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
@@ -49,7 +50,7 @@ def test_a_noisy_cube_is_averaged_and_its_fit_says_so() -> None:
 
 def test_faces_that_meet_are_told_from_bends() -> None:
     def edges(samples: Samples) -> bool:
-        return has_edges(*averaged.FIRST.of(samples.points, samples.normals))
+        return has_edges(*_candidates(DenoisingParameters())[0].apply(samples.points, samples.normals))
 
     rng = np.random.default_rng(2)
     assert edges(cube(1500, 0.0, rng))
@@ -63,7 +64,7 @@ def test_faces_that_meet_are_told_from_bends() -> None:
     assert not edges(Samples(x, np.stack([0 * side, 0 * side, side], axis=1), FRAME))
 
 
-def chosen(gains: dict[Averaging, float], edges: bool) -> Averaging | None:
+def chosen(gains: dict[BilateralFilter, float], edges: bool) -> BilateralFilter | None:
     """Return the averaging whose left-out points are told better, by gains of a scatter of one hundredth."""
     scatter = 0.01 * np.tile([1.0, -1.0], 50)[:, None]
     belief = Belief(0.1, 0.01, 0.1)
@@ -83,7 +84,7 @@ def chosen(gains: dict[Averaging, float], edges: bool) -> Averaging | None:
 
 def test_edges_decide_what_scatter_hides() -> None:
     # The doubt about a mean of a hundred is a thousandth.
-    first, (wider, widest) = averaged.FIRST, averaged.OTHERS
+    first, wider, widest = _candidates(DenoisingParameters())
     for gain, without, with_edges in ((0.003, first, first), (0.0015, None, first), (-0.0005, None, first)):
         assert chosen({first: gain}, edges=False) == without
         assert chosen({first: gain}, edges=True) == with_edges
@@ -118,6 +119,6 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
         assert found.averaging is None
         return None if tried else found
 
-    assert result(NOISY, estimated=False) is not None
-    assert result(1.1 * NOISY, estimated=True) is not None
-    assert result(1.1 * NOISY, estimated=False) is None
+    assert result(DenoisingParameters.least_noise_disk_radii, estimated=False) is not None
+    assert result(1.1 * DenoisingParameters.least_noise_disk_radii, estimated=True) is not None
+    assert result(1.1 * DenoisingParameters.least_noise_disk_radii, estimated=False) is None

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.marginal_likelihood import ANGLE, ESTIMATED, POSITION, clean_noise, heights
-from gnrecon.fit.model_selection import LENGTHS, Choice, Leftover, Trials
+from gnrecon.fit.marginal_likelihood import clean_noise, heights
+from gnrecon.fit.model_selection import Choice, Leftover, Trials
+from gnrecon.fit.parameters import CleanScanParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
@@ -68,9 +69,12 @@ def test_neighbours_tell_the_noise_of_positions() -> None:
 def test_a_clean_scan_has_the_noise_that_its_neighbours_tell() -> None:
     scan, radius = told(bumpy(1500)), Density(bumpy(1500).points).radius
     position, angle = clean_noise(*scan, radius, estimated=False) or pytest.fail("the scan is clean")
-    assert POSITION * radius <= position < 0.01 * radius
-    assert ANGLE <= angle < 0.015
-    assert clean_noise(*scan, radius, estimated=True) == (POSITION * radius, ESTIMATED)
+    assert CleanScanParameters.least_position_noise_disk_radii * radius <= position < 0.01 * radius
+    assert CleanScanParameters.least_angle_noise_radians <= angle < 0.015
+    assert clean_noise(*scan, radius, estimated=True) == (
+        CleanScanParameters.least_position_noise_disk_radii * radius,
+        CleanScanParameters.estimated_angle_noise_radians,
+    )
 
 
 @pytest.mark.parametrize(
@@ -97,11 +101,17 @@ def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: p
     scan = leftover(bumpy(200))
     trials = Trials.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
     even = np.linspace(-1.0, 1.0, 10)[:, None]
-    scores = {LENGTHS[0]: 3.0 + even, LENGTHS[1]: 2.0 + even, LENGTHS[2]: 1.99 - even, LENGTHS[3]: 0.0 * even}
+    lengths = ModelSelectionParameters.lengths_disk_radii
+    scores = {
+        lengths[0]: 3.0 + even,
+        lengths[1]: 2.0 + even,
+        lengths[2]: 1.99 - even,
+        lengths[3]: 0.0 * even,
+    }
     monkeypatch.setattr(Trials, "scores", lambda _, length: scores[length])
     belief = trials.clean()
     assert belief is not None
-    assert belief.length == LENGTHS[1]
+    assert belief.length == lengths[1]
 
 
 def test_clean_scans_are_fitted_nearer_than_by_choice(monkeypatch: pytest.MonkeyPatch) -> None:

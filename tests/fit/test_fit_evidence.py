@@ -12,9 +12,10 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.local_solve import SIZE, Patch, data_kernel
-from gnrecon.fit.marginal_likelihood import ANGLES, POINTS, POSITIONS, Evidence, log_density
+from gnrecon.fit.local_solve import Patch, data_kernel
+from gnrecon.fit.marginal_likelihood import Evidence, log_density
 from gnrecon.fit.model_selection import Leftover, Trials
+from gnrecon.fit.parameters import LocalSolveParameters, MarginalLikelihoodParameters
 
 LENGTH, RADIUS = 0.4, 0.05
 
@@ -58,7 +59,11 @@ def test_noise_is_found_again(position: float, angle: float, rng: np.random.Gene
     drawn = [noisy(patch, position * RADIUS, angle, rng) for patch in exact]
     found = Evidence(drawn, features, RADIUS, "cpu").noise(LENGTH)
     # What the prior's size, which is not the functions' own, makes of it moves it by a place in the tables at most.
-    for value, wanted, table in ((found[0] / RADIUS, position, POSITIONS), (found[1], angle, ANGLES)):
+    tables = MarginalLikelihoodParameters
+    for value, wanted, table in (
+        (found[0] / RADIUS, position, tables.position_noises_disk_radii),
+        (found[1], angle, tables.angle_noises_radians),
+    ):
         nearest = int(np.argmin(np.abs(np.log(np.array(table) / wanted))))
         assert table[max(nearest - 1, 0)] - 1e-9 <= value <= table[min(nearest + 1, len(table) - 1)] + 1e-9
 
@@ -85,7 +90,7 @@ def test_few_points_and_estimated_normals_have_a_belief_too(rng: np.random.Gener
     x = rng.standard_normal((40, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     leftover = Leftover(x, x, 0.01 * x[:, 0], x)
-    assert len(x) < POINTS
+    assert len(x) < MarginalLikelihoodParameters.patch_points
     held = np.arange(40) % 6 == 0
     found = Trials.draw(leftover, held, leftover.density.radius, rng, "cpu").choice()
     assert found.evident is not None
@@ -100,4 +105,6 @@ def test_size_of_a_kernel(rng: np.random.Generator) -> None:
     kernel = data_kernel(patch, features, LENGTH, patch.size)
     # The mean variance of its values is the square of the size that is taken for that of the patch's function.
     assert float(kernel.diagonal()[:200].mean()) == pytest.approx(patch.size**2, rel=0.2)
-    assert patch.size == pytest.approx(SIZE * float(patch.value.square().mean().sqrt()))
+    assert patch.size == pytest.approx(
+        LocalSolveParameters.correction_rms_factor * float(patch.value.square().mean().sqrt())
+    )

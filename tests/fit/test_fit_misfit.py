@@ -60,9 +60,8 @@ def test_values_that_are_all_zero_or_not_finite_still_make_a_report(height: floa
     assert json.dumps(found.as_dict())
 
 
-def test_many_points_are_asked_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gnrecon.fit.residual_stats.MOST", 10)
-    found = Misfit.of(Plane(), samples(np.arange(95.0), np.zeros(95)))  # type: ignore[arg-type]
+def test_many_points_are_asked_evenly() -> None:
+    found = Misfit.of(Plane(), samples(np.arange(95.0), np.zeros(95)), most_points=10)  # type: ignore[arg-type]
     assert np.allclose(found.distances, np.arange(0, 95, 10))
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.consistency import LEAST, LEAST_POINTS, MOST, find_outliers
+from gnrecon.fit.consistency import find_outliers
+from gnrecon.fit.parameters import OutlierParameters
 from gnrecon.geometry.signed_distance import Density
 
 COUNT = 1000
@@ -32,7 +33,7 @@ def test_points_of_a_scan_are_kept(noise: float) -> None:
 def test_points_off_the_surface_are_found(noise: float) -> None:
     rng = np.random.default_rng(1)
     x = ball(noise, rng)
-    off = rng.permutation(COUNT)[: int(2 * LEAST * COUNT)]
+    off = rng.permutation(COUNT)[: int(2 * OutlierParameters.least_share * COUNT)]
     x[off] *= 1 + rng.choice([-0.3, 0.3], (len(off), 1))
     found = find_outliers(field(x), Density(x))
     np.testing.assert_array_equal(np.flatnonzero(found), np.sort(off))
@@ -46,11 +47,11 @@ def test_a_single_one_is_chance() -> None:
 
 def test_many_are_no_outliers() -> None:
     x = ball(0.0, np.random.default_rng(3))
-    x[: int(1.5 * MOST * COUNT)] *= 1.2
+    x[: int(1.5 * OutlierParameters.most_share * COUNT)] *= 1.2
     assert not find_outliers(field(x), Density(x)).any()
 
 
 def test_few_points_have_no_usual_difference() -> None:
-    x = ball(0.0, np.random.default_rng(4))[: LEAST_POINTS - 1]
+    x = ball(0.0, np.random.default_rng(4))[: OutlierParameters.least_points - 1]
     x[0] *= 1.5
     assert not find_outliers(field(x), Density(x)).any()

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.local_solve import SHARE, SIZE, Patch, PatchSystem, RowSystem, patch_system
+from gnrecon.fit.local_solve import Patch, PatchSystem, RowSystem, patch_system
+from gnrecon.fit.parameters import LocalSolveParameters
 
 LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
 
@@ -45,17 +46,22 @@ def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor]:
     """J and r of data and volume, each row over its standard deviation."""
     value, gradient = rows(features, patch.points, patch.center)
     free = rows(features, patch.volume, patch.center)[0]
-    spread = (SHARE * patch.distance)[:, None]
+    spread = (LocalSolveParameters.volume_deviation_share * patch.distance)[:, None]
     J = torch.cat([value / POSITION, gradient.reshape(-1, len(features)) / ANGLE, free / spread])
     r = torch.cat([patch.value / POSITION, patch.gradient.reshape(-1) / ANGLE, patch.wanted / spread[:, 0]])
     return J, r
 
 
 @pytest.mark.parametrize("system", [PatchSystem, RowSystem])
+@pytest.mark.seed(1503570714)
 def test_amplitudes_are_the_mode_of_bayesian_regression(
     system: type[PatchSystem | RowSystem], patch: Patch, features: Features
 ) -> None:
-    prior = SIZE * float(patch.value.square().mean().sqrt()) * (2 / len(features)) ** 0.5
+    prior = (
+        LocalSolveParameters.correction_rms_factor
+        * float(patch.value.square().mean().sqrt())
+        * (2 / len(features)) ** 0.5
+    )
     J, r = plainly(patch, features)
     expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
     found = system(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)

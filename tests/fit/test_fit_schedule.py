@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit.fit_options import NORMAL_RESIDUALS, OPTIMISERS, SEARCHES
 from gnrecon.fit.objective import Scene
-from gnrecon.fit.single_network import MAX_STEP_POINTS, hold_out
+from gnrecon.fit.parameters import SingleNetworkParameters
+from gnrecon.fit.single_network import hold_out
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import SOLVERS
 from gnrecon.optim import Record
@@ -149,7 +150,7 @@ def test_same_seed_same_bits(widths: tuple[int, ...]) -> None:
 
 
 def test_more_points_than_a_step_takes() -> None:
-    assert MAX_STEP_POINTS < 4500
+    assert SingleNetworkParameters.step_points < 4500
     sdf, solution = fit(sphere(4500), FitOptions(widths=(40,), steps=1))
     assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(50, 2)))).mean() < 0.03 * FRAME.scale
     assert solution.history[0].loss < solution.history[0].before

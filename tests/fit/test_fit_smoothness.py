@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.global_field import LENGTHS, REACHES, Smoothness, global_smoothness
+from gnrecon.fit.global_field import Smoothness, global_smoothness
 from gnrecon.fit.objective import Scene
+from gnrecon.fit.parameters import GlobalFieldParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 
@@ -46,12 +47,12 @@ def chosen(samples: Samples) -> Smoothness:
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_ball_needs_long_features(noise: float) -> None:
-    assert chosen(rippled(1.0, 0.0, noise)).length > LENGTHS[0]
+    assert chosen(rippled(1.0, 0.0, noise)).length > GlobalFieldParameters.length_scales_radii[0]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
 def test_ripples_need_short_features(noise: float) -> None:
-    assert chosen(rippled(9.0, 0.05, noise)).length == LENGTHS[0]
+    assert chosen(rippled(9.0, 0.05, noise)).length == GlobalFieldParameters.length_scales_radii[0]
 
 
 def test_equal_seeds_choose_alike() -> None:
@@ -63,5 +64,5 @@ def test_exact_normals_of_a_smooth_shape_reach_farther_than_scattered_ones() -> 
     exact = rippled(1.0, 0.0, 0.01)
     turned = exact.normals + 0.5 * np.random.default_rng(3).standard_normal(exact.normals.shape)
     scattered = Samples(exact.points, turned / np.linalg.norm(turned, axis=1, keepdims=True), FRAME)
-    assert chosen(exact).reach == REACHES[-1]
-    assert chosen(scattered).reach < REACHES[-1]
+    assert chosen(exact).reach == GlobalFieldParameters.normal_reaches_spacings[-1]
+    assert chosen(scattered).reach < GlobalFieldParameters.normal_reaches_spacings[-1]

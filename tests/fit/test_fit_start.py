@@ -9,8 +9,8 @@ from scipy.special import kv
 from torch import Tensor
 
 from gnrecon.field import Siren
-from gnrecon.field.random_features import DEGREES_OF_FREEDOM
-from gnrecon.fit.initialisation import COARSE, Spectrum, random_features, solve_last_layer
+from gnrecon.field.field_parameters import FieldParameters
+from gnrecon.fit.initialisation import Spectrum, random_features, solve_last_layer
 from gnrecon.fit.objective import FieldProblem, Term
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
@@ -74,7 +74,9 @@ def test_values_that_are_not_finite_end_with_a_sentence() -> None:
         solve_last_layer(field, broken, theta)
 
 
-@pytest.mark.parametrize("spectrum", [COARSE, Spectrum(0.25, DEGREES_OF_FREEDOM)], ids=["coarse", "smooth"])
+@pytest.mark.parametrize(
+    "spectrum", [Spectrum(), Spectrum(0.25, FieldParameters.degrees_of_freedom)], ids=["coarse", "smooth"]
+)
 def test_features_have_a_maternlike_spectrum(spectrum: Spectrum) -> None:
     """The kernel E[2 sin(w.x + b) sin(w.y + b)] = E[cos w.(x - y)] is Matern's, of smoothness nu / 2."""
     like = torch.zeros(1, dtype=torch.float64)

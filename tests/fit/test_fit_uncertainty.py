@@ -15,8 +15,9 @@ from torch.func import grad, jacrev, vmap
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
 from gnrecon.fit.initialisation import random_features
-from gnrecon.fit.laplace_approximation import MOST_PARAMETERS, PRIOR, DataRows, Laplace, free_units, laplace
-from gnrecon.fit.uncertainty import PATCHES, calibration, left_out_scores
+from gnrecon.fit.laplace_approximation import DataRows, Laplace, free_units, laplace
+from gnrecon.fit.parameters import LaplaceParameters, UncertaintyParameters
+from gnrecon.fit.uncertainty import calibration, left_out_scores
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import normal_projection, normal_vector
@@ -71,7 +72,7 @@ def plain_precision(rows: DataRows, noise: float) -> tuple[Tensor, Tensor, Tenso
     prior, offsets = torch.empty(len(columns), dtype=torch.float64), rows.field.layout.offsets
     for start, stop in zip(offsets, [*offsets[1:], rows.field.layout.count], strict=True):
         group = (columns >= start) & (columns < stop)
-        prior[group] = value[:, group].square().sum() / len(rows) / PRIOR**2
+        prior[group] = value[:, group].square().sum() / len(rows) / LaplaceParameters.prior_deviation_radii**2
     return J.T @ J / noise**2 + prior.diag(), J, prior
 
 
@@ -95,7 +96,8 @@ def test_a_wide_last_layer_stands_for_all_parameters() -> None:
     assert len(free_columns(Siren((1000,)))) == 1001
     deep = Siren((256, 256))
     columns = free_columns(deep)
-    assert 0.9 * MOST_PARAMETERS < len(columns) <= MOST_PARAMETERS
+    most = LaplaceParameters.most_free_parameters
+    assert 0.9 * most < len(columns) <= most
     assert len(columns.unique()) == len(columns)
     assert torch.equal(columns[-257:], torch.arange(deep.layout.count - 257, deep.layout.count))
 
@@ -166,7 +168,8 @@ def test_the_factor_covers_what_is_left_out_and_never_takes_away() -> None:
     sure = replace(posterior, factor=4 * posterior.factor, noise=posterior.noise / 4)
     factor, rng = calibration(rows, sure), np.random.default_rng(0)
     assert factor > 1
-    inside = [np.abs(left_out_scores(rows, sure, size, PATCHES[size], rng)) <= 2 * factor for size in PATCHES]
+    patches = zip(UncertaintyParameters.patch_sizes, UncertaintyParameters.patch_counts, strict=True)
+    inside = [np.abs(left_out_scores(rows, sure, size, count, rng)) <= 2 * factor for size, count in patches]
     assert np.mean([part.mean() for part in inside]) == pytest.approx(0.9545, abs=0.01)
     assert calibration(rows, replace(posterior, factor=posterior.factor / 100, noise=100 * posterior.noise)) == 1
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnrecon.geometry.signed_distance import Box, CoarseDistance, halved, near_surface, winding_number
+from gnrecon.geometry.signed_distance import Box, CoarseDistance, kd_tree_order, sample_near_surface, winding_number
 
 Float = NDArray[np.float64]
 Shape = Callable[[int], tuple[Float, Float]]
@@ -60,7 +60,7 @@ def test_box() -> None:
 
 def test_near_surface() -> None:
     points, _ = sphere(50)
-    drawn = near_surface(points, 1e-6, 3000, np.random.default_rng(1))
+    drawn = sample_near_surface(points, 1e-6, 3000, np.random.default_rng(1))
     assert drawn.shape == (3000, 3)
     gaps = np.linalg.norm(drawn[:, None] - points, axis=2)
     nearest = gaps.argmin(axis=1)
@@ -75,7 +75,7 @@ def test_samplers_follow_their_generator() -> None:
     box = Box.around(points, 0.1)
     for draw in (
         lambda seed: box.sample(10, np.random.default_rng(seed)),
-        lambda seed: near_surface(points, 0.1, 10, np.random.default_rng(seed)),
+        lambda seed: sample_near_surface(points, 0.1, 10, np.random.default_rng(seed)),
     ):
         assert np.array_equal(draw(3), draw(3))
         assert not np.array_equal(draw(3), draw(4))
@@ -191,16 +191,16 @@ def test_a_large_cloud_is_summed_by_a_subset() -> None:
 def test_halved_points_come_in_compact_patches() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(size=(1000, 3)) * [4.0, 2.0, 0.0]
-    order = halved(points)
+    order = kd_tree_order(points)
     assert sorted(order) == list(range(1000))
     # Runs of 8 and 64 points of a plane, 125 to a unit of area: their patches are about square.
     for length in (8, 64):
         sides = [np.ptp(points[order][start : start + length], axis=0).max() for start in range(0, 1000, length)]
         assert np.mean(sides) < 1.6 * np.sqrt(length / 125)
-    assert np.array_equal(halved(points), order)
+    assert np.array_equal(kd_tree_order(points), order)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 9])
 def test_few_or_equal_points_are_halved(count: int) -> None:
-    assert sorted(halved(np.random.default_rng(count).normal(size=(count, 3)))) == list(range(count))
-    assert sorted(halved(np.ones((count, 3)))) == list(range(count))
+    assert sorted(kd_tree_order(np.random.default_rng(count).normal(size=(count, 3)))) == list(range(count))
+    assert sorted(kd_tree_order(np.ones((count, 3)))) == list(range(count))

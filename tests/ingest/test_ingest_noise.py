@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from analytic_clouds import sphere, torus
 
+from gnrecon.geometry.local_pca import tangent_coordinates
 from gnrecon.ingest import estimate_noise, mean_spacing
-from gnrecon.ingest.noise import local_frames
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
 RADIUS = {sphere: 1.0, torus: 1.3}
@@ -62,7 +62,7 @@ def test_too_few_points_for_their_shape_tell_nothing(rng: np.random.Generator) -
 
 def test_frames_keep_distances(rng: np.random.Generator) -> None:
     groups = rng.normal(size=(5, 9, 3))
-    local = local_frames(groups)
+    local = tangent_coordinates(groups)
     reach = np.linalg.norm(groups - groups[:, :1], axis=2).max(axis=1)
     np.testing.assert_allclose(
         np.linalg.norm(local, axis=2) * reach[:, None], np.linalg.norm(groups - groups[:, :1], axis=2)

@@ -9,14 +9,14 @@ import pytest
 from analytic_clouds import sphere, thin_shell, torus
 
 from gnrecon.ingest import flip_if_inward, oriented_normals
-from gnrecon.ingest.orientation_methods import agreement as confirmed
 from gnrecon.ingest.orientation_methods import (
     consistent_normals,
-    disorder,
     gauss_normals,
     outwardness,
-    winding_on_surface,
+    winding_at_points,
+    winding_disorder,
 )
+from gnrecon.ingest.orientation_methods import winding_agreement as confirmed
 from gnrecon.runtime.errors import InputError
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
@@ -119,14 +119,14 @@ def test_only_the_sides_of_given_directions_are_found() -> None:
 
 def test_winding_number_of_closed_inward_and_open_surfaces() -> None:
     points, truth = sphere(4000, np.random.default_rng(0))
-    np.testing.assert_allclose(np.median(winding_on_surface(points, truth)), 0.5, atol=0.02)
+    np.testing.assert_allclose(np.median(winding_at_points(points, truth)), 0.5, atol=0.02)
     assert outwardness(points, truth) == pytest.approx(1, abs=0.04)
     assert outwardness(points, -truth) == pytest.approx(-1, abs=0.04)
     half = points[:, 2] > 0
     # A sphere's kernel is 1 / (2 distance) of the constant sign; half of the surface carries about half of the flux.
     assert 0.3 < outwardness(points[half], truth[half]) < 0.7
     random_signs = np.sign(np.random.default_rng(1).normal(size=(4000, 1)))
-    assert disorder(points, truth) < 0.1 < 0.4 < disorder(points, random_signs * truth)
+    assert winding_disorder(points, truth) < 0.1 < 0.4 < winding_disorder(points, random_signs * truth)
     assert confirmed(points, truth) > 0.95 > 0.5 > confirmed(points, random_signs * truth)
     assert confirmed(points, -truth) < 0.05
 

@@ -11,7 +11,7 @@ from analytic_clouds import Float, sphere, torus
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
 from gnrecon.ingest.orientation import oriented_normals
-from gnrecon.ingest.orientation_methods import towards_scanner
+from gnrecon.ingest.orientation_methods import orient_towards_scanner
 from gnrecon.io import read_scans
 from gnrecon.runtime.errors import UsageError
 
@@ -52,7 +52,7 @@ def test_unknown_and_grazing_origins_follow_their_neighbours(rng: np.random.Gene
     origins = 3 * points
     origins[rng.permutation(2000)[:600]] = np.nan
     turned = truth * rng.choice([-1.0, 1.0], (2000, 1))
-    normals, share = towards_scanner(points, turned, origins) or (truth, 0.0)
+    normals, share = orient_towards_scanner(points, turned, origins) or (truth, 0.0)
     assert np.allclose(normals, truth)
     assert share == pytest.approx(0.7)
 
@@ -61,9 +61,9 @@ def test_unknown_and_grazing_origins_follow_their_neighbours(rng: np.random.Gene
 def test_few_known_origins_do_not_decide(known: float, rng: np.random.Generator) -> None:
     points, truth = sphere(1000, rng)
     origins = np.where(np.arange(1000)[:, None] < 1000 * known, 3 * points, np.nan)
-    assert towards_scanner(points, truth, origins) is None
+    assert orient_towards_scanner(points, truth, origins) is None
     assert oriented_normals(points, origins).how == "estimated"
-    assert towards_scanner(points, truth, None) is None
+    assert orient_towards_scanner(points, truth, None) is None
 
 
 def test_what_is_done_with_given_normals(rng: np.random.Generator) -> None:
@@ -87,8 +87,8 @@ def test_what_is_done_with_given_normals(rng: np.random.Generator) -> None:
     samples, counts = told["mixed", "signs"]
     assert counts.flipped == pytest.approx(share, abs=0.01)
     assert np.abs(np.einsum("ij,ij->i", samples.normals, truth)).min() > 1 - 1e-12
-    assert "% turned around; " in counts.remarks()[-1]
-    assert "% of the points confirm their side." in counts.remarks()[-1]
+    assert "% flipped; " in counts.remarks()[-1]
+    assert "% of the points confirm their sign." in counts.remarks()[-1]
     assert [told["mixed", mode][0].estimated for mode in ("auto", "given", "signs", "estimate")] == [
         False,
         False,

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import mean_spacing, prepare, subsample
-from gnrecon.ingest.subsample import METHODS, farthest_points, surface_variation
+from gnrecon.ingest.subsample import METHODS, farthest_points, pointwise_surface_variation
 from gnrecon.runtime.errors import UsageError
 
 
@@ -36,7 +36,7 @@ def box_edges(rng: np.random.Generator) -> np.ndarray:
 
 def test_curvature_keeps_more_where_the_surface_bends(rng: np.random.Generator) -> None:
     points = box_edges(rng)
-    bend = surface_variation(points)
+    bend = pointwise_surface_variation(points)
     ridge = np.abs(points[:, 0]) < 0.02
     assert bend[ridge].mean() > 20 * bend[np.abs(points[:, 0]) > 0.2].mean()
     kept = subsample(PointCloud(points), max_points=1000, method="curvature")

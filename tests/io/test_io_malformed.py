@@ -1,4 +1,4 @@
-"""Whatever is wrong with a file becomes one sentence in an InputError, and nothing else: no crash, no print."""
+"""Any error in a file becomes an InputError of one sentence, without a crash or other output."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MALFORMED: list[tuple[str, str | bytes, str]] = [
     ("a.ply", PLY.format("", FOUR).replace("vertex 4", "corner 4"), "no vertex element"),
     ("a.ply", PLY.format("", "").replace("ascii", "binary_little_endian") + "abc", "ends after 0"),
     ("a.ply", PLY.format("", "").replace("ascii", "binary_little_endian").replace("4", "9" * 15), "ends after 0"),
-    ("a.ply", "hello, this is some text\n", "no PLY file"),
+    ("a.ply", "hello, this is some text\n", "not a PLY file"),
     ("a.pcd", PCD.format(4, "ascii") + "0 0 0\n1 1 1\n", "declares 4 points"),
     ("a.pcd", PCD.format(4, "binary").encode() + bytes(30), "declares 4 points"),
     ("a.pcd", PCD.format(4, "binary_compressed").encode() + bytes(30), "declares 4 points.*ends after 0"),
@@ -63,7 +63,7 @@ MALFORMED: list[tuple[str, str | bytes, str]] = [
     ("a.obj", "f 1 2 3\n", "no vertex line"),
     ("a.obj", "v 0 0 0\nf 1 2 3\n", "names vertex 3, but there are 1"),
     ("a.obj", "v 0 0 0\nf 0 0 0\n", "indices begin at 1"),
-    ("a.obj", "v 0 0 0\nf a b c\n", "no vertex index"),
+    ("a.obj", "v 0 0 0\nf a b c\n", "not a vertex index"),
     ("a.obj", "v 0 0 0\nvn 0 0 1\nf 1//2 1//2 1//2\n", "names normal 2, but there are 1"),
     ("a.obj", "hello, this is some text\n", "no vertex line"),
     ("a.off", "OFF\n4 1 0\n0 0 0\n", "declares 4 vertices and 1 faces, but 1 rows"),

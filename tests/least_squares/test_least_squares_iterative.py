@@ -77,16 +77,16 @@ def test_without_reuse_every_linearisation_prepares() -> None:
 
 
 def test_a_preconditioner_can_be_changed_by_how_it_served() -> None:
-    heard = []
+    efforts = []
 
     def adapt(preconditioner: Preconditioner, effort: float) -> Preconditioner:
-        heard.append(effort)
+        efforts.append(effort)
         return SampledGram(1000) if effort > 1.0 else preconditioner
 
     solver = Iterative("cg", Jacobi(), reuse=False, adapt=adapt)
     counts = [solver.linearise(*system(0), identity).solve(1e-2).iterations for _ in range(5)]
-    assert heard[0] == 0.0
-    assert heard[1] == pytest.approx(0.3 * counts[0])
+    assert efforts[0] == 0.0
+    assert efforts[1] == pytest.approx(0.3 * counts[0])
     assert counts[0] > 10
     assert counts[1:] == [1] * 4, "all rows make the exact inverse"
 
@@ -135,7 +135,7 @@ def test_the_factor_of_a_damping_is_kept() -> None:
     assert counting.dampings == [1e-2, 1e-1]
 
 
-@pytest.mark.parametrize("method", ["cg", "minres", "gmres"])
+@pytest.mark.parametrize("method", ["cg", "gmres"])
 def test_truncated_steps_lower_the_loss_as_predicted(method: str) -> None:
     problem = PROBLEMS["network"](3, F64)
     last = 0.0

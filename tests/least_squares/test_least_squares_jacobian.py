@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gnrecon.least_squares import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
-from gnrecon.least_squares import jacobian as module
+from gnrecon.least_squares import layered_jacobian as module
 from gnrecon.least_squares.layer_products import gram
 
 Made = tuple[Jacobian, Tensor]
@@ -132,10 +133,9 @@ def test_rounded_factors_keep_the_precision_of_vectors() -> None:
     assert matrix.rounded() is matrix, "its vectors would be rounded with it"
 
 
-def test_long_blocks_are_cut_into_tiles_and_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "TILE", 5)
-    monkeypatch.setattr(module, "CHUNK_BYTES", 1)
+def test_long_blocks_are_cut_into_tiles_and_chunks() -> None:
     jacobian, J = layered(3, [(70, True), (67, False)])
+    jacobian = replace(jacobian, tile_rows=5, chunk_bytes=1)
     assert [len(chunk) for chunk in jacobian.dense()] == [64, 6, 64, 3]
     close(jacobian.gram().tril(), (J.T @ J).tril(), F64)
     close(
@@ -145,7 +145,7 @@ def test_long_blocks_are_cut_into_tiles_and_chunks(monkeypatch: pytest.MonkeyPat
     )
 
 
-def test_blocks_are_made_afresh_for_each_product() -> None:
+def test_blocks_are_computed_again_for_each_product() -> None:
     kept, J = layered(4)
     calls = []
 

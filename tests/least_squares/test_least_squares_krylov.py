@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gnrecon.least_squares import KrylovResult, conjugate_gradients, gmres, minres
+from gnrecon.least_squares import KrylovResult, conjugate_gradients, gmres
 from gnrecon.least_squares.krylov import Apply
 
 Method = Callable[[Apply, Tensor, Apply, float, int], KrylovResult]
-METHODS: list[Method] = [conjugate_gradients, minres, gmres]
+METHODS: list[Method] = [conjugate_gradients, gmres]
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)
 few = settings(max_examples=8, deadline=None)
 seeds = given(seed=st.integers(0, 2**31))
@@ -89,8 +89,6 @@ def test_each_method_minimises_its_own_norm() -> None:
     rests = [float(r.rest.norm()) for r in results]
     assert errors[0] < errors[1]
     assert rests[1] < rests[0]
-    # Without a preconditioner GMRES and MINRES are the same iterates.
-    torch.testing.assert_close(results[1].solution, results[2].solution)
 
 
 @each_method
@@ -141,17 +139,15 @@ def test_indefinite_matrices() -> None:
     assert "definite" in (broken.failure or "")
     assert bool(torch.isfinite(broken.solution).all())
     torch.testing.assert_close(broken.rest, b - A @ broken.solution)
-    for method in (minres, gmres):
-        result = method(A.mv, b, plain, 1e-10, 200)
-        assert result.converged
-        torch.testing.assert_close(result.solution, torch.linalg.solve(A, b))
+    result = gmres(A.mv, b, plain, 1e-10, 200)
+    assert result.converged
+    torch.testing.assert_close(result.solution, torch.linalg.solve(A, b))
     assert conjugate_gradients((-A @ A).mv, b, plain, 1e-10, 100).iterations == 1
 
 
-@pytest.mark.parametrize("method", [conjugate_gradients, minres])
-def test_indefinite_preconditioners(method: Method) -> None:
+def test_indefinite_preconditioners() -> None:
     A, b = definite(7)
-    result = method(A.mv, b, lambda r: -r, 1e-6, 100)
+    result = conjugate_gradients(A.mv, b, lambda r: -r, 1e-6, 100)
     assert result.iterations == 0
     assert "preconditioner" in (result.failure or "")
 
@@ -185,5 +181,5 @@ def test_gmres_restarts_after_its_basis_is_full() -> None:
     A, b = definite(9, size=120, decades=4.0)
     result = gmres(A.mv, b, plain, 1e-4, 2000)
     assert result.converged
-    assert result.iterations > 50
+    assert result.iterations > 50, "more than the basis"
     torch.testing.assert_close(result.rest, b - A @ result.solution, rtol=0.0, atol=1e-9)

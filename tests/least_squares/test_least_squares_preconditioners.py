@@ -1,4 +1,4 @@
-"""Preconditioners: exact where they should be, definite always, and worth their price."""
+"""Preconditioners: exact where they should be, always definite, and better than none."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gnrecon.least_squares import (
     Kronecker,
     LayeredJacobian,
     LayerRows,
-    Neighbours,
+    NeighbourSums,
     Nystrom,
     Preconditioner,
     SampledGram,
@@ -25,14 +25,14 @@ from gnrecon.least_squares import (
     conjugate_gradients,
 )
 from gnrecon.least_squares.krylov import Apply, KrylovResult
-from gnrecon.least_squares.neighbour_sums import AGAIN, PreparedNeighbours, run_lengths
-from gnrecon.least_squares.preconditioners import inclusion
+from gnrecon.least_squares.neighbour_sums import PreparedSums, run_lengths
+from gnrecon.least_squares.preconditioners import inclusion_probabilities
 
 PRECONDITIONERS: dict[str, Preconditioner] = {
     "jacobi": Jacobi(),
     "block jacobi": BlockJacobi(),
-    "neighbours": Neighbours(),
-    "neighbours, alike or not": Neighbours(-2.0),
+    "neighbours": NeighbourSums(),
+    "neighbours, similar or not": NeighbourSums(-2.0),
     "nystrom": Nystrom(5),
     "nystrom, full": Nystrom(1000),
     "sampled": SampledGram(15),
@@ -100,9 +100,9 @@ def test_neighbours_that_are_alike_take_few_iterations() -> None:
             P = at(preconditioner, jacobian, D, damping)
             return conjugate_gradients(lambda v: A @ v, b, P, tolerance, 200, energy)
 
-        off = solved(Neighbours(), 0.0, 0.01).solution - expected
+        off = solved(NeighbourSums(), 0.0, 0.01).solution - expected
         assert float(off @ A @ off) < 4e-4 * float(expected @ A @ expected), "the error is measured as it is"
-        assert solved(Neighbours(), 1e-6, 0.0).iterations < solved(Jacobi(), 1e-6, 0.0).iterations / 2
+        assert solved(NeighbourSums(), 1e-6, 0.0).iterations < solved(Jacobi(), 1e-6, 0.0).iterations / 2
 
 
 def test_runs_are_as_long_as_their_ends_are_alike() -> None:
@@ -113,31 +113,32 @@ def test_runs_are_as_long_as_their_ends_are_alike() -> None:
     turning = torch.stack([angle.cos(), angle.sin()], 1)
     assert run_lengths(DenseJacobian(turning), 0.8) == [4]
     assert run_lengths(DenseJacobian(turning), 0.7) == [8]
-    assert run_lengths(DenseJacobian(0.0 * turning), 0.8) == [1], "rows of zeros are alike to nothing"
+    assert run_lengths(DenseJacobian(0.0 * turning), 0.8) == [1], "zero rows are similar to none"
     assert run_lengths(DenseJacobian(turning[:7]), 0.0) == [1], "a stretch shorter than the longest run"
     blocks = layered(0, [(7, 1), (40, 1), (0, 0)])[0]
     assert run_lengths(blocks, -2.0) == [1, 8, 1], "each block has its own runs"
 
 
-def test_runs_are_looked_for_again_after_some_linearisations() -> None:
+def test_run_lengths_are_computed_again_after_some_linearisations() -> None:
     generator = torch.Generator().manual_seed(0)
     turning, unlike = smooth(0, 400)[0], DenseJacobian(randn(generator, 400, 400))
-    neighbours = Neighbours()
+    neighbours = NeighbourSums()
+    assert neighbours.refresh_interval == 8
 
     def summed(jacobian: Jacobian) -> bool:
         prepared = neighbours.prepare(jacobian, torch.ones(jacobian.columns, dtype=F64), generator)
-        return isinstance(prepared, PreparedNeighbours)
+        return isinstance(prepared, PreparedSums)
 
     assert summed(turning)
-    # The first rows' runs hold for some more, and are given up in time for rows that are unlike.
-    assert [summed(unlike) for _ in range(AGAIN)] == [True] * (AGAIN - 1) + [False]
+    # The run lengths of the first rows are used for some more linearisations, then computed again.
+    assert [summed(unlike) for _ in range(8)] == [True] * 7 + [False]
     assert not summed(layered(0, [(40, 1), (40, 0)])[0]), "other constraints have runs of their own"
 
 
 def test_neighbours_that_are_no_fewer_than_the_columns_give_the_inverse() -> None:
     J = randn(torch.Generator().manual_seed(2), 60, 20)
     D = metric_of(J)
-    P = as_matrix(at(Neighbours(), DenseJacobian(J), D, 0.1), 20)
+    P = as_matrix(at(NeighbourSums(), DenseJacobian(J), D, 0.1), 20)
     torch.testing.assert_close(P, torch.linalg.inv(J.T @ J + 0.1 * torch.diag(D)))
 
 
@@ -286,7 +287,7 @@ def test_fewer_iterations_than_without(preconditioner: Preconditioner) -> None:
 def test_chances_by_length_sum_to_the_count(seed: int, count: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     squares = torch.rand(50, generator=generator, dtype=F64) ** 8
-    chances = inclusion(squares, count)
+    chances = inclusion_probabilities(squares, count)
     assert float(chances.sum()) == pytest.approx(count, rel=1e-9)
     assert float(chances.min()) >= 0.0
     assert float(chances.max()) <= 1.0
@@ -297,9 +298,9 @@ def test_chances_by_length_sum_to_the_count(seed: int, count: int) -> None:
 
 
 def test_chances_of_rows_without_length() -> None:
-    assert torch.equal(inclusion(torch.zeros(8, dtype=F64), 2), torch.full((8,), 0.25, dtype=F64))
+    assert torch.equal(inclusion_probabilities(torch.zeros(8, dtype=F64), 2), torch.full((8,), 0.25, dtype=F64))
     alone = torch.tensor([0.0, 3.0, 0.0, 0.0], dtype=F64)
-    assert torch.equal(inclusion(alone, 2), torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=F64))
+    assert torch.equal(inclusion_probabilities(alone, 2), torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=F64))
 
 
 def test_few_heavy_rows_are_all_drawn() -> None:

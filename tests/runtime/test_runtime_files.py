@@ -44,7 +44,7 @@ def test_existing_files_are_kept_unless_overwriting_is_allowed(tmp_path: Path) -
 
 def test_a_file_that_appears_meanwhile_is_not_lost(tmp_path: Path) -> None:
     target = tmp_path / "a.txt"
-    with pytest.raises(OutputError, match="created by somebody else"), atomic_write(target):
+    with pytest.raises(OutputError, match="created by another process"), atomic_write(target):
         target.write_text("theirs")
     assert target.read_text() == "theirs"
     assert list(tmp_path.iterdir()) == [target]

@@ -71,7 +71,7 @@ def test_stages_choices_steps_and_remarks_are_logged(
     assert sum(line.startswith("Step 1 of at most 1: Record(step=1") for line in said) == 1
     assert any(line.startswith("Kept 600 of 600 points") for line in said)
     assert any(line.startswith("Extracted ") and line.endswith("with 24 cells.") for line in said)
-    assert [record.getMessage() for record in caplog.records if getattr(record, "told", False)] == told.remarks
+    assert [record.getMessage() for record in caplog.records if getattr(record, "already_shown", False)] == told.remarks
     assert {record.name.partition(".")[0] for record in caplog.records} == {"gnrecon"}
 
 
@@ -129,6 +129,6 @@ def test_a_cancelled_run_is_logged(
     def cancel(*_: object) -> None:
         raise Cancelled
 
-    monkeypatch.setattr("gnrecon.run.Shown.stage", cancel)
+    monkeypatch.setattr("gnrecon.run.ConsoleProgress.stage", cancel)
     assert run(scan, "-o", tmp_path / "mesh.obj", "--log", tmp_path / "run.log") == ExitCode.INTERRUPTED
     assert "Cancelled: Cancelled; nothing was written." in (tmp_path / "run.log").read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from threading import Barrier, Thread
 
@@ -69,13 +70,14 @@ def test_a_failure_within_ends_the_watch() -> None:
     with pytest.raises(KeyError), PeakMemory() as peak:
         raise KeyError
     assert peak.mb > 1
-    assert not memory._watched
+    assert not memory._active
 
 
 @pytest.fixture
 def no_reset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A system that does not let the mark be set back."""
-    monkeypatch.setattr(memory, "RESET", tmp_path / "missing" / "clear_refs")
+    missing = tmp_path / "missing" / "clear_refs"
+    monkeypatch.setattr(memory, "_reset_mark", partial(memory._reset_mark, path=missing))
 
 
 @pytest.mark.usefixtures("no_reset")
@@ -97,5 +99,5 @@ def test_without_a_reset_a_mark_that_rises_tells_the_peak_all_the_same() -> None
 
 
 def test_without_a_mark_the_system_is_asked_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "STATUS", tmp_path / "missing")
+    monkeypatch.setattr(memory, "_status", partial(memory._status, path=tmp_path / "missing"))
     assert memory._high_water() / 1e6 > resident() / 2

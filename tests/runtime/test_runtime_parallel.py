@@ -19,8 +19,9 @@ import torch
 from scan_files import box, torus
 
 from gnrecon.optim import Record
-from gnrecon.pipeline import Progress, Reconstruction, limited, reconstruct
-from gnrecon.runtime.parallel import abreast
+from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.runtime.compute_limits import limited
+from gnrecon.runtime.parallel import map_in_threads
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
@@ -115,8 +116,8 @@ def test_pieces_of_work_keep_their_order_and_have_one_thread_each() -> None:
     told: list[float] = []
     before = default()
     with limited(3):
-        assert abreast(piece, range(5), advance=told.append) == [(number, 1) for number in range(5)]
-        assert abreast(piece, []) == []
+        assert map_in_threads(piece, range(5), advance=told.append) == [(number, 1) for number in range(5)]
+        assert map_in_threads(piece, []) == []
         assert torch.get_num_threads() == 3
         assert default() == before
     assert told == [0.2, 0.4, 0.6, 0.8, 1.0]
@@ -133,7 +134,7 @@ def test_the_first_piece_that_fails_ends_the_work(count: int) -> None:
             raise ValueError("no")
 
     with limited(count), pytest.raises(ValueError, match="no"):
-        abreast(piece, range(200))
+        map_in_threads(piece, range(200))
     assert len(begun) < 100
 
 

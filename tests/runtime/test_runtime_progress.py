@@ -18,9 +18,9 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.report.report import report_schema
-from gnrecon.run import STAGES, Shown
+from gnrecon.run import STAGES, ConsoleProgress
 from gnrecon.runtime.errors import Cancelled, ExitCode
-from gnrecon.runtime.progress import part
+from gnrecon.runtime.progress import subrange
 
 SMALL: dict[str, Any] = {"widths": (100,), "steps": 2, "resolution": 32}
 SMALLEST = ("--widths", "80", "--steps", "0", "--resolution", "24")
@@ -141,7 +141,7 @@ def test_a_run_may_end_at_every_stage(cloud: Cloud, stage: str) -> None:
 def test_a_command_that_ends_before_it_writes_leaves_nothing(
     tmp_path: Path, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gnrecon.run.Shown.stage", lambda _, name: cancel() if name == "write" else None)
+    monkeypatch.setattr("gnrecon.run.ConsoleProgress.stage", lambda _, name: cancel() if name == "write" else None)
     scan = write_scan(tmp_path / "ring.ply", *cloud)
     handler = signal.getsignal(signal.SIGTERM)
     asked = [str(tmp_path / name) for name in ("mesh.obj", "report.json", "model.gnr")]
@@ -154,7 +154,7 @@ def test_a_command_that_ends_before_it_writes_leaves_nothing(
 
 def test_a_part_tells_of_the_whole() -> None:
     told: list[float] = []
-    inner = part(part(told.append, 0.5, 1.0), 0.0, 0.5)
+    inner = subrange(subrange(told.append, 0.5, 1.0), 0.0, 0.5)
     for share in (0.0, 0.5, 1.0):
         inner(share)
     assert told == [0.5, 0.625, 0.75]
@@ -164,7 +164,7 @@ def test_the_bar_shows_the_share_of_the_stage() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=120)
     with Bar(console=console, auto_refresh=False) as bar:
-        shown = Shown(console, bar, verbose=False)
+        shown = ConsoleProgress(console, bar, verbose=False)
         shown.stage("fit")
         assert bar.tasks[0].total is None
         shown.advance(0.25)
@@ -189,7 +189,7 @@ def cancel() -> None:
 def test_a_cancelled_command_ends_as_an_interrupted_one(
     tmp_path: Path, cloud: Cloud, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("gnrecon.run.Shown.advance", lambda *_: cancel())
+    monkeypatch.setattr("gnrecon.run.ConsoleProgress.advance", lambda *_: cancel())
     scan = write_scan(tmp_path / "ring.ply", *cloud)
     handler = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as end:

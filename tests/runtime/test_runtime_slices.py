@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gnrecon.runtime.parallel import slices
+from gnrecon.runtime.chunks import slices
 
 
 @pytest.mark.parametrize(("count", "size"), [(0, 5), (1, 5), (5, 5), (6, 5), (23, 7)])

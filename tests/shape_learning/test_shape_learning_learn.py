@@ -62,12 +62,12 @@ def sheet(target: float = 0.3) -> ShapeProblem:
 
 @pytest.mark.parametrize(("optimiser", "steps", "share"), [("gn", 12, 0.1), ("lbfgs", 2, 0.2), ("adam", 60, 0.9)])
 def test_each_optimiser_lowers_the_loss(optimiser: str, steps: int, share: float) -> None:
-    told: list[Measurement] = []
-    learned = learn(half_ball(), optimiser, budget=None, steps=steps, learning_rate=3e-3, heard=told.append)
-    assert told == list(learned.history)
-    assert told[0].step == 0
-    assert learned.best.loss == min(found.loss for found in told)
-    assert learned.best.loss < share * told[0].loss
+    measurements: list[Measurement] = []
+    learned = learn(half_ball(), optimiser, budget=None, steps=steps, learning_rate=3e-3, callback=measurements.append)
+    assert measurements == list(learned.history)
+    assert measurements[0].step == 0
+    assert learned.best.loss == min(found.loss for found in measurements)
+    assert learned.best.loss < share * measurements[0].loss
     assert learned.best.loss == pytest.approx(sum(learned.best.shares.values()))
     assert learned.best.chamfer is None
 
@@ -99,7 +99,7 @@ def test_the_same_seed_gives_the_same_parameters() -> None:
 
 def test_the_catenoid_is_approached() -> None:
     found: list[Measurement] = []
-    learned = learn(replace(catenoid(), network=Network((16, 16))), budget=None, steps=12, heard=found.append)
+    learned = learn(replace(catenoid(), network=Network((16, 16))), budget=None, steps=12, callback=found.append)
     assert learned.best.chamfer is not None
     assert learned.best.chamfer < 0.5 * found[0].chamfer
     assert learned.best.loss < 0.01 * found[0].loss

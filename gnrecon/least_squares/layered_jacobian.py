@@ -1,0 +1,209 @@
+"""A Jacobian whose rows are sums of outer products, layer by layer, so that the matrix is never formed.
+
+The factors of the rows are stored, or computed again for each product (see `layer_products`). Products with J and J^T
+cost O(M p) time and O(M width) memory. Factors may be stored in float32 while vectors and sums over chunks of rows are
+in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gnrecon.least_squares.jacobian import Block, column_slices
+from gnrecon.least_squares.layer_products import gram
+
+
+@dataclass(frozen=True)
+class LayeredJacobian:
+    """A Jacobian of outer-product rows.
+
+    Parameters
+    ----------
+    blocks : returns the blocks of rows in order; called for each product, so that it may return stored factors, or
+        compute them again where storing them would take too much memory
+    rows : M
+    group_sizes : number of columns of each layer
+    device : where the factors lie
+    dtype : of vectors and sums, float64 or that of the factors
+    stored : precision of the factors
+    chunk_bytes : memory of the rows that are multiplied out at a time
+    tile_rows : rows of the square tiles in which J J^T is formed
+    """
+
+    blocks: Callable[[], Iterable[Block]]
+    rows: int
+    group_sizes: tuple[int, ...]
+    device: torch.device
+    dtype: torch.dtype = torch.float64
+    stored: torch.dtype = torch.float64
+    chunk_bytes: int = 64_000_000
+    tile_rows: int = 1024
+
+    @property
+    def columns(self) -> int:
+        """p."""
+        return sum(self.group_sizes)
+
+    @property
+    def groups(self) -> tuple[slice, ...]:
+        """The layers' columns."""
+        return column_slices(self.group_sizes)
+
+    def _zeros(self, *shape: int) -> Tensor:
+        return torch.zeros(*shape, dtype=self.dtype, device=self.device)
+
+    def mv(self, v: Tensor) -> Tensor:
+        """Return J v, of shape (M,)."""
+        product, start = self._zeros(self.rows), 0
+        parts: dict[torch.dtype, list[Tensor]] = {}
+        for block in self.blocks():
+            stored = _stored(block)
+            if stored not in parts:
+                parts[stored] = [v[group].to(stored) for group in self.groups]
+            stop = start + len(block[0])
+            for layer, part in zip(block, parts[stored], strict=True):
+                product[start:stop] += layer.mv(part)
+            start = stop
+        return product
+
+    def tmv(self, u: Tensor) -> Tensor:
+        """Return J^T u, of shape (p,)."""
+        product, start = self._zeros(self.columns), 0
+        for block in self.blocks():
+            stop = start + len(block[0])
+            part = u[start:stop].to(_stored(block))
+            for layer, group in zip(block, self.groups, strict=True):
+                product[group] += layer.tmv(part)
+            start = stop
+        return product
+
+    def dense(self) -> Iterator[Tensor]:
+        """Yield chunks of rows, in the precision in which the factors are stored, of at most `chunk_bytes`."""
+        return self._dense(self.blocks())
+
+    def _chunk(self, block: Block) -> int:
+        """Return how many rows are multiplied out at a time."""
+        return max(64, self.chunk_bytes // max(block[0].left.element_size() * self.columns, 1))
+
+    def _dense(self, blocks: Iterable[Block]) -> Iterator[Tensor]:
+        buffer: Tensor | None = None
+        for block in blocks:
+            if buffer is None:
+                length = max(1, min(self._chunk(block), self.rows))
+                buffer = torch.empty(length, self.columns, dtype=_stored(block), device=self.device)
+            for start in range(0, len(block[0]), len(buffer)):
+                part = [layer.take(slice(start, start + len(buffer))) for layer in block]
+                chunk = buffer[: len(part[0])]
+                for layer, group in zip(part, self.groups, strict=True):
+                    layer.write(chunk[:, group])
+                yield chunk
+
+    def gram(self) -> Tensor:
+        """Return J^T J, its lower triangle valid."""
+        return gram(self._dense(map(_without_zero_rows, self.blocks())), self.columns, self._zeros(0))
+
+    def group_grams(self) -> list[Tensor]:
+        """Return the layers' blocks of J^T J, each with a valid lower triangle."""
+        return [
+            replace(self, blocks=partial(self._layer, k), group_sizes=(size,)).gram()
+            for k, size in enumerate(self.group_sizes)
+        ]
+
+    def _layer(self, k: int) -> Iterator[Block]:
+        return ([block[k]] for block in self.blocks())
+
+    def kernel(self, scales: Sequence[float] | None = None) -> Tensor:
+        """Return J S J^T, its lower triangle valid, tile by tile from layer Gram matrices; J is never formed."""
+        scales = scales or [1.0] * len(self.group_sizes)
+        kernel = self._zeros(self.rows, self.rows)
+        tiles = [
+            [layer.take(slice(start, start + self.tile_rows)) for layer in block]
+            for block in self.blocks()
+            for start in range(0, len(block[0]), self.tile_rows)
+        ]
+        row = 0
+        for count, mine in enumerate(tiles):
+            column = 0
+            for theirs in tiles[: count + 1]:
+                place = kernel[row : row + len(mine[0]), column : column + len(theirs[0])]
+                for scale, layer, other in zip(scales, mine, theirs, strict=True):
+                    place.add_(layer.kernel(other), alpha=scale)
+                column += len(theirs[0])
+            row += len(mine[0])
+        return kernel
+
+    def diagonal(self) -> Tensor:
+        """Return the diagonal of J^T J, of shape (p,)."""
+        squares = self._zeros(self.columns)
+        for block in self.blocks():
+            for layer, group in zip(block, self.groups, strict=True):
+                squares[group] += layer.squares()
+        return squares
+
+    def row_squares(self) -> Tensor:
+        """Return the squared lengths of the rows, of shape (M,)."""
+        squares, start = self._zeros(self.rows), 0
+        for block in self.blocks():
+            stop = start + len(block[0])
+            for layer in block:
+                squares[start:stop] += layer.row_squares()
+            start = stop
+        return squares
+
+    def sample(self, rows: Tensor) -> LayeredJacobian:
+        """Return the Jacobian of the given rows, its factors kept."""
+        blocks, start = [], 0
+        for block in self.blocks():
+            stop = start + len(block[0])
+            inside = rows[(rows >= start) & (rows < stop)] - start
+            if len(inside):
+                blocks.append([layer.take(inside) for layer in block])
+            start = stop
+        return replace(self, blocks=lambda: blocks, rows=len(rows))
+
+    def rounded(self) -> LayeredJacobian:
+        """Return J with factors in float32, which are kept, or itself where they are."""
+        if self.stored == torch.float32:
+            return self
+        blocks = [[layer.to(torch.float32) for layer in block] for block in self.blocks()]
+        return replace(self, blocks=lambda: blocks, stored=torch.float32)
+
+    @property
+    def stretches(self) -> tuple[int, ...]:
+        """The blocks' numbers of rows."""
+        return tuple(len(block[0]) for block in self.blocks())
+
+    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of rows over the roots of their numbers, in the precision of storage, never forming J."""
+        for block, length in zip(self.blocks(), lengths, strict=True):
+            count = length * self._chunk(block)
+            for start in range(0, len(block[0]), count):
+                part = [layer.take(slice(start, start + count)) for layer in block]
+                sums = block[0].left.new_empty(-(-len(part[0]) // length), self.columns)
+                for layer, group in zip(part, self.groups, strict=True):
+                    layer.write_runs(length, sums[:, group])
+                yield sums
+
+
+def _without_zero_rows(block: Block, *, most_nonzero: float = 0.9) -> Block:
+    """Return a block without its zero rows, such as those of inactive constraints.
+
+    If more than the fraction `most_nonzero` of the rows is nonzero, copying costs more than it saves, and the block is
+    returned unchanged.
+    """
+    filled = torch.zeros(len(block[0]), dtype=torch.bool, device=block[0].left.device)
+    for layer in block:
+        filled |= layer.left.any(1)
+        for right, tangents in layer.pairs:
+            filled |= right.any(1) & tangents.any(1)
+    rows = filled.nonzero()[:, 0]
+    return block if len(rows) > most_nonzero * len(filled) else [layer.take(rows) for layer in block]
+
+
+def _stored(block: Block) -> torch.dtype:
+    return block[0].left.dtype

@@ -1,0 +1,79 @@
+"""Tuning constants of the fit: frozen, all of them used, and their defaults are what a fit uses."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gnrecon.fit
+from gnrecon.fit import FitOptions, parameters
+from gnrecon.fit.consistency import find_outliers
+from gnrecon.fit.local_fields import cube_length
+from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.objective import normal_weight
+from gnrecon.fit.parameters import FitParameters, LocalFieldParameters, OutlierParameters, SingleNetworkParameters
+from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.signed_distance import Density
+
+CLASSES = [found for _, found in inspect.getmembers(parameters, dataclasses.is_dataclass)]
+
+
+def used_names() -> set[str]:
+    """The names of all attributes that the sources of the fit read."""
+    sources = [path for path in Path(gnrecon.fit.__file__).parent.rglob("*.py") if path.name != "parameters.py"]
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sources]
+    return {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+
+
+@pytest.mark.parametrize("group", CLASSES, ids=lambda group: group.__name__)
+def test_groups_are_frozen_and_have_defaults(group: type) -> None:
+    instance = group()
+    for field in dataclasses.fields(group):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(instance, field.name, None)
+
+
+def test_every_constant_is_used() -> None:
+    used = used_names()
+    groups = [group for group in CLASSES if group is not FitParameters]
+    unused = [(group.__name__, field.name) for group in groups for field in dataclasses.fields(group)]
+    assert [both for both in unused if both[1] not in used] == []
+
+
+def test_the_whole_holds_every_group() -> None:
+    held = {type(getattr(FitParameters(), field.name)) for field in dataclasses.fields(FitParameters)}
+    assert held == {group for group in CLASSES if group is not FitParameters}
+
+
+def test_a_cube_of_sparse_points_is_as_long_as_the_limit_says() -> None:
+    belief, disks = Belief(0.1, 1e-3, 0.05), np.full(5, 10.0)
+    assert cube_length(belief, disks, 1.0) == pytest.approx(0.1 * LocalFieldParameters.most_length_stretch)
+    assert cube_length(belief, disks, 1.0, most_length_stretch=2.0) == pytest.approx(0.2)
+
+
+def test_the_default_thresholds_find_the_outliers() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((500, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    value: Float = np.where(np.arange(500) < 5, 0.5, 0.0)
+    found = find_outliers(value, Density(points))
+    assert np.flatnonzero(found).tolist() == [0, 1, 2, 3, 4]
+    assert (found == find_outliers(value, Density(points), parameters=OutlierParameters())).all()
+    assert not find_outliers(value, Density(points), parameters=OutlierParameters(most_share=0.001)).any()
+
+
+def test_default_steps_and_units_are_those_of_the_parameters() -> None:
+    options, chosen = FitOptions(normals="projection"), SingleNetworkParameters()
+    assert options.steps_for(5000) == options.steps_for(5000, parameters=chosen) == chosen.wide_steps
+    assert options.steps_for(5000, parameters=SingleNetworkParameters(wide_steps=7)) == 7
+    assert options.widths_for(10, parameters=SingleNetworkParameters(least_units=50)) == (50,)
+
+
+def test_normals_of_sparse_data_weigh_more() -> None:
+    assert normal_weight(0.1) == pytest.approx(0.04**2)
+    assert normal_weight(0.1, least_reach_radii=0.1) == pytest.approx(0.01)
