@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from holed_can import RADIUS, can, distance
+from holed_can import Can
 
 from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, fit
@@ -64,17 +64,17 @@ def test_a_minimal_film_has_little_mean_curvature() -> None:
 
 
 def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    cloud = can(0.12, 0.45)
+    cloud = Can().scan(0.12, 0.45)
 
     def off(seed: int = 0, **penalties: str) -> float:
         sdf = fitted(cloud, seed, **penalties)
         x = surface(sdf, cloud)
-        hole = x[np.linalg.norm(x - [RADIUS, 0, 0], axis=1) < 0.3]
+        hole = x[Can().in_hole(x, 0.3)]
         assert len(hole) > 20
         # Features that are bent to the surface run off beside it, if nothing holds the free space.
-        elsewhere = x[np.linalg.norm(x - [RADIUS, 0, 0], axis=1) > 0.3]
-        assert np.abs(distance(elsewhere)).mean() < 0.01
-        return float(np.sqrt(np.mean(distance(hole) ** 2)))
+        elsewhere = x[~Can().in_hole(x, 0.3)]
+        assert np.abs(Can().distance(elsewhere)).mean() < 0.01
+        return float(np.sqrt(np.mean(Can().distance(hole) ** 2)))
 
     assert off() < 2e-3  # its side goes on
     developable = [off(seed, prior="developable") for seed in range(3)]
@@ -100,7 +100,7 @@ def test_strain_smooths() -> None:
 
 
 def test_the_same_again_is_the_same() -> None:
-    cloud = can(0.25, 0.45)
+    cloud = Can().scan(0.25, 0.45)
     one, other = (fitted(cloud, fill="minimal", prior="developable", smooth="strain=1e-5") for _ in range(2))
     assert one.theta.equal(other.theta)
     assert one.detail is not None
