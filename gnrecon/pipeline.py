@@ -18,15 +18,15 @@ from gnrecon.export import (
     Attribute,
     Metrics,
     Neighbourhood,
-    invented,
     measure,
     require_bordered,
     require_sound,
     trim,
+    unsupported_area,
     verify_file,
     vertex_error,
 )
-from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
@@ -154,7 +154,7 @@ def reconstruct(
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
     reference : path, Mesh, PointCloud, or another library's, optional
-        MeshedScan to measure the mesh against.
+        Known surface to measure the mesh against.
     format : str, optional
         Format of the scan's file, such as ``"ply"``; by default its extension.
     progress : Progress, optional
@@ -269,7 +269,7 @@ def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
-        run.options = replace(run.options, resolution=fine_enough(sdf, run.options.resolution))
+        run.options = replace(run.options, resolution=cells_for_curvature(sdf, run.options.resolution))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     neighbourhood = Neighbourhood(scan.cloud.points)
@@ -297,7 +297,7 @@ def _finish(
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with run.stages("attributes"):
         distances = surface.neighbourhood.distances(mesh.vertices)
-        unsupported = invented(mesh, distances, surface.spacing)
+        unsupported = unsupported_area(mesh, distances, surface.spacing)
         sources = AttributeSources(
             mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options
         )
