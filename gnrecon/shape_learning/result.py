@@ -24,7 +24,7 @@ from gnrecon.shape_learning.shape_problem import ShapeProblem
 
 @dataclass(frozen=True)
 class LearnedField:
-    """A network's values as a field in its own coordinates; about a distance where the terms made it one.
+    """A network's values as a field in its own coordinates; approximately a distance if the terms require it.
 
     Parameters
     ----------
