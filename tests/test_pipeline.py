@@ -204,7 +204,7 @@ def test_progress_is_told_of_stages_steps_and_remarks(scan: Cloud) -> None:
     result = reconstruct(*twice, progress=told, widths=(200,), steps=2, resolution=32)
     assert told.stages == STAGES
     assert told.steps == [(1, 2), (2, 2)]
-    assert f"Dropped 7 of {len(twice[0])} points at the position of another." in told.remarks
+    assert f"Dropped 7 of {len(twice[0])} points that duplicate another." in told.remarks
     assert result.report["fit"]["status"] in told.remarks
     assert set(result.report["actions"]) <= set(told.remarks)
 

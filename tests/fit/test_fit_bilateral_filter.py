@@ -64,8 +64,8 @@ def test_a_cube_loses_its_noise_and_keeps_its_edges() -> None:
     edge = np.sort(np.abs(x), axis=1)[:, 1] > 0.95
     assert 300 < edge.sum() < 1000
     assert off_cube(points[edge]).mean() < 0.5 * off_cube(x[edge]).mean()
-    heedless, _ = BilateralFilter(3.0, 10.0).apply(x, normals)
-    assert off_cube(heedless[edge]).mean() > 1.5 * off_cube(points[edge]).mean()
+    unguided, _ = BilateralFilter(3.0, 10.0).apply(x, normals)
+    assert off_cube(unguided[edge]).mean() > 1.5 * off_cube(points[edge]).mean()
 
 
 def test_the_two_sides_of_a_sheet_do_not_attract() -> None:
@@ -78,7 +78,7 @@ def test_the_two_sides_of_a_sheet_do_not_attract() -> None:
 
 
 def test_a_surface_behind_a_wall_that_looks_the_same_way_does_not_attract() -> None:
-    """As the wall of a bore does beside a thin wall: a patch of it lies behind, with the same normals."""
+    """As the wall of a bore behind a thin wall: a patch of it lies behind, with the same normals."""
     rng = np.random.default_rng(6)
     front, behind, noise = 4000, 300, 0.005
     x = np.concatenate([rng.uniform(-1, 1, (front, 3)), rng.uniform(-0.25, 0.25, (behind, 3))])
@@ -86,9 +86,9 @@ def test_a_surface_behind_a_wall_that_looks_the_same_way_does_not_attract() -> N
     x[:, 2] = height + noise * rng.standard_normal(len(x))
     points, _ = WIDE.apply(x, np.tile([0.0, 0.0, 1.0], (len(x), 1)))
     off = np.abs(points[:, 2] - height)
-    beside = np.abs(x[:, :2]).max(axis=1) < 0.2
-    assert off[:front][beside[:front]].mean() < 0.4 * noise
-    assert off[front:][beside[front:]].mean() < 0.4 * noise
+    central = np.abs(x[:, :2]).max(axis=1) < 0.2
+    assert off[:front][central[:front]].mean() < 0.4 * noise
+    assert off[front:][central[front:]].mean() < 0.4 * noise
 
 
 @pytest.mark.parametrize("count", [2, 10])

@@ -63,7 +63,7 @@ def test_faces_of_a_cube_are_extended_to_its_edges_and_its_gaps_are_halved() -> 
     assert (found.averaging, found.snapped) == (None, None)
     x, normals = found.samples.points[600:], found.samples.normals[600:]
     assert (found.samples.points[:600] == scan.points).all()
-    # One may go on a little where the other face has a gap, too.
+    # One may extend a little farther where the other face has a gap, too.
     assert (off_cube(x) < 1e-9).mean() > 0.999
     assert off_cube(x).max() < 0.02
     # Each sample's normal is that of a face that it lies on.
@@ -114,7 +114,7 @@ def test_smooth_shapes_have_no_edges(samples: Samples) -> None:
 
 
 def test_outliers_are_no_edges() -> None:
-    """Whichever way an outlier looks, it lies on no face. Yet single points on a plate's sides tell of its edges."""
+    """Outliers of any direction lie on no face. But single points on a plate's sides show its edges."""
     rng = np.random.default_rng(2)
     smooth = ball(1500)
     normals = smooth.normals.copy()

@@ -11,7 +11,7 @@ from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare
-from gnrecon.ingest.survey import find_layers
+from gnrecon.ingest.double_walls import find_layers
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
 

@@ -89,8 +89,8 @@ def test_what_is_done_with_given_normals(rng: np.random.Generator) -> None:
     samples, counts = told["mixed", "signs"]
     assert counts.flipped == pytest.approx(share, abs=0.01)
     assert np.abs(np.einsum("ij,ij->i", samples.normals, truth)).min() > 1 - 1e-12
-    assert "% turned around; " in counts.remarks()[-1]
-    assert "% of the points confirm their side." in counts.remarks()[-1]
+    assert "% flipped; " in counts.remarks()[-1]
+    assert "% of the points confirm their sign." in counts.remarks()[-1]
     assert [told["mixed", mode][0].estimated for mode in ("auto", "given", "signs", "estimate")] == [
         False,
         False,

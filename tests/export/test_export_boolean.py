@@ -51,7 +51,7 @@ def test_a_box_inside_of_the_solid_is_the_box() -> None:
 
 
 def test_a_box_beside_the_solid_is_refused() -> None:
-    with pytest.raises(MeshError, match="Nothing of the shape lies in the box"):
+    with pytest.raises(MeshError, match="Nothing of the shape lies in the crop box"):
         crop(ball(), np.array([[0.9] * 3, [1.0] * 3]))
 
 
