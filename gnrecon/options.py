@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.export import RefineOptions
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.mesh_field import MeshOptions
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float

@@ -18,15 +18,15 @@ from gnrecon.export import (
     Attribute,
     Metrics,
     Neighbourhood,
-    invented,
     measure,
     require_bordered,
     require_sound,
     trim,
+    unsupported_area,
     verify_file,
     vertex_error,
 )
-from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
@@ -172,7 +172,7 @@ def reconstruct(
     if chosen.work_dir is not None:
         require_work_folder(chosen.work_dir)
     with limited(chosen.threads):
-        run = _Run(source_name(source), chosen, progress or Progress())
+        run = _PipelineRun(source_name(source), chosen, progress or Progress())
         scan = _read(run, source, normals, format, reference)
         ingested = _ingest(run, scan)
         fitted = _fit(run, ingested)
@@ -184,7 +184,7 @@ def reconstruct(
 
 
 @dataclass
-class _Run:
+class _PipelineRun:
     """What all steps of a run share.
 
     Parameters
@@ -221,7 +221,7 @@ class _Run:
         return chosen.resolution is None and chosen.edge_length is None and chosen.max_error is None
 
 
-def _read(run: _Run, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
+def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
     """Read the scan and the reference."""
     with run.stages("read"):
         cloud, reading = read_source(source, normals, format, run.options.read_points, run.options.region())
@@ -231,7 +231,7 @@ def _read(run: _Run, source: Any, normals: Any, format: str | None, reference: A
     return scan
 
 
-def _ingest(run: _Run, scan: ScanRead) -> Ingested:
+def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     """Clean and thin the points, orient their normals, and choose a resolution from their spacing."""
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
@@ -244,7 +244,7 @@ def _ingest(run: _Run, scan: ScanRead) -> Ingested:
     return ingested
 
 
-def _fit(run: _Run, ingested: Ingested) -> Fitted:
+def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
     """Fit the field, and measure its residuals."""
     options, samples = run.options, ingested.samples
     total = options.fit().steps_for(len(samples))
@@ -265,18 +265,18 @@ def _fit(run: _Run, ingested: Ingested) -> Fitted:
     return Fitted(sdf, solution, residuals, held_out)
 
 
-def _mesh(run: _Run, scan: ScanRead, fitted: Fitted) -> MeshedScan:
+def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
-        run.options = replace(run.options, resolution=fine_enough(sdf, run.options.resolution))
+        run.options = replace(run.options, resolution=cells_for_curvature(sdf, run.options.resolution))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     neighbourhood = Neighbourhood(scan.cloud.points)
     return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, neighbourhood.spacing(), None)
 
 
-def _trim(run: _Run, surface: MeshedScan) -> MeshedScan:
+def _trim(run: _PipelineRun, surface: MeshedScan) -> MeshedScan:
     """Cut off what is farther from the points than ``trim``, where that was given."""
     reach = run.options.trim_at(surface.spacing)
     if reach is not None:
@@ -289,7 +289,7 @@ def _trim(run: _Run, surface: MeshedScan) -> MeshedScan:
 
 
 def _finish(
-    run: _Run, scan: ScanRead, ingested: Ingested, fitted: Fitted, surface: MeshedScan
+    run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted, surface: MeshedScan
 ) -> tuple[FinishedMesh, Uncertainty | None]:
     """Verify the mesh, give its vertices attributes, and measure it against the reference."""
     mesh, trimming = surface.mesh, surface.trimming
@@ -297,7 +297,7 @@ def _finish(
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with run.stages("attributes"):
         distances = surface.neighbourhood.distances(mesh.vertices)
-        unsupported = invented(mesh, distances, surface.spacing)
+        unsupported = unsupported_area(mesh, distances, surface.spacing)
         sources = AttributeSources(
             mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options
         )
@@ -309,7 +309,7 @@ def _finish(
     return finished, sources.uncertainty
 
 
-def _measure(run: _Run, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:
+def _measure(run: _PipelineRun, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:
     """Measure the mesh against the reference; its vertices get the attribute ``error``."""
     mesh, attributes = finished.mesh, finished.attributes
     with run.stages("measure"):

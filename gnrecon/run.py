@@ -1,6 +1,6 @@
 """Runs one reconstruction for the command line as a transaction.
 
-Invalid arguments are refused before any work, a progress bar is shown meanwhile, and all files are written or none.
+Invalid arguments are refused before any work, a progress bar shows the stages, and all files are written or none.
 """
 
 from __future__ import annotations

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.export.boolean import crop, subtract
-from gnrecon.export.mesh_field import StageTimer, mesh_field, untimed
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.mesh_field import MeshOptions, StageTimer, mesh_field, untimed
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.fit import NeuralSDF

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
+from gnrecon.export import Attribute, Neighbourhood, curvatures, interpolate_from_samples, transfer_attributes
 from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -138,9 +138,9 @@ def _carried(sources: AttributeSources) -> MadeAttributes:
         name for name in requested_names(sources.cloud, sources.options.attributes) if name in sources.cloud.attributes
     ]
     if "distance" not in names:
-        return carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+        return transfer_attributes(sources.mesh.vertices, sources.cloud, names, sources.around)
     names.remove("distance")
-    attributes, sentences = carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+    attributes, sentences = transfer_attributes(sources.mesh.vertices, sources.cloud, names, sources.around)
     return attributes, [*sentences, "The points' attribute 'distance' is replaced by the distance to the points."]
 
 
@@ -168,5 +168,5 @@ def _sigma(sources: AttributeSources) -> MadeAttributes:
         return [], ["There is no sigma: the data does not determine the field's parameters."]
     carried = "sigma" in requested_names(sources.cloud, sources.options.attributes)
     remarks = ["The points' attribute 'sigma' is replaced by the standard deviation of the surface."] * carried
-    sigma = sparsely(uncertainty.sigma, sources.mesh)
+    sigma = interpolate_from_samples(uncertainty.sigma, sources.mesh)
     return [Attribute("sigma", sigma, f"Laplace approximation, {uncertainty.describe()}")], remarks

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,8 @@ def _typed(annotation: Any) -> str:
 def _shown(default: Any) -> str:
     if repr(default) == "<factory>":
         return "{}"
+    if is_dataclass(default) and not isinstance(default, type) and default == type(default)():
+        return f"{type(default).__name__}()"
     return default.__name__ if callable(default) else repr(default)
 
 

@@ -12,7 +12,15 @@ import numpy as np
 from rich.console import Console
 
 from gnrecon.cli.learn_inputs import PAPER_SCANS, DesignFiles, ScanFiles, is_scan, part_mesh, placed
-from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
+from gnrecon.export import (
+    MeshFacts,
+    curvatures,
+    drop_stray_components,
+    require_bordered,
+    require_sound,
+    verify,
+    verify_file,
+)
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import all_input_files, check_writable, write_mesh
@@ -161,7 +169,7 @@ def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> tup
     mesh = mesh_of(learned.field, problem.shown or problem.box, options.resolution)
     notes: list[str] = []
     if isinstance(problem.known, ScannedSurface):
-        mesh, notes = drop_stray(mesh, problem.known.points.numpy())
+        mesh, notes = drop_stray_components(mesh, problem.known.points.numpy())
     if not options.curvature:
         return mesh, notes
     mean, gauss = curvatures(learned.field.gradient(mesh.vertices), learned.field.hessian(mesh.vertices))

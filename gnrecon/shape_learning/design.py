@@ -16,7 +16,7 @@ import numpy as np
 
 from gnrecon.export.boolean import from_solid, to_solid
 from gnrecon.export.mesh_statistics import face_components, submesh
-from gnrecon.export.metrics import Surface, nearest_on_surface, sample_surface
+from gnrecon.export.metrics import SurfaceQuery, nearest_on_surface, sample_surface
 from gnrecon.export.verify import failures, verify
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
@@ -230,8 +230,8 @@ class DesignRegion:
         self.box = Box.around(mesh.vertices, margin)
 
     @cached_property
-    def _surface(self) -> Surface:
-        return Surface(self.mesh)
+    def _surface(self) -> SurfaceQuery:
+        return SurfaceQuery(self.mesh)
 
     def inside(self, points: Float) -> Mask:
         """Return which points, of shape (N, 3), lie in the region, of shape (N,)."""

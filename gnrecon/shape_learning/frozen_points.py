@@ -28,7 +28,7 @@ from gnrecon.runtime.chunks import slices
 
 @dataclass(frozen=True)
 class FrozenTerm:
-    """One constraint at the points of one step; `moves` where they belong to the surface and move with it."""
+    """One constraint at the points of one step; `moves` if they are on the surface and move with it."""
 
     name: str
     residual: Residual | SecondOrder

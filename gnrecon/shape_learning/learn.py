@@ -67,7 +67,7 @@ class Learned:
 
 
 @dataclass
-class _Run:
+class _LearningRun:
     """The state of a run: when the next measurement is due, and the best parameters so far."""
 
     problem: ShapeProblem
@@ -195,7 +195,7 @@ def learn(
         raise UsageError("The number of additional units must be 0 or more, and only Gauss-Newton can start wider.")
     rng = np.random.default_rng(seed)
     wide = replace(problem, network=widened(problem.network, wider))
-    run = _Run(wide, rng, seed, parameters.most_steps if steps is None else steps, budget, callback, parameters)
+    run = _LearningRun(wide, rng, seed, parameters.most_steps if steps is None else steps, budget, callback, parameters)
     seconds = None if budget is None else parameters.pretraining_budget_share * budget
     theta = pretrained(wide, seed, rng, seconds, parameters)
     run.record(0, theta)
@@ -206,7 +206,7 @@ def learn(
     return _finished(run, theta, _solved(run, theta, method))
 
 
-def _pruned(run: _Run, theta: Tensor, method: GaussNewton, problem: ShapeProblem) -> tuple[GaussNewton, Tensor]:
+def _pruned(run: _LearningRun, theta: Tensor, method: GaussNewton, problem: ShapeProblem) -> tuple[GaussNewton, Tensor]:
     """Take steps with the wider network and remove units until it is the problem's own; return how to continue."""
     parameters = run.parameters
     goal = problem.network.widths
@@ -229,7 +229,7 @@ def _pruned(run: _Run, theta: Tensor, method: GaussNewton, problem: ShapeProblem
     return method, theta
 
 
-def _solved(run: _Run, theta: Tensor, method: Optimiser) -> Solution:
+def _solved(run: _LearningRun, theta: Tensor, method: Optimiser) -> Solution:
     """Run the optimiser; the run also ends when the surface vanishes."""
     try:
         return run.run_optimiser(method, theta, run.steps_left, run.seconds_left)
@@ -239,7 +239,7 @@ def _solved(run: _Run, theta: Tensor, method: Optimiser) -> Solution:
         return Solution(run.best[1], str(error), tuple(run.records))
 
 
-def _finished(run: _Run, start: Tensor, solution: Solution) -> Learned:
+def _finished(run: _LearningRun, start: Tensor, solution: Solution) -> Learned:
     last = solution.theta
     if solution.history and last is not start and bool(last.isfinite().all()):
         run.average(last)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.export import extract, project
-from gnrecon.export.trim import clip
+from gnrecon.export.trim import clip_to_box
 from gnrecon.field import Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -24,7 +24,7 @@ from gnrecon.shape_learning.shape_problem import ShapeProblem
 
 @dataclass(frozen=True)
 class LearnedField:
-    """A network's values as a field in its own coordinates; about a distance where the terms made it one.
+    """A network's values as a field in its own coordinates; approximately a distance if the terms require it.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def mesh_of(field: LearnedField, shown: Box, resolution: int, *, margin_cells: i
     grow = (cells * cell - sides) / 2 + margin_cells * cell
     outer = np.stack([shown.lower - grow, shown.upper + grow])
     whole = extract(field, resolution=int(cells.max()) + 2 * margin_cells, bounds=outer)
-    mesh = clip(whole, np.stack([shown.lower, shown.upper]))
+    mesh = clip_to_box(whole, np.stack([shown.lower, shown.upper]))
     if not len(mesh.faces):
         raise MeshError("The field has no zero level in the box, so there is no surface to mesh.")
     return project(mesh, field)

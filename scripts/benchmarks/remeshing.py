@@ -15,8 +15,8 @@ from benchmarks.harness import command_line
 from benchmarks.harness.measurement import Stopwatch
 from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
 from gnrecon.export.boolean import centre_and_size, from_meshlab, to_meshlab
-from gnrecon.export.project import between
-from gnrecon.export.remeshing.decimate import collapsed
+from gnrecon.export.project import face_sample_points
+from gnrecon.export.remeshing.decimate import simplify_by_collapses
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -70,7 +70,7 @@ def compare(
         "remeshed by gnrecon": ours(RefineOptions(remesh=length)),
         "collapsed by pymeshlab": lambda given: pymeshlab_collapse(given, faces),
         "fewer faces by gnrecon": ours(RefineOptions(faces=faces)),
-        "simplified by manifold3d": lambda given: collapsed(given, cell / 4),
+        "simplified by manifold3d": lambda given: simplify_by_collapses(given, cell / 4),
         "simplified by gnrecon": ours(RefineOptions(simplify=cell / 4)),
     }
     return [{"field": name, "method": method} | measured(work, mesh, field) for method, work in methods.items()]
@@ -86,7 +86,7 @@ def measured(work: Work, mesh: Mesh, field: SignedDistance) -> dict[str, Any]:
         "least_angle": angles["min"],
         "angle_p1": angles["p1"],
         "vertices_off": float(np.abs(field.sdf(made.vertices)).max()),
-        "between_off": float(np.abs(field.sdf(between(made.corners))).max()),
+        "between_off": float(np.abs(field.sdf(face_sample_points(made.corners))).max()),
         "cpu_seconds": watch.cpu_seconds,
     }
 

@@ -23,7 +23,7 @@ from PIL import Image
 from rich.console import Console
 
 from gnrecon.export import require_sound, verify
-from gnrecon.export.metrics import Surface
+from gnrecon.export.metrics import SurfaceQuery
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -65,7 +65,7 @@ def test_the_truths_are_solids_of_the_stated_genus_and_of_radius_one(name: str) 
 def test_points_lie_on_the_shapes_and_normals_lead_out(name: str, rng: np.random.Generator) -> None:
     solid = SOLIDS[name]
     points, normals = solid.draw(2000, rng)
-    surface = Surface(solid.mesh())
+    surface = SurfaceQuery(solid.mesh())
     gaps = np.linalg.norm(points - surface.nearest(points)[0], axis=1)
     # The mesh of a curved shape has chords; of a flat one the nearest point differs by rounding alone.
     assert gaps.mean() < (5e-5 if solid.function else 1e-7)
@@ -155,7 +155,7 @@ def test_the_files_truths_have_their_genus_and_unoriented_scans_no_normals(share
         assert (len(problem.scan), problem.scan.normals) == (500, None)
         assert verify(problem.truth).genus == problem.genus, name
         # The frame is one for both, so that the points lie on the truth.
-        feet, _ = Surface(problem.truth).nearest(problem.scan.points)
+        feet, _ = SurfaceQuery(problem.truth).nearest(problem.scan.points)
         assert np.linalg.norm(problem.scan.points - feet, axis=1).mean() < 2e-3
     given, unoriented = (CASES[name].problem(shared_data, 0) for name in ("gargoyle", "gargoyle, no normals"))
     assert unoriented.scan.normals is None

@@ -42,7 +42,7 @@ BELIEF = Belief(0.1, 1e-3, 0.05)
 FEATURES = 60
 
 
-def known(*_: object) -> Belief:
+def fixed_belief(*_: object) -> Belief:
     """Replace the choice, which is tested elsewhere."""
     return BELIEF
 
@@ -80,7 +80,7 @@ def fitted(
 @pytest.fixture(autouse=True)
 def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fix length and noise; their choice is tested elsewhere."""
-    monkeypatch.setattr(large, "choose", known)
+    monkeypatch.setattr(large, "choose", fixed_belief)
     monkeypatch.setitem(QUALITIES, "draft", FEATURES)
 
 
@@ -88,7 +88,7 @@ def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
 def whole() -> Detail:
     """The detail of an undisturbed fit in one process."""
     with pytest.MonkeyPatch.context() as patch, threads(1):
-        patch.setattr(large, "choose", known)
+        patch.setattr(large, "choose", fixed_belief)
         patch.setitem(QUALITIES, "draft", FEATURES)
         return fitted(block_points=200)[1]
 
@@ -154,7 +154,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    found = LocalData(samples, Leftover.of(sdf, samples), known())
+    found = LocalData(samples, Leftover.of(sdf, samples), fixed_belief())
     single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
@@ -217,7 +217,7 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent), *sys.path]!r}\n"
         "import time, torch; from pathlib import Path\n"
         "from gnrecon.fit.blocks import solve as large; import test_fit_blocks as own\n"
-        "torch.set_num_threads(1); large.choose = own.known; own.QUALITIES['draft'] = own.FEATURES\n"
+        "torch.set_num_threads(1); large.choose = own.fixed_belief; own.QUALITIES['draft'] = own.FEATURES\n"
         "save = own.WorkFolder.save\n"
         "own.WorkFolder.save = lambda *arguments: (save(*arguments), time.sleep(0.2))\n"
         f"own.fitted(Path({str(tmp_path)!r}))\n"

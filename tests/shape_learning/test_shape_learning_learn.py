@@ -128,7 +128,7 @@ def test_the_mean_of_the_last_steps_is_returned_where_it_is_better(monkeypatch: 
         # Of each pair, the later one is the mean.
         return Measurement(step, 0.0, 1.0 / len(seen), {}, None, None)
 
-    monkeypatch.setattr(learning._Run, "measured", measured)
+    monkeypatch.setattr(learning._LearningRun, "measured", measured)
     learned = learn(half_ball(), budget=None, steps=4)
     start, one, two = seen[0], learned.solution.theta, learned.field.theta
     assert not torch.equal(one, two)

@@ -20,7 +20,7 @@ from benchmarks.accuracy.summary import summarise
 from benchmarks.harness import command_line
 from benchmarks.harness.measurement import Stopwatch
 from benchmarks.harness.tables import number_or_dash, row_table
-from gnrecon.export.metrics import Surface
+from gnrecon.export.metrics import SurfaceQuery
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.ingest import oriented_normals
@@ -127,7 +127,7 @@ def true_normals(problem: Problem) -> Float | None:
     """Return the outward unit normals of a scan: its own, or the nearest true surface's; None if there is neither."""
     normals = problem.scan.normals
     if normals is None and isinstance(problem.truth, Mesh):
-        _, faces = Surface(problem.truth).nearest(problem.scan.points)
+        _, faces = SurfaceQuery(problem.truth).nearest(problem.scan.points)
         normals = problem.truth.face_vectors[faces]
     return None if normals is None else normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
