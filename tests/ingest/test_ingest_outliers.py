@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, thin_shell, torus
+from analytic_clouds import thin_shell, torus
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
