@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Choice, Leftover, Trials
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import DenoisingParameters
 from gnrecon.fit.shape_priors.bilateral_filter import Averaging
 from gnrecon.fit.shape_priors.sharp_shape import Sharp, has_edges
@@ -41,14 +41,14 @@ class LocalData:
     """
 
     samples: Samples
-    leftover: Leftover
-    belief: Belief
+    residuals: FieldResiduals
+    hyperparameters: Hyperparameters
     averaging: Averaging | None = None
 
     @classmethod
     def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> LocalData:
         """Return what faces that were continued to their edges tell by themselves, beside a global field."""
-        return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
+        return cls(sharp.samples, FieldResiduals.of(sdf, sharp.samples), sharp.hyperparameters, sharp.averaging)
 
 
 def choose_local_data(
@@ -76,43 +76,43 @@ def choose_local_data(
     device : a torch device
     outliers : whether some were found; those that are left would make horns on what is fitted as clean
     """
-    leftover = Leftover.of(sdf, samples)
-    radius = leftover.density.radius
-    trials = Trials.draw(leftover, held, radius, rng, device, features)
-    clean = None if outliers else trials.clean()
+    residuals = FieldResiduals.of(sdf, samples)
+    radius = residuals.density.radius
+    validation = CrossValidation.draw(residuals, held, radius, rng, device, features)
+    clean = None if outliers else validation.clean()
     if clean is not None:
-        return LocalData(samples, leftover, clean)
-    choice = trials.choice()
+        return LocalData(samples, residuals, clean)
+    choice = validation.choice()
     # Outliers that are left have no part in the noise that evidence tells.
-    plain = choice.belief if outliers else choice.best
+    plain = choice.hyperparameters if outliers else choice.best
     # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
-    if samples.estimated or choice.belief.position <= 1.001 * parameters.least_noise_disk_radii * radius:
-        return LocalData(samples, leftover, plain)
+    if samples.estimated or choice.hyperparameters.position <= 1.001 * parameters.least_noise_disk_radii * radius:
+        return LocalData(samples, residuals, plain)
 
-    def with_kept(averaging: Averaging) -> Trials:
+    def with_kept(averaging: Averaging) -> CrossValidation:
         points, normals = samples.points.copy(), samples.normals.copy()
         points[~held], normals[~held] = averaging.of(points[~held], normals[~held])
         # The noise of averaged points is alike among neighbours, of which no evidence is made.
-        of_averaged = Leftover.of(sdf, replace(samples, points=points, normals=normals))
-        return replace(trials, leftover=of_averaged, evidence=None)
+        of_averaged = FieldResiduals.of(sdf, replace(samples, points=points, normals=normals))
+        return replace(validation, residuals=of_averaged, likelihood=None)
 
     first = _candidates(parameters)[0]
     found = _best(choice, with_kept, lambda: has_edges(*first.of(samples.points, samples.normals)), parameters)
     if found is None:
-        return LocalData(samples, leftover, plain)
+        return LocalData(samples, residuals, plain)
     averaging, better = found
     points, normals = averaging.of(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
     _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
-    return LocalData(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
+    return LocalData(samples, FieldResiduals.of(sdf, samples), better.choice().hyperparameters, averaging)
 
 
 def _best(
-    choice: Choice,
-    kept_averaged: Callable[[Averaging], Trials],
+    choice: SelectedModel,
+    kept_averaged: Callable[[Averaging], CrossValidation],
     edges: Callable[[], bool],
     parameters: DenoisingParameters = DenoisingParameters(),
-) -> tuple[Averaging, Trials] | None:
+) -> tuple[Averaging, CrossValidation] | None:
     """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
 
     Whether there are edges is asked where the patches alone do not decide. All are compared at the length that suits
@@ -121,11 +121,11 @@ def _best(
     plain = _of_best_noise(choice.scores)
     first, *others = _candidates(parameters)
 
-    def tried(averaging: Averaging) -> tuple[Float, Trials]:
-        trials = kept_averaged(averaging)
-        return plain - _of_best_noise(trials.scores(choice.belief.length)), trials
+    def tried(averaging: Averaging) -> tuple[Float, CrossValidation]:
+        validation = kept_averaged(averaging)
+        return plain - _of_best_noise(validation.scores(choice.hyperparameters.length)), validation
 
-    gain, trials = tried(first)
+    gain, validation = tried(first)
     doubt = gain.std() / np.sqrt(len(gain))
     if not (gain.mean() > parameters.gain_standard_errors * doubt or (gain.mean() > -doubt and edges())):
         return None
@@ -133,8 +133,8 @@ def _best(
     for other in others:
         gain, of_other = tried(other)
         if gain.mean() > best:
-            best, averaging, trials = float(gain.mean()), other, of_other
-    return averaging, trials
+            best, averaging, validation = float(gain.mean()), other, of_other
+    return averaging, validation
 
 
 def _candidates(parameters: DenoisingParameters) -> list[Averaging]:

@@ -84,8 +84,8 @@ def fit_global(
     reach = plain_reach if options.regularisers else smoothness.reach
     sdf, solution, wrong = fitted(reach, subrange(advance, 0.0, 0.5))
     if reach > plain_reach and wrong > parameters.wrong_sign_share:
-        plain, plainly, ghosts = fitted(plain_reach, subrange(advance, 0.5, 1.0))
-        if wrong > ghosts + parameters.wrong_sign_share:
+        plain, plainly, wrong_signs = fitted(plain_reach, subrange(advance, 0.5, 1.0))
+        if wrong > wrong_signs + parameters.wrong_sign_share:
             reach, sdf, solution = plain_reach, plain, plainly
     _log.info(
         "The global field has %d features of length %.3g radii, and sees %d points; normals reach %.3g spacings.",

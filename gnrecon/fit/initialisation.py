@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.fit.objective import FieldProblem, Scene, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
 from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
@@ -34,7 +34,7 @@ from gnrecon.least_squares.system import identity
 from gnrecon.runtime.errors import FitError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
-TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
+TermsOf = Callable[[Tensor, Tensor, int], Sequence[ObjectiveTerm]]
 """Terms of volume samples x, their coarse distances, and at most so many data points."""
 
 
@@ -80,7 +80,7 @@ def wide_start(
     frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
-    search = GhostSearch(scene.coarse, x, np.sign(distance))
+    search = WrongSignSearch(scene.coarse, x, np.sign(distance))
     for round_number in range(parameters.rounds):
         last = round_number + 1 == parameters.rounds
         most_points = parameters.final_points if last else parameters.search_points
@@ -89,7 +89,7 @@ def wide_start(
         advance((round_number + 1) / parameters.rounds)
         if not last:
             trial = scene.places(parameters.trial_factor * scene.volume_count, rng)
-            wrong, expected = search.ghosts(trial, partial(_value, field, theta, scene))
+            wrong, expected = search.wrong_signs(trial, partial(_value, field, theta, scene))
             some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], parameters.wrong_sign_repeats)
             x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
     return theta
@@ -150,7 +150,7 @@ def random_network(
 
 def solve_last_layer(
     field: Siren,
-    terms: Sequence[Term],
+    terms: Sequence[ObjectiveTerm],
     theta: Tensor,
     ridge: float | None = None,
     *,
@@ -188,7 +188,7 @@ def solve_last_layer(
 
 
 @dataclass
-class GhostSearch:
+class WrongSignSearch:
     """A search that remembers the signs which it has found.
 
     Parameters
@@ -202,7 +202,7 @@ class GhostSearch:
     points: Float
     signs: Float
 
-    def ghosts(self, x: Float, value: Callable[[Float], Float]) -> tuple[Float, Float]:
+    def wrong_signs(self, x: Float, value: Callable[[Float], Float]) -> tuple[Float, Float]:
         """Return those of x where the value has the wrong sign, of shape (G, 3), and the coarse distances there.
 
         Parameters

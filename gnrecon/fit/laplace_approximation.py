@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.fit.objective import FieldProblem, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.fit.parameters import LaplaceParameters
 from gnrecon.least_squares import LayeredJacobian
 from gnrecon.least_squares.direct import damped_factor, solve_factored
@@ -160,14 +160,14 @@ class DataRows:
         points, normals = (self.points, self.normals) if rows is None else (self.points[rows], self.normals[rows])
         # The fit's terms are means over their points; here each row counts as it is.
         count = float(len(points))
-        normal = Term("normal", self.normal_residual, points, normals, count * self.normal_weight)
-        return self._linearise([Term("interface", interface, points, None, count), normal])
+        normal = ObjectiveTerm("normal", self.normal_residual, points, normals, count * self.normal_weight)
+        return self._linearise([ObjectiveTerm("interface", interface, points, None, count), normal])
 
     def values(self, points: Tensor) -> LayeredJacobian:
         """Return the derivatives of f at points, of shape (N, 3), by the free parameters."""
-        return self._linearise([Term("value", interface, points, None, float(len(points)))])[0]
+        return self._linearise([ObjectiveTerm("value", interface, points, None, float(len(points)))])[0]
 
-    def _linearise(self, terms: Sequence[Term]) -> tuple[LayeredJacobian, Tensor]:
+    def _linearise(self, terms: Sequence[ObjectiveTerm]) -> tuple[LayeredJacobian, Tensor]:
         units = free_units(self.field, self.theta.device)
         problem = FieldProblem(self.field, terms, self.theta, units, keep_bytes=LaplaceParameters.factor_bytes)
         return problem.linearise(problem.free())

@@ -25,7 +25,7 @@ from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)
-class Belief:
+class Hyperparameters:
     """What is assumed of a scan and its surface, all standard deviations or lengths.
 
     Parameters
@@ -109,7 +109,7 @@ class PatchSystem:
         amplitudes: Tensor = self._scale * solve_factored(factor, right)
         return amplitudes
 
-    def solve_within(
+    def solve_with_bounds(
         self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
@@ -149,7 +149,7 @@ class PatchSystem:
         return product.add_(self._volume[0], alpha=self._scale**2)
 
 
-class RowSystem:
+class LocalRowSystem:
     """The same system in the space of its rows, for a patch of few points: K + 1 with K = s^2 J J^T.
 
     The most probable amplitudes are s^2 J^T (s^2 J J^T + 1)^-1 r. Parameters are those of `PatchSystem`.
@@ -185,10 +185,10 @@ def data_kernel(patch: Patch, features: Features, length: float, size: float) ->
     return size**2 * 2.0 / len(features) * (rows @ rows.T)
 
 
-def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | RowSystem:
+def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | LocalRowSystem:
     """Return the smaller one of the two systems that `solve` may use; parameters as those of `PatchSystem`."""
     rows = 4 * len(patch.points) + len(patch.volume)
-    return (RowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
+    return (LocalRowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
 
 
 def _factor(

@@ -34,7 +34,7 @@ Place = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Evidence:
+class MarginalLikelihood:
     """Patches of a scan, which tell its noise.
 
     Parameters
@@ -60,7 +60,7 @@ class Evidence:
         device: str,
         *,
         parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters(),
-    ) -> Evidence:
+    ) -> MarginalLikelihood:
         """Return the evidence of patches, drawing its features."""
         features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
         return cls(patches, features, radius, device, parameters)
@@ -156,7 +156,7 @@ def clean_noise(
     """
     if over < parameters.least_residual_disk_radii * density.radius:
         return None
-    height = heights(points, normals, density, parameters=parameters)
+    height = median_pair_height(points, normals, density, parameters=parameters)
     if not height <= parameters.most_height:
         return None
     least = parameters.least_position_noise_disk_radii
@@ -166,7 +166,7 @@ def clean_noise(
     return max(height, least) * density.radius, angle
 
 
-def heights(
+def median_pair_height(
     points: Float,
     normals: Float,
     density: Density,

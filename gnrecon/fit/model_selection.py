@@ -24,8 +24,8 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.local_solve import Belief, Patch, patch_system
-from gnrecon.fit.marginal_likelihood import Evidence, clean_noise
+from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, clean_noise
 from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -34,7 +34,7 @@ from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
-class Leftover:
+class FieldResiduals:
     """What a global field leaves over at the points: everything of shape (N,) or (N, 3), unit coordinates.
 
     `estimated` says that the normals were found from the points.
@@ -47,7 +47,7 @@ class Leftover:
     estimated: bool = False
 
     @classmethod
-    def of(cls, sdf: NeuralSDF, samples: Samples) -> Leftover:
+    def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
         """Return what a field leaves over at samples."""
         value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
         return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
@@ -136,7 +136,7 @@ class Volume:
 
 
 @dataclass(frozen=True)
-class Choice:
+class SelectedModel:
     """What left-out points choose.
 
     Parameters
@@ -146,17 +146,19 @@ class Choice:
     evident : belief of the noise that has most evidence at its length; None where points do not tell it
     """
 
-    belief: Belief
+    hyperparameters: Hyperparameters
     scores: Float
-    evident: Belief | None = None
+    most_likely: Hyperparameters | None = None
 
     @property
-    def best(self) -> Belief:
+    def best(self) -> Hyperparameters:
         """Return the belief for points as they were scanned."""
-        return self.evident or self.belief
+        return self.most_likely or self.hyperparameters
 
 
-def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
+def select_hyperparameters(
+    residuals: FieldResiduals, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu"
+) -> Hyperparameters:
     """Return the belief that a clean scan tells by itself, and of any other that which predicts left-out points best.
 
     The noise is then that of most evidence (`evidence`), unless normals were estimated.
@@ -169,26 +171,26 @@ def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generat
     rng : draws patches, features and what is left out
     device : a torch device
     """
-    trials = Trials.draw(leftover, held, radius, rng, device)
-    return trials.clean() or trials.choice().best
+    validation = CrossValidation.draw(residuals, held, radius, rng, device)
+    return validation.clean() or validation.choice().best
 
 
-def _evidence(
-    leftover: Leftover,
+def _marginal_likelihood(
+    residuals: FieldResiduals,
     radius: float,
     rng: np.random.Generator,
     device: str,
     *,
     parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters(),
-) -> Evidence:
+) -> MarginalLikelihood:
     """Return the evidence of points about places that are drawn; the other parameters as those of `choose`."""
-    count = min(parameters.patches, len(leftover))
-    centers = leftover.points[rng.choice(len(leftover), count, replace=False)]
-    ranks = list(range(1, min(parameters.patch_points, len(leftover)) + 1))
-    near = leftover.density.tree.query(centers, ranks)[1]
+    count = min(parameters.patches, len(residuals))
+    centers = residuals.points[rng.choice(len(residuals), count, replace=False)]
+    ranks = list(range(1, min(parameters.patch_points, len(residuals)) + 1))
+    near = residuals.density.tree.query(centers, ranks)[1]
     pairs = zip(np.sort(near), centers, strict=True)
-    patches = [leftover.patch(rows, center, Volume.none(), device) for rows, center in pairs]
-    return Evidence.of(patches, radius, rng, device, parameters=parameters)
+    patches = [residuals.patch(rows, center, Volume.none(), device) for rows, center in pairs]
+    return MarginalLikelihood.of(patches, radius, rng, device, parameters=parameters)
 
 
 def _noise_candidates(parameters: ModelSelectionParameters) -> list[tuple[float, float]]:
@@ -222,7 +224,7 @@ def _smoothest(
 
 
 @dataclass(frozen=True)
-class Trials:
+class CrossValidation:
     """Patches with what they are to predict.
 
     Parameters
@@ -240,8 +242,8 @@ class Trials:
         means of, and not by the surface alone
     """
 
-    leftover: Leftover
-    told: Leftover
+    residuals: FieldResiduals
+    told: FieldResiduals
     radius: float
     features: Features
     centers: Float
@@ -249,7 +251,7 @@ class Trials:
     held: Mask
     device: str
     known: tuple[float, float] | None = None
-    evidence: Evidence | None = None
+    likelihood: MarginalLikelihood | None = None
     parameters: ModelSelectionParameters = ModelSelectionParameters()
     _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
@@ -257,7 +259,7 @@ class Trials:
     @classmethod
     def draw(
         cls,
-        leftover: Leftover,
+        residuals: FieldResiduals,
         held: Mask,
         radius: float,
         rng: np.random.Generator,
@@ -265,31 +267,31 @@ class Trials:
         cube_features: int = ModelSelectionParameters.features,
         *,
         parameters: ModelSelectionParameters = ModelSelectionParameters(),
-    ) -> Trials:
+    ) -> CrossValidation:
         """Draw the patches, for cubes of so many features; the other parameters as those of `choose`."""
         out = np.flatnonzero(held)
-        dense = len(leftover) > parameters.dense_points
+        dense = len(residuals) > parameters.dense_points
         patches = parameters.dense_patches if dense else parameters.patches
         # What is to predict a cube of few features resolves no more than it.
         few = dense or cube_features <= parameters.dense_features
         count = parameters.dense_features if few else parameters.features
-        chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
+        chosen = rng.choice(len(residuals), min(patches, len(residuals)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(parameters.patch_validation_points, len(out)) + 1))
-        near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
+        near = cKDTree(residuals.points[out]).query(residuals.points[chosen], ranks)[1]
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
-        centers = leftover.points[chosen]
-        evidence = None if leftover.estimated else _evidence(leftover, radius, rng.spawn(1)[0], device)
+        centers = residuals.points[chosen]
+        likelihood = None if residuals.estimated else _marginal_likelihood(residuals, radius, rng.spawn(1)[0], device)
         found = list(out[near])
-        return cls(leftover, leftover, radius, features, centers, found, held, device, None, evidence, parameters)
+        return cls(residuals, residuals, radius, features, centers, found, held, device, None, likelihood, parameters)
 
-    def clean(self) -> Belief | None:
+    def clean(self) -> Hyperparameters | None:
         """Return the belief of a scan so clean that its points tell their noise by themselves, or None.
 
         Its length is the shortest whose next is not better beyond its standard error. All that clean points tell asks
         for that; only where they, or a cube's features, are too few for it are longer ones clearly better.
         """
-        left = self.leftover
+        left = self.residuals
         noise = clean_noise(left.points, left.normals, left.density, left.over, left.estimated)
         if noise is None:
             return None
@@ -297,9 +299,9 @@ class Trials:
         number, count = 0, len(self.parameters.lengths_disk_radii)
         while number + 1 < count and known._clearly_better(number + 1, number):
             number += 1
-        return Belief(self._length(number), *noise)
+        return Hyperparameters(self._length(number), *noise)
 
-    def choice(self) -> Choice:
+    def choice(self) -> SelectedModel:
         """Return the belief that predicts best."""
         scores: dict[int, Float] = {}
 
@@ -317,16 +319,16 @@ class Trials:
         count = len(_noise_candidates(self.parameters))
         tabled = {number: of_length[:, :count] for number, of_length in scores.items()}
         number, noise = _smoothest(tabled, parameters=self.parameters)
-        evident = None
-        if self.evidence is not None:
+        most_likely = None
+        if self.likelihood is not None:
             last, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
-            evident = self._belief(last, -1)
-        return Choice(self._belief(number, noise), tabled[number], evident)
+            most_likely = self._belief(last, -1)
+        return SelectedModel(self._belief(number, noise), tabled[number], most_likely)
 
-    def _belief(self, number: int, noise: int) -> Belief:
+    def _belief(self, number: int, noise: int) -> Hyperparameters:
         """Return the belief of the numbers of a length and of one of its noises."""
         length = self._length(number)
-        return Belief(length, *self.noises(length)[noise])
+        return Hyperparameters(length, *self.noises(length)[noise])
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
@@ -346,8 +348,8 @@ class Trials:
             return [self.known]
         if length not in self._noises:
             tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
-            tried += [] if self.evidence is None else [self.evidence.noise(length)]
-            most = max(self.leftover.over, self.parameters.least_position_noise_disk_radii * self.radius)
+            tried += [] if self.likelihood is None else [self.likelihood.noise(length)]
+            most = max(self.residuals.over, self.parameters.least_position_noise_disk_radii * self.radius)
             self._noises[length] = [(min(position, most), angle) for position, angle in tried]
         return self._noises[length]
 
@@ -363,17 +365,17 @@ class Trials:
         """Return the scores of one patch for each choice of noise."""
         center, predicted = self.centers[number], self.predicted[number]
         reach = (
-            np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max()
+            np.linalg.norm(self.residuals.points[predicted] - center, axis=1).max()
             + self.parameters.margin_lengths * length
         )
-        rows = self.leftover.within(center, reach)
+        rows = self.residuals.within(center, reach)
         rows = rows[~self.held[rows]]
         # Beyond this many the nearest tell enough, and time would grow with the length's square.
         most = self.parameters.most_patch_points
         if len(rows) > most:
-            far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
+            far = np.linalg.norm(self.residuals.points[rows] - center, axis=1)
             rows = rows[np.sort(np.argsort(far, kind="stable")[:most])]
-        patch = self.leftover.patch(rows, center, Volume.none(), self.device)
+        patch = self.residuals.patch(rows, center, Volume.none(), self.device)
         system = patch_system(patch, self.features, length, patch.size)
         target = self.told.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.told.normals[predicted], device=self.device)
@@ -387,7 +389,7 @@ class Trials:
         # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
         missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
-        if self.leftover.estimated and len(self.leftover) <= self.parameters.sparse_points:
+        if self.residuals.estimated and len(self.residuals) <= self.parameters.sparse_points:
             # Such normals are means of their neighbours', which a field that is too smooth predicts best. So distances
             # alone count, and a field that is steep because it winds through every point is not nearer for that.
             return float((missing.abs() / slope.clamp(self.parameters.least_slope, 1.0)).mean())

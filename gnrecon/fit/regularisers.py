@@ -112,7 +112,7 @@ Jet = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
-class Wish:
+class PenaltyTerm:
     """A residual of curvature that is asked of points of the surface, or one of the value, at points that stay.
 
     Parameters
@@ -132,28 +132,28 @@ class Wish:
     target: Tensor | None = None
     still: Tensor | None = None
 
-    def asked(self, jet: Jet) -> Linearised:
+    def linearised(self, jet: Jet) -> Linearised:
         """Return the residuals at the points' jet."""
         return self.residual(*jet, self.target)
 
-    def unmet(self, jet: Jet) -> tuple[Wish, Linearised]:
+    def active_rows(self, jet: Jet) -> tuple[PenaltyTerm, Linearised]:
         """Return those of the points that stay whose residuals of the value are not zero, and these, at the jet."""
-        linear = self.asked(jet)
+        linear = self.linearised(jet)
         assert linear.by_value is not None, "residuals of the value"
         rows = linear.residual.ne(0).any(dim=1)
         kept = replace(self, points=self.points[rows], scale=self.scale[rows])
         return kept, Linearised(linear.residual[rows], linear.by_value[rows], None)
 
-    def weighed(self, jet: Jet) -> Wish:
+    def reweighted(self, jet: Jet) -> PenaltyTerm:
         """Return a robust wish with what its residuals count, at the points' jet, in its scale."""
         assert self.robust is not None, "what is not robust counts alike"
-        square = self.asked(jet).residual.square().sum(1, keepdim=True)
+        square = self.linearised(jet).residual.square().sum(1, keepdim=True)
         # The tangent of r^2 / (1 + r^2) is a multiple of r^2: iteratively reweighted least squares.
         return replace(self, scale=self.scale / (1 + square / self.robust**2))
 
 
 @dataclass(frozen=True)
-class Sines:
+class SineSum:
     """Sine features about a centre, on top of a known function.
 
     Parameters
@@ -218,14 +218,14 @@ class Sines:
         return x
 
 
-def valued(value: Tensor) -> Jet:
+def constant_jet(value: Tensor) -> Jet:
     """Return values, of shape (N,), as a jet whose derivatives nobody asks for."""
     count = len(value)
     return value, value.new_zeros(1, 3).expand(count, 3), value.new_zeros(1, 3, 3).expand(count, 3, 3)
 
 
 @dataclass(frozen=True)
-class BendProblem:
+class PenaltyProblem:
     """The least-squares problem of one step: L^T a = y, and the wishes at their points, of which none moves.
 
     Parameters
@@ -237,26 +237,27 @@ class BendProblem:
     known : jets of the known function at each wish's points
     """
 
-    sines: Sines
+    sines: SineSum
     factor: Tensor
     target: Tensor
-    wishes: Sequence[Wish]
+    terms: Sequence[PenaltyTerm]
     theta: Tensor
     known: Sequence[Jet]
 
     @classmethod
-    def at(cls, sines: Sines, factor: Tensor, target: Tensor, wishes: Sequence[Wish], theta: Tensor) -> BendProblem:
+    def at(
+        cls, sines: SineSum, factor: Tensor, target: Tensor, terms: Sequence[PenaltyTerm], theta: Tensor
+    ) -> PenaltyProblem:
         """Pose the problem of the surface that the amplitudes theta make."""
         placed = [
-            replace(wish, points=sines.on_surface(theta, wish.points)) if wish.still is None else wish
-            for wish in wishes
+            replace(term, points=sines.on_surface(theta, term.points)) if term.still is None else term for term in terms
         ]
-        known = [sines.known(wish.points) if wish.still is None else valued(wish.still) for wish in placed]
-        weighed = [
-            wish if wish.robust is None else wish.weighed(sines.jet(theta, wish.points, jet))
-            for wish, jet in zip(placed, known, strict=True)
+        known = [sines.known(term.points) if term.still is None else constant_jet(term.still) for term in placed]
+        reweighted = [
+            term if term.robust is None else term.reweighted(sines.jet(theta, term.points, jet))
+            for term, jet in zip(placed, known, strict=True)
         ]
-        return cls(sines, factor, target, weighed, theta, known)
+        return cls(sines, factor, target, reweighted, theta, known)
 
     def free(self) -> Tensor:
         """Return the amplitudes where it was posed."""
@@ -268,31 +269,31 @@ class BendProblem:
 
     def residual(self, free: Tensor) -> Tensor:
         """Return r, of shape (M,), without values that are as they should be; M depends on how many are."""
-        return self._residual(free, self._asked(free))
+        return self._residual(free, self._linearised(free))
 
     def linearise(self, free: Tensor) -> tuple[DenseJacobian, Tensor]:
         """Return J, of shape (M, p), and r."""
-        asked = list(self._asked(free))
-        rows = [self.sines.rows(wish.points, linear, wish.scale) for wish, linear in asked]
-        return DenseJacobian(torch.cat([self.factor.T, *rows])), self._residual(free, asked)
+        linearised = list(self._linearised(free))
+        rows = [self.sines.rows(term.points, linear, term.scale) for term, linear in linearised]
+        return DenseJacobian(torch.cat([self.factor.T, *rows])), self._residual(free, linearised)
 
-    def _residual(self, free: Tensor, asked: Iterable[tuple[Wish, Linearised]]) -> Tensor:
-        parts = [(wish.scale * linear.residual).T.flatten() for wish, linear in asked]
+    def _residual(self, free: Tensor, linearised: Iterable[tuple[PenaltyTerm, Linearised]]) -> Tensor:
+        parts = [(term.scale * linear.residual).T.flatten() for term, linear in linearised]
         return torch.cat([self.factor.T @ free - self.target, *parts])
 
-    def _asked(self, free: Tensor) -> Iterator[tuple[Wish, Linearised]]:
-        for wish, known in zip(self.wishes, self.known, strict=True):
-            if wish.still is None:
-                yield wish, wish.asked(self.sines.jet(free, wish.points, known))
+    def _linearised(self, free: Tensor) -> Iterator[tuple[PenaltyTerm, Linearised]]:
+        for term, known in zip(self.terms, self.known, strict=True):
+            if term.still is None:
+                yield term, term.linearised(self.sines.jet(free, term.points, known))
             else:
-                yield wish.unmet(self.sines.value(free, wish.points, known))
+                yield term.active_rows(self.sines.value(free, term.points, known))
 
 
-def bent(
-    sines: Sines,
+def minimise_penalised(
+    sines: SineSum,
     factor: Tensor,
     right: Tensor,
-    wishes: Sequence[Wish],
+    terms: Sequence[PenaltyTerm],
     amplitudes: Tensor,
     steps: int,
     *,
@@ -310,9 +311,9 @@ def bent(
     """
     target = torch.linalg.solve_triangular(factor, right[:, None], upper=False)[:, 0]
 
-    def posed(number: int, theta: Tensor) -> BendProblem:
+    def posed(number: int, theta: Tensor) -> PenaltyProblem:
         del number
-        return BendProblem.at(sines, factor, target, wishes, theta)
+        return PenaltyProblem.at(sines, factor, target, terms, theta)
 
     # A step knows nothing of how the surface moves away from its points; what counts is how it is where it has gone.
     method = GaussNewton(GainRatioDamping(initial_damping=1e-9, metric=identity))

@@ -26,8 +26,8 @@ from gnrecon.fit.blocks.store import Work
 from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.fit_options import QUALITIES
 from gnrecon.fit.local_fields import fit_detail
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Leftover
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -39,11 +39,11 @@ from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 COUNT = 1500
 AXES = np.array([1.0, 0.6, 0.5])
-BELIEF = Belief(0.1, 1e-3, 0.05)
+BELIEF = Hyperparameters(0.1, 1e-3, 0.05)
 FEATURES = 60
 
 
-def known(*_: object) -> Belief:
+def known(*_: object) -> Hyperparameters:
     """Choose nothing: that is tested elsewhere."""
     return BELIEF
 
@@ -81,7 +81,7 @@ def fitted(
 @pytest.fixture(autouse=True)
 def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Length and noise as they are: choosing them is tested elsewhere."""
-    monkeypatch.setattr(large, "choose", known)
+    monkeypatch.setattr(large, "select_hyperparameters", known)
     monkeypatch.setitem(QUALITIES, "draft", FEATURES)
 
 
@@ -89,7 +89,7 @@ def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
 def whole() -> Detail:
     """The detail of an undisturbed fit in one process."""
     with pytest.MonkeyPatch.context() as patch, threads(1):
-        patch.setattr(large, "choose", known)
+        patch.setattr(large, "select_hyperparameters", known)
         patch.setitem(QUALITIES, "draft", FEATURES)
         return fitted(block_points=200)[1]
 
@@ -158,7 +158,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    found = LocalData(samples, Leftover.of(sdf, samples), known())
+    found = LocalData(samples, FieldResiduals.of(sdf, samples), known())
     single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
@@ -221,7 +221,7 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent), *sys.path]!r}\n"
         "import time, torch; from pathlib import Path\n"
         "from gnrecon.fit import block, large; import test_fit_large as own\n"
-        "torch.set_num_threads(1); large.choose = own.known; own.QUALITIES['draft'] = own.FEATURES\n"
+        "torch.set_num_threads(1); large.select_hyperparameters = own.known; own.QUALITIES['draft'] = own.FEATURES\n"
         "keep = own.Work.keep\n"
         "own.Work.keep = lambda *arguments: (keep(*arguments), time.sleep(0.2))\n"
         f"own.fitted(Path({str(tmp_path)!r}))\n"
@@ -250,7 +250,7 @@ def test_memory_holds_one_cube_and_its_neighbours(tmp_path: Path, monkeypatch: p
         return rows
 
     monkeypatch.setattr(block.Blocks, "_around", counted)
-    monkeypatch.setattr(large, "choose", lambda *_: Belief(0.04, 1e-3, 0.05))
+    monkeypatch.setattr(large, "select_hyperparameters", lambda *_: Hyperparameters(0.04, 1e-3, 0.05))
     with threads(1):
         _, detail = fitted(tmp_path)
     assert isinstance(Work(tmp_path).array("points").base, np.memmap)
@@ -261,7 +261,7 @@ def test_memory_holds_one_cube_and_its_neighbours(tmp_path: Path, monkeypatch: p
 def test_cubes_see_all_of_their_points(tmp_path: Path) -> None:
     fitted(tmp_path)
     found = block.Blocks.of(Work(tmp_path), "cpu")
-    points, partition = found.leftover.points, found.partition
+    points, partition = found.residuals.points, found.partition
     reach = partition.reach + 2 * found.radius
     for key in found.keys[::7]:
         inside = np.flatnonzero((np.abs(points - partition.center(key)) <= reach).all(axis=1))

@@ -78,7 +78,7 @@ def test_faces_of_a_cube_are_continued_to_its_edges_and_its_gaps_are_halved() ->
     assert nearest[1] < 0.75 * nearest[0]
     nearest = [Density(points).tree.query(places)[0].max() for points in (scan.points, found.samples.points)]
     assert nearest[1] < nearest[0]
-    assert found.belief.length == pytest.approx(sharp.EXACT[0] * Density(found.samples.points).radius)
+    assert found.hyperparameters.length == pytest.approx(sharp.EXACT[0] * Density(found.samples.points).radius)
 
 
 def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:

@@ -26,8 +26,8 @@ from gnrecon.fit.blocks.tree import Dipoles, morton, octree_blocks
 from gnrecon.fit.blocks.workers import solve_blocks, solve_scheduled
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Leftover, choose
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -76,16 +76,18 @@ def fit_large(
     FitError, MemoryLimitError
         When a block cannot be solved.
     """
-    leftover = Leftover.of(sdf, samples)
-    belief = choose(leftover, held, leftover.density.radius, rng, options.device)
+    residuals = FieldResiduals.of(sdf, samples)
+    hyperparameters = select_hyperparameters(residuals, held, residuals.density.radius, rng, options.device)
     chosen = LocalFieldParameters.selection_time_share
     advance(chosen)
     like = torch.zeros(0, dtype=torch.float64, device=options.device)
     features = Features.draw(options.features, rng, like)
     # Off the data by a part of a cell that no regular scan shares, as in `detail`.
     edge = LocalFieldParameters.cube_edge_lengths
-    partition = Partition(leftover.points.min(axis=0) - 0.137 * edge * belief.length, edge * belief.length)
-    arrays, facts = _tasks(sdf, leftover, belief, features, partition, block_points)
+    partition = Partition(
+        residuals.points.min(axis=0) - 0.137 * edge * hyperparameters.length, edge * hyperparameters.length
+    )
+    arrays, facts = _tasks(sdf, residuals, hyperparameters, features, partition, block_points)
     with _folder(folder) as place:
         work = Work.begin(place, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
@@ -95,7 +97,7 @@ def fit_large(
         else:
             # As many as torch has threads, which is what was asked for, or the machine's cores.
             solve_blocks(work, missing, torch.get_num_threads(), options.device, subrange(advance, chosen, 1.0))
-        return _gathered(work, count, arrays["keys"], partition, features, belief)
+        return _gathered(work, count, arrays["keys"], partition, features, hyperparameters)
 
 
 @contextmanager
@@ -108,20 +110,25 @@ def _folder(asked: str | Path | None) -> Iterator[Path]:
 
 
 def _tasks(
-    sdf: NeuralSDF, leftover: Leftover, belief: Belief, features: Features, partition: Partition, block_points: int
+    sdf: NeuralSDF,
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
+    features: Features,
+    partition: Partition,
+    block_points: int,
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the arrays and the plain values from which all blocks are solved."""
-    density = leftover.density
-    codes = morton(_cells(partition, leftover.points))
+    density = residuals.density
+    codes = morton(_cells(partition, residuals.points))
     order = np.argsort(codes, kind="stable")
     cells, first = np.unique(codes[order], return_index=True)
-    keys, ends = _blocks(_cubes(partition, leftover.points), cells, np.append(first, len(codes)), block_points)
-    dipoles = Dipoles.of(leftover.points, leftover.normals, density.disks)
+    keys, ends = _blocks(_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points)
+    dipoles = Dipoles.of(residuals.points, residuals.normals, density.disks)
     arrays = {
-        "points": leftover.points[order],
-        "normals": leftover.normals[order],
-        "value": leftover.value[order],
-        "gradient": leftover.gradient[order],
+        "points": residuals.points[order],
+        "normals": residuals.normals[order],
+        "value": residuals.value[order],
+        "gradient": residuals.gradient[order],
         "disks": density.disks[order],
         "cells": cells,
         "first": np.append(first, len(codes)),
@@ -140,9 +147,9 @@ def _tasks(
         "cell": partition.cell,
         "overlap": partition.overlap,
         "radius": density.radius,
-        "length": belief.length,
-        "position": belief.position,
-        "angle": belief.angle,
+        "length": hyperparameters.length,
+        "position": hyperparameters.position,
+        "angle": hyperparameters.angle,
     }
     return arrays, facts
 
@@ -173,7 +180,9 @@ def _blocks(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) -> 
     return keys, np.array([0, *(block.stop for block in octree_blocks(codes, counts, most))])
 
 
-def _gathered(work: Work, count: int, keys: Int, partition: Partition, features: Features, belief: Belief) -> Detail:
+def _gathered(
+    work: Work, count: int, keys: Int, partition: Partition, features: Features, hyperparameters: Hyperparameters
+) -> Detail:
     """Return the detail of all blocks, its cubes in the order of their keys."""
     solved = [work.solved(number) for number in range(count)]
     cubes, lengths, amplitudes = (
@@ -182,4 +191,6 @@ def _gathered(work: Work, count: int, keys: Int, partition: Partition, features:
     kept = keys[cubes]
     order = np.lexsort((kept[:, 2], kept[:, 1], kept[:, 0]))
     sums = torch.as_tensor(amplitudes[order], device=features.phases.device)
-    return Detail(partition, kept[order], lengths[order], features, sums, belief.position, belief.angle)
+    return Detail(
+        partition, kept[order], lengths[order], features, sums, hyperparameters.position, hyperparameters.angle
+    )

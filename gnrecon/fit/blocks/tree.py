@@ -128,10 +128,10 @@ class Dipoles:
         sums = np.column_stack([areas, areas[:, None] * points, areas[:, None] * normals / 4])[order]
         first: Int
         codes, first = codes[order], np.arange(len(points) + 1)
-        codes, sums, first = _joined(codes, sums)
+        codes, sums, first = _connected(codes, sums)
         levels = [_level(sums, first, origin, side)]
         while len(codes) > FEW:
-            codes, sums, first = _joined(codes >> np.uint64(3), sums)
+            codes, sums, first = _connected(codes >> np.uint64(3), sums)
             side *= 2
             levels.append(_level(sums, first, origin, side))
         return cls(tuple(reversed(levels)))
@@ -174,7 +174,7 @@ class Dipoles:
         return winding_number(x, *self.near(center, reach))
 
 
-def _joined(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:
+def _connected(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:
     """Sum the rows of equal codes, which are neighbours; where each began, with the end."""
     start = np.flatnonzero(np.r_[True, codes[1:] != codes[:-1]])
     return codes[start], np.add.reduceat(sums, start, axis=0), np.append(start, len(codes))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.shape_priors.bilateral_filter import Averaging
 from gnrecon.fit.shape_priors.edge_completion import Faces
 from gnrecon.fit.shape_priors.hole_completion import Continued, continued
@@ -75,11 +75,11 @@ class Sharp:
     across: Continued
 
     @property
-    def belief(self) -> Belief:
+    def hyperparameters(self) -> Hyperparameters:
         """What is believed of them."""
         radius = Density(self.samples.points).radius
         length, angle = EXACT if self.averaging is None else AVERAGED
-        return Belief(length * radius, NOISE * radius, angle)
+        return Hyperparameters(length * radius, NOISE * radius, angle)
 
     @classmethod
     def of(cls, samples: Samples) -> Sharp | None:

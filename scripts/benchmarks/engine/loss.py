@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field import Siren
-from gnrecon.fit.objective import FieldProblem, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.residuals import eikonal, interface, normal_projection
 
 WEIGHTS = (1.0, 1.0, 1e-2)
@@ -52,9 +52,9 @@ def posed(
     """Return the loss as a least-squares problem of all parameters at theta, of shape (p,)."""
     data, normal, volume = weights
     terms = [
-        Term("data", interface, sample.points, None, data),
-        Term("normal", normal_projection, sample.points, sample.normals, normal),
-        Term("eikonal", eikonal, sample.volume, None, volume),
+        ObjectiveTerm("data", interface, sample.points, None, data),
+        ObjectiveTerm("normal", normal_projection, sample.points, sample.normals, normal),
+        ObjectiveTerm("eikonal", eikonal, sample.volume, None, volume),
     ]
     return FieldProblem(field, terms, theta, precision=precision, keep_bytes=keep_bytes)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.engine.loss import Sample
 from gnrecon.field import Siren
 from gnrecon.fit.initialisation import solve_last_layer
-from gnrecon.fit.objective import Scene, Term
+from gnrecon.fit.objective import ObjectiveTerm, Scene
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.residuals import interface, normal_vector, signed_distance
 
@@ -54,8 +54,8 @@ def solved_start(field: Siren, sample: Sample, seed: int = 0) -> Tensor:
     chosen = torch.as_tensor(rng.permutation(len(points))[:POINTS])
     on = scene.points[chosen]
     terms = [
-        Term("data", interface, on),
-        Term("normal", normal_vector, on, scene.normals[chosen], NORMAL_WEIGHT),
-        Term("distance", signed_distance, scene.tensor(x), scene.tensor(distance), DISTANCE_WEIGHT),
+        ObjectiveTerm("data", interface, on),
+        ObjectiveTerm("normal", normal_vector, on, scene.normals[chosen], NORMAL_WEIGHT),
+        ObjectiveTerm("distance", signed_distance, scene.tensor(x), scene.tensor(distance), DISTANCE_WEIGHT),
     ]
     return solve_last_layer(field, terms, sine_features(field, seed), RIDGE).to(sample.points)

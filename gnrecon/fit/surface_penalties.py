@@ -25,10 +25,10 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_solve import Belief, PatchSystem
-from gnrecon.fit.objective import FieldProblem, Scene, Term, data_terms, distance_term
+from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
-from gnrecon.fit.regularisers import Jet, Regulariser, Sines, Wish, bent
+from gnrecon.fit.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.signed_distance import Density, free_space_bounds
 from gnrecon.least_squares.direct import damped_factor
@@ -38,7 +38,7 @@ from gnrecon.runtime.errors import FitError
 
 
 @dataclass(frozen=True)
-class Free:
+class FreeSpace:
     """Points of the volume at which the sign is beyond doubt, and what f should be there at least.
 
     Parameters
@@ -53,14 +53,14 @@ class Free:
     @classmethod
     def of(
         cls, scene: Scene, rng: np.random.Generator, *, parameters: PenaltyFitParameters = PenaltyFitParameters()
-    ) -> Free:
+    ) -> FreeSpace:
         """Draw points of a scan's box."""
         x = scene.places(parameters.free_space_factor * scene.volume_count, rng)
         known, distance, _, certain = scene.coarse.at(x)
         kept = certain & (np.abs(distance) > parameters.free_space_clearance_radii)
         return cls(x[known][kept], free_space_bounds(distance[kept], parameters.most_free_space_distance_radii))
 
-    def wishes(
+    def terms(
         self,
         rows: Mask,
         known: Float,
@@ -68,7 +68,7 @@ class Free:
         like: Tensor,
         *,
         weight: float = PenaltyFitParameters.free_space_weight,
-    ) -> list[Wish]:
+    ) -> list[PenaltyTerm]:
         """Return what is asked at some of the points.
 
         Parameters
@@ -83,11 +83,11 @@ class Free:
         points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
         scales = torch.full_like(least, scale * (weight / len(rows)) ** 0.5)[:, None]
         residual = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
-        return [Wish(residual, points, scales, target=least, still=still)]
+        return [PenaltyTerm(residual, points, scales, target=least, still=still)]
 
 
 @dataclass(frozen=True)
-class Shaping:
+class SurfacePenalties:
     """What is asked of a field's surface, and where.
 
     Parameters
@@ -100,10 +100,10 @@ class Shaping:
     """
 
     wanted: Sequence[Regulariser]
-    sheet: Sheet
+    surface: SurfaceSamples
     sdf: NeuralSDF
     density: Density
-    free: Free
+    free: FreeSpace
 
     @classmethod
     def of(
@@ -111,17 +111,21 @@ class Shaping:
         wanted: Sequence[Regulariser],
         sdf: NeuralSDF,
         density: Density,
-        free: Free,
+        free: FreeSpace,
         length: float,
         rng: np.random.Generator,
-    ) -> Shaping:
+    ) -> SurfacePenalties:
         """Draw points of the surface for features of a length, in radii."""
         return cls(
-            wanted, Sheet.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng), sdf, density, free
+            wanted,
+            SurfaceSamples.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng),
+            sdf,
+            density,
+            free,
         )
 
     @cached_property
-    def in_free(self) -> Float:
+    def free_space_values(self) -> Float:
         """Values of the global field at the points of the free space, of shape (Q,)."""
         return self.sdf.sdf(self.sdf.frame.to_world(self.free.points)) / self.sdf.frame.scale
 
@@ -129,9 +133,9 @@ class Shaping:
         """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
         if not any(one.holes for one in self.wanted):
             return signed
-        return self.sheet.volume_distances(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
+        return self.surface.volume_distances(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
 
-    def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
+    def terms(self, rows: Mask, scale: float, like: Tensor) -> list[PenaltyTerm]:
         """Return what is asked of the surface at some of its points.
 
         Parameters
@@ -142,48 +146,50 @@ class Shaping:
         """
         found = []
         for one in self.wanted:
-            share = self.sheet.far * rows if one.holes else 1.0 * rows
+            share = self.surface.far * rows if one.holes else 1.0 * rows
             asked = np.flatnonzero(share)
             if len(asked):
-                points, weights = (torch.as_tensor(part[asked]).to(like) for part in (self.sheet.points, share))
+                points, weights = (torch.as_tensor(part[asked]).to(like) for part in (self.surface.points, share))
                 scales = scale * (one.weight * weights[:, None]).sqrt()
-                found.append(Wish(one.residual, points, scales, one.crease))
+                found.append(PenaltyTerm(one.residual, points, scales, one.crease))
         return found
 
-    def bend_cube(
+    def penalise_cube(
         self,
         features: Features,
         length: float,
         center: Float,
         reach: float,
-        belief: Belief,
+        hyperparameters: Hyperparameters,
         system: PatchSystem,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
     ) -> Tensor:
         """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
-        amplitudes = system.solve_within(belief.position, belief.angle)
-        equations = system.equations(belief.position, belief.angle)
-        rows = np.asarray((np.abs(self.sheet.points - center) < reach).all(axis=1))
-        scale = (len(self.density.points) / len(self.sheet)) ** 0.5 / belief.position
-        wishes = self.wishes(rows, scale, amplitudes)
-        if equations is None or not wishes:
+        amplitudes = system.solve_with_bounds(hyperparameters.position, hyperparameters.angle)
+        equations = system.equations(hyperparameters.position, hyperparameters.angle)
+        rows = np.asarray((np.abs(self.surface.points - center) < reach).all(axis=1))
+        scale = (len(self.density.points) / len(self.surface)) ** 0.5 / hyperparameters.position
+        terms = self.terms(rows, scale, amplitudes)
+        if equations is None or not terms:
             return amplitudes
         near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
-        wishes += self.free.wishes(near, self.in_free, len(self.density.points) ** 0.5 / belief.position, amplitudes)
+        terms += self.free.terms(
+            near, self.free_space_values, len(self.density.points) ** 0.5 / hyperparameters.position, amplitudes
+        )
         whole, known = as_sines(self.sdf)
 
         def base(x: Tensor) -> Jet:
             return whole.jet(known, x, whole.known(x))
 
-        sines = Sines(
+        sines = SineSum(
             features, torch.as_tensor(center).to(amplitudes), length, parameters.cube_step_lengths * length, base
         )
-        return bent(sines, *equations, wishes, amplitudes, parameters.cube_steps)
+        return minimise_penalised(sines, *equations, terms, amplitudes, parameters.cube_steps)
 
 
-def bend_global(
-    shaping: Shaping,
+def penalise_global(
+    penalties: SurfacePenalties,
     scene: Scene,
     options: FitOptions,
     rng: np.random.Generator,
@@ -197,35 +203,38 @@ def bend_global(
     FitError
         When the data's system cannot be factored.
     """
-    sdf, like = shaping.sdf, scene.points
-    everywhere, free = (np.ones(len(one), dtype=bool) for one in (shaping.sheet.points, shaping.free.points))
-    wishes = shaping.wishes(everywhere, max(len(everywhere), 1) ** -0.5, like)
+    sdf, like = penalties.sdf, scene.points
+    everywhere, free = (np.ones(len(one), dtype=bool) for one in (penalties.surface.points, penalties.free.points))
+    terms = penalties.terms(everywhere, max(len(everywhere), 1) ** -0.5, like)
     # The global field is all of f.
-    wishes += shaping.free.wishes(free, np.zeros(len(free)), 1.0, like)
-    x, wanted = _volume(shaping, scene, scene.volume_count, rng)
+    terms += penalties.free.terms(free, np.zeros(len(free)), 1.0, like)
+    x, wanted = _volume(penalties, scene, scene.volume_count, rng)
     for left in reversed(range(parameters.rounds)):
         volume = scene.tensor(x), scene.tensor(wanted)
-        terms = [*data_terms(scene, options, rng, InitialisationParameters.final_points), distance_term(scene, *volume)]
+        data = [*data_terms(scene, options, rng, InitialisationParameters.final_points), distance_term(scene, *volume)]
         sines, amplitudes = as_sines(sdf)
-        problem, factor, right = _linear_part(sdf, terms, amplitudes)
-        sdf = replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, parameters.global_steps)))
+        problem, factor, right = _linear_part(sdf, data, amplitudes)
+        sdf = replace(
+            sdf,
+            theta=problem.whole(minimise_penalised(sines, factor, right, terms, amplitudes, parameters.global_steps)),
+        )
         if left:
             # Where the sign has become wrong, more samples bring it back, as at the fit's start.
-            trial, expected = _volume(shaping, scene, 3 * scene.volume_count, rng)
+            trial, expected = _volume(penalties, scene, 3 * scene.volume_count, rng)
             wrong = np.flatnonzero(sdf.sdf(sdf.frame.to_world(trial)) * expected <= 0)[: scene.volume_count // 2]
             x, wanted = np.concatenate([x, trial[wrong]]), np.concatenate([wanted, expected[wrong]])
     return sdf
 
 
-def _volume(shaping: Shaping, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+def _volume(penalties: SurfacePenalties, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
     """Return points of the volume, of shape (Q, 3), and what their signed distances should be, of shape (Q,)."""
     x, distance = scene.volume(count, rng)
-    return x, shaping.volume_distances(x, distance)
+    return x, penalties.volume_distances(x, distance)
 
 
 def _linear_part(
     sdf: NeuralSDF,
-    terms: Sequence[Term],
+    terms: Sequence[ObjectiveTerm],
     amplitudes: Tensor,
     *,
     ridge: float = InitialisationParameters.ridge,
@@ -246,12 +255,12 @@ def _linear_part(
     raise FitError("The surface could not be shaped: the data's system holds values that are not finite.")
 
 
-def as_sines(sdf: NeuralSDF) -> tuple[Sines, Tensor]:
+def as_sines(sdf: NeuralSDF) -> tuple[SineSum, Tensor]:
     """Return a network of one layer as sine features, of which one more is its bias, and their amplitudes."""
     (weights, bias), (out, constant) = sdf.field.layout.layers(sdf.theta)
     frequencies = torch.cat([weights, weights.new_zeros(1, 3)])
     phases = torch.cat([bias, bias.new_full((1,), torch.pi / 2)])
-    sines = Sines(Features(frequencies, phases), weights.new_zeros(3), 1.0, PenaltyFitParameters.global_step_radii)
+    sines = SineSum(Features(frequencies, phases), weights.new_zeros(3), 1.0, PenaltyFitParameters.global_step_radii)
     return sines, torch.cat([out[0], constant])
 
 
@@ -263,7 +272,7 @@ def as_sines(sdf: NeuralSDF) -> tuple[Sines, Tensor]:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class SurfaceSamples:
     """Points of a surface, about uniform by area, unit coordinates.
 
     Parameters
@@ -287,7 +296,7 @@ class Sheet:
         rng: np.random.Generator,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
-    ) -> Sheet:
+    ) -> SurfaceSamples:
         """Draw points of a field's zero level about `spacing` apart, in radii; none where there is no surface.
 
         Sheets on which no point is near the scan are no part of the shape, and are left out.
@@ -298,7 +307,7 @@ class Sheet:
         distance, nearest = density.tree.query(points)
         low, high = parameters.near_disk_radii, parameters.far_disk_radii
         far = np.clip((distance / density.disks[nearest] - low) / (high - low), 0.0, 1.0)
-        kept = _joined(points, far == 0.0, parameters.joined_spacings * np.sqrt(scanned / count))
+        kept = _connected(points, far == 0.0, parameters.joined_spacings * np.sqrt(scanned / count))
         return cls(points[kept], far[kept])
 
     def volume_distances(self, x: Float, signed: Float, value: Float, density: Density) -> Float:
@@ -319,7 +328,7 @@ class Sheet:
         return signed_distance
 
 
-def _joined(points: Float, near: Mask, reach: float) -> Mask:
+def _connected(points: Float, near: Mask, reach: float) -> Mask:
     """Return which points, of shape (N, 3), lead to a near one in leaps of at most `reach`."""
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
