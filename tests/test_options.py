@@ -51,7 +51,7 @@ from gnrecon.runtime.errors import UsageError
         ({"smooth": "strain=much"}, "weight of smooth must be a positive number, as in strain=1e-4, not 'much'"),
         ({"fill": "maximal"}, "option fill takes minimal=WEIGHT or minimal alone, .* not 'maximal'"),
         ({"prior": "developable=inf"}, "weight of prior must be a positive number, .* not 'inf'"),
-        ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior belong to the default fit"),
+        ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior are for the default fit"),
         ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The start of a fit, which decides how it ends.
+"""Starts of a fit: exact linear solves for the last layer of a sine network (`wide_start`, `spectral_start`).
 
 *Wide and linear.* One hidden layer of random sine features sin(w . x + b) is linear in its output weights, so that
 f = 0, grad f = n and the coarse signed distance have one exact least-squares solution (variable projection). The
@@ -6,7 +6,7 @@ frequencies w follow the spectral density of a Matern kernel, a Student t distri
 normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of
 kernel interpolation with Hermite data.
 Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
-Where the solution's sign disagrees with the coarse distance ("ghosts"), samples are added and the solve is repeated.
+Where the solution's sign disagrees with the coarse distance, samples are added and the solve is repeated.
 
 *Spectral.* Deeper networks begin with normal frequencies of fixed standard deviation in the first layer, hidden weights
 that keep the variance of sines (Sitzmann et al. 2020, theorem 1.8), uniform phases, and one exact solve of the last
@@ -69,7 +69,7 @@ def wide_start(
 ) -> Tensor:
     """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
 
-    `advance` is told of the share of the rounds that is done.
+    `advance` is called with the share of the rounds that is done.
 
     Raises
     ------
@@ -180,16 +180,16 @@ def solve_last_layer(
     raise FitError("The linear start could not be solved: the system holds values that are not finite.")
 
 
-# Where in free space a field has the wrong sign: what makes the ghost sheets and the horns of a mesh.
+# Places in free space where a field has the wrong sign. They cause detached sheets and spikes in the mesh.
 #
-# The sign is that of the winding number, which costs as much as several values of a field. But from place to place it
-# changes only through the data, or where a hole is closed: so the nearest sample of known sign nearly always tells it,
-# and the winding number is asked for only where the field contradicts that sample.
+# The true sign is that of the winding number, which costs as much as several evaluations of the field. But it changes
+# only across the data or the closing of a hole, so that it nearly always equals that of the nearest sample of known
+# sign. The winding number is evaluated only where the field contradicts that sample.
 
 
 @dataclass
 class WrongSignSearch:
-    """A search that remembers the signs which it has found.
+    """A search for places of the wrong sign that remembers the signs it has computed.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ class WrongSignSearch:
 
         Parameters
         ----------
-        x : array of shape (Q, 3); what is too near to the data for a coarse distance is left out
+        x : array of shape (Q, 3); those too near to the data for a coarse distance are ignored
         value : gives the field's values, of shape (N,), at points, of shape (N, 3)
         """
         known, size, _ = self.coarse.size(x)

@@ -60,7 +60,7 @@ def fit_detail(
     """
     samples, residuals, hyperparameters = data.samples, data.residuals, data.hyperparameters
     _log.info(
-        "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",
+        "Local fields: length scale %.3g radii, noise %.2g radii and %.2g radians; %d features each.",
         hyperparameters.length,
         hyperparameters.position,
         hyperparameters.angle,
@@ -83,7 +83,7 @@ def cube_length(
 
     Parameters
     ----------
-    belief : of the whole scan
+    hyperparameters : of the whole scan
     disks : array of shape (N,), radii of the disks that the cube's points stand for
     radius : their median in the whole scan
     most_length_stretch : most that a cube's length scale may exceed the scan's
@@ -114,7 +114,7 @@ class _Cubes:
         penalties: SurfacePenalties | None,
         parameters: LocalFieldParameters,
     ) -> _Cubes:
-        """Return the cubes of a belief's length, each of `count` features."""
+        """Return the cubes of a length scale, each with `count` features."""
         like = torch.zeros(0, dtype=torch.float64, device=device)
         cell = parameters.cube_edge_lengths * hyperparameters.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
@@ -145,7 +145,7 @@ class _Cubes:
         cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
-        _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
+        _log.info("Fitted %d local fields; %d cubes had too few points.", len(kept), len(keys) - len(kept))
         noise = self.hyperparameters.position, self.hyperparameters.angle
         return Detail(self.partition, keys[kept], np.array(lengths), self.features, torch.stack(amplitudes), *noise)
 

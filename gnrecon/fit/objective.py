@@ -2,7 +2,7 @@
 
 Row i of a term with weight w and N points is sqrt(w / N) r_i, so that |r|^2 / 2 is the paper's loss (its equations for
 the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is an operator made of the factors
-of its rows (`linalg.jacobian`); it is never held whole.
+of its rows (`least_squares.jacobian`); it is never stored as a matrix.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ def groups(terms: Sequence[ObjectiveTerm]) -> list[list[ObjectiveTerm]]:
     return list(by_points.values())
 
 
-# The terms of a fit, drawn afresh for each step.
+# The terms of a fit, sampled for each step.
 #
 # In the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
 #
@@ -268,15 +268,15 @@ def step_terms(
 def data_terms(
     scene: Scene, options: FitOptions, rng: np.random.Generator, most: int, weight: float = 1.0
 ) -> list[ObjectiveTerm]:
-    """Return interface and normals at the data points, or at `most` of them drawn afresh."""
+    """Return interface and normals at the data points, or at a random `most` of them."""
     points, normals = scene.points, scene.normals
     if len(points) > most:
         rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
         points, normals = points[rows], normals[rows]
-    beside = normal_weight(scene.coarse.spacing, scene.reach)
+    relative = normal_weight(scene.coarse.spacing, scene.reach)
     return [
         ObjectiveTerm("interface", interface, points, None, weight),
-        ObjectiveTerm("normal", normal_residual(options.normals), points, normals, weight * beside),
+        ObjectiveTerm("normal", normal_residual(options.normals), points, normals, weight * relative),
     ]
 
 

@@ -1,12 +1,12 @@
-"""A global field and the cubes of its detail, bent to what the regularisers ask for (`regulariser`, `bend`).
+"""Curvature penalties on the global field (`penalise_global`) and on local fields (`SurfacePenalties.penalise_cube`).
 
-Where a hole is to be filled by a film of its own, the coarse distances there say something else: their sign is that of
-the winding number, another film's, and their size the distance to the hole's rim. So samples of the volume that are
-nearer to the film than to any scanned point are told the distance to the film instead, as it is then: that keeps the
-field's sign and slope beside it, and hardly holds it, because these rows weigh little.
+Holes that are to be filled by a minimal surface need other distances in the volume: the coarse ones have the sign of
+the winding number, which closes the hole elsewhere, and the distance to the hole's rim. Volume samples that are nearer
+to the current surface in the hole than to any scanned point get the distance to that surface instead. This keeps the
+field's sign and slope near it, and hardly fixes its place, because these rows have small weights.
 
-So little that features which are bent to a surface's curvature may run off in the free space beside it, and leave
-sheets there. Where the sign is beyond doubt the field is asked to keep it, by a residual that is zero where it does.
+With such small weights, features that follow the curvature penalty may make sheets in free space. Where the sign is
+certain, a one-sided residual (`FreeSpace`) keeps it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from gnrecon.runtime.errors import FitError
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Points of the volume at which the sign is beyond doubt, and what f should be there at least.
+    """Points of the volume at which the sign is certain, and bounds of f there.
 
     Parameters
     ----------
@@ -69,37 +69,37 @@ class FreeSpace:
         *,
         weight: float = PenaltyFitParameters.free_space_weight,
     ) -> list[PenaltyTerm]:
-        """Return what is asked at some of the points.
+        """Return the one-sided terms at some of the points.
 
         Parameters
         ----------
         rows : mask of them
-        known : value at all points, of shape (Q,), of what the features are added to
+        known : value at all points, of shape (Q,), of the field that the features are added to
         scale : of the root mean square residual of all points, for a weight of one
         like : tensor whose device is used
         """
         if not rows.any():
             return []
-        points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
+        points, least, fixed_value = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
         scales = torch.full_like(least, scale * (weight / len(rows)) ** 0.5)[:, None]
         residual = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
-        return [PenaltyTerm(residual, points, scales, target=least, still=still)]
+        return [PenaltyTerm(residual, points, scales, target=least, fixed_value=fixed_value)]
 
 
 @dataclass(frozen=True)
 class SurfacePenalties:
-    """What is asked of a field's surface, and where.
+    """Curvature penalties of a field and the points at which they apply.
 
     Parameters
     ----------
-    wanted : the regularisers
-    sheet : points of the surface, at which they are asked for
+    regularisers : the penalties
+    surface : points of the surface at which they apply
     sdf : the global field
     density : of the scanned points
     free : where the field is to keep its sign
     """
 
-    wanted: Sequence[Regulariser]
+    regularisers: Sequence[Regulariser]
     surface: SurfaceSamples
     sdf: NeuralSDF
     density: Density
@@ -108,7 +108,7 @@ class SurfacePenalties:
     @classmethod
     def of(
         cls,
-        wanted: Sequence[Regulariser],
+        regularisers: Sequence[Regulariser],
         sdf: NeuralSDF,
         density: Density,
         free: FreeSpace,
@@ -117,7 +117,7 @@ class SurfacePenalties:
     ) -> SurfacePenalties:
         """Draw points of the surface for features of a length, in radii."""
         return cls(
-            wanted,
+            regularisers,
             SurfaceSamples.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng),
             sdf,
             density,
@@ -131,25 +131,25 @@ class SurfacePenalties:
 
     def volume_distances(self, x: Float, signed: Float) -> Float:
         """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
-        if not any(one.holes for one in self.wanted):
+        if not any(one.holes for one in self.regularisers):
             return signed
         return self.surface.volume_distances(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
 
     def terms(self, rows: Mask, scale: float, like: Tensor) -> list[PenaltyTerm]:
-        """Return what is asked of the surface at some of its points.
+        """Return the penalty terms at some points of the surface.
 
         Parameters
         ----------
-        rows : mask of the sheet's points
+        rows : mask of the surface points
         scale : of each point's residuals, for a weight of one
         like : tensor whose device is used
         """
         found = []
-        for one in self.wanted:
+        for one in self.regularisers:
             share = self.surface.far * rows if one.holes else 1.0 * rows
-            asked = np.flatnonzero(share)
-            if len(asked):
-                points, weights = (torch.as_tensor(part[asked]).to(like) for part in (self.surface.points, share))
+            active = np.flatnonzero(share)
+            if len(active):
+                points, weights = (torch.as_tensor(part[active]).to(like) for part in (self.surface.points, share))
                 scales = scale * (one.weight * weights[:, None]).sqrt()
                 found.append(PenaltyTerm(one.residual, points, scales, one.crease))
         return found
@@ -196,7 +196,7 @@ def penalise_global(
     *,
     parameters: PenaltyFitParameters = PenaltyFitParameters(),
 ) -> NeuralSDF:
-    """Return the global field with output weights that heed the regularisers.
+    """Return the global field with output weights that also minimise the penalties.
 
     Raises
     ------
@@ -252,11 +252,11 @@ def _linear_part(
             # The ridge holds the amplitudes where they are, as damping does.
             return problem, factor, right + ridge * amplitudes
         ridge *= 10
-    raise FitError("The surface could not be shaped: the data's system holds values that are not finite.")
+    raise FitError("The curvature penalties could not be applied: the linear system holds values that are not finite.")
 
 
 def as_sines(sdf: NeuralSDF) -> tuple[SineSum, Tensor]:
-    """Return a network of one layer as sine features, of which one more is its bias, and their amplitudes."""
+    """Return a network of one layer as sine features, with one more for its bias, and their amplitudes."""
     (weights, bias), (out, constant) = sdf.field.layout.layers(sdf.theta)
     frequencies = torch.cat([weights, weights.new_zeros(1, 3)])
     phases = torch.cat([bias, bias.new_full((1,), torch.pi / 2)])
@@ -266,9 +266,9 @@ def as_sines(sdf: NeuralSDF) -> tuple[SineSum, Tensor]:
 
 # Points of a fitted field's surface, and how far each is from the scan, as in its holes.
 #
-# Distances count in radii of the disk that the nearest scanned point stands for. On points thrown evenly at random onto
-# a surface, one in fifty of its places is 2 radii from all of them, and five in a million are 3.5 radii away. What lies
-# between counts in part, so that nothing is left without a say at a hole's rim.
+# Distances are in radii of the disk that the nearest scanned point stands for. If points are uniformly distributed on a
+# surface, one in fifty of its places is 2 radii from all of them, and five in a million are 3.5 radii away. Weights
+# between these are interpolated, so that the penalty begins smoothly at a hole's rim.
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class SurfaceSamples:
     ) -> SurfaceSamples:
         """Draw points of a field's zero level about `spacing` apart, in radii; none where there is no surface.
 
-        Sheets on which no point is near the scan are no part of the shape, and are left out.
+        Connected parts without a point near the scan are not part of the shape, and are dropped.
         """
         scanned = float(np.pi * np.square(density.disks).sum())
         count = int(np.clip(scanned / spacing**2, parameters.least_surface_samples, parameters.most_surface_samples))
@@ -317,7 +317,7 @@ class SurfaceSamples:
         ----------
         x : points of the volume, of shape (Q, 3)
         signed : what their coarse distances are, of shape (Q,)
-        value : of the field there, whose sign tells the far part's sides, of shape (Q,)
+        value : of the field there, whose sign gives the side of the far part, of shape (Q,)
         density : of the scanned points
         """
         film = self.points[self.far == 1.0]
@@ -329,7 +329,7 @@ class SurfaceSamples:
 
 
 def _connected(points: Float, near: Mask, reach: float) -> Mask:
-    """Return which points, of shape (N, 3), lead to a near one in leaps of at most `reach`."""
+    """Return which points, of shape (N, 3), are connected to a near one by steps of at most `reach`."""
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
     labels = connected_components(graph, directed=False)[1]

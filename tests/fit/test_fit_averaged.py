@@ -104,7 +104,7 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
             def clean(self) -> None:
                 return None
 
-            def choice(self) -> SelectedModel:
+            def select(self) -> SelectedModel:
                 return choice
 
         monkeypatch.setattr(averaged.CrossValidation, "draw", lambda *_: Canned())

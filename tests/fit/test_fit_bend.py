@@ -99,7 +99,7 @@ def test_points_that_stay_keep_what_is_asked_of_their_values(rng: np.random.Gene
     below = 0.85 * torch.nn.functional.normalize(points, dim=1)
     least = torch.full((150,), -0.1).double()
     keeps = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
-    held = PenaltyTerm(keeps, below, torch.full((150, 1), 1.0).double(), target=least, still=sphere(below)[0])
+    held = PenaltyTerm(keeps, below, torch.full((150, 1), 1.0).double(), target=least, fixed_value=sphere(below)[0])
     factor = 1e-2 * torch.eye(80).double()
 
     def highest(*terms: PenaltyTerm) -> float:

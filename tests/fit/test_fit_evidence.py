@@ -81,7 +81,7 @@ def test_exact_points_with_tilted_normals_are_believed(rng: np.random.Generator)
     radius = residuals.density.radius
     held = rng.random(1500) < 1 / 6
     validation = CrossValidation.draw(residuals, held, radius, rng, "cpu")
-    hyperparameters = validation.choice().best
+    hyperparameters = validation.select().best
     assert hyperparameters.position <= 0.05 * radius
     assert 0.17 <= hyperparameters.angle <= 0.4
 
@@ -92,12 +92,12 @@ def test_few_points_and_estimated_normals_have_a_belief_too(rng: np.random.Gener
     residuals = FieldResiduals(x, x, 0.01 * x[:, 0], x)
     assert len(x) < MarginalLikelihoodParameters.patch_points
     held = np.arange(40) % 6 == 0
-    found = CrossValidation.draw(residuals, held, residuals.density.radius, rng, "cpu").choice()
+    found = CrossValidation.draw(residuals, held, residuals.density.radius, rng, "cpu").select()
     assert found.most_likely is not None
     assert found.best == found.most_likely
     of_estimated = CrossValidation.draw(
         replace(residuals, estimated=True), held, residuals.density.radius, rng, "cpu"
-    ).choice()
+    ).select()
     assert of_estimated.most_likely is None
     assert of_estimated.best == of_estimated.hyperparameters
 

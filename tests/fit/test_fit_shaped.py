@@ -117,8 +117,8 @@ def test_the_free_space_counts_as_a_whole() -> None:
     free = FreeSpace(np.eye(3), np.array([0.03, -0.03, 0.01]))
     (term,) = free.terms(np.array([True, False, True]), np.arange(3.0), 2.0, torch.zeros(0, dtype=torch.float64))
     assert term.points.tolist() == [[1, 0, 0], [0, 0, 1]]
-    assert term.still is not None
-    assert term.still.tolist() == [0, 2]
+    assert term.fixed_value is not None
+    assert term.fixed_value.tolist() == [0, 2]
     # All three points together weigh as much as is asked, whatever part of them a cube holds.
     assert (term.scale**2).flatten().tolist() == pytest.approx([4 * PenaltyFitParameters.free_space_weight / 3] * 2)
 
