@@ -10,7 +10,7 @@ import numpy as np
 
 from gnrecon.export import RefineOptions
 from gnrecon.export.mesh_options import MeshOptions
-from gnrecon.fit.blocks.solve import LARGE
+from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Region
@@ -197,7 +197,7 @@ def _default_cells(
     dense_cell_spacings : cell edge of a scan that is fitted by blocks: about one vertex for each point
     dense_cells : range of its cells
     """
-    dense = len(points) >= LARGE
+    dense = len(points) >= BlockParameters.large_scan_points
     edge = (dense_cell_spacings if dense else sparse_cell_spacings) * neighbour_spacing(points)
     least, most = dense_cells if dense else sparse_cells
     return math.ceil(min(max(longest / edge, least), most)) if edge > 0 else most

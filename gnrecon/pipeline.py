@@ -1,31 +1,25 @@
-"""The main job: a scan in, a verified watertight mesh out.
+"""The reconstruction of a scan: read, ingest, fit, mesh, verify, report.
 
-The way of the data: file -> cloud -> samples -> fitted field -> mesh -> report. Every stage is a function of its own in
-`gnrecon.io`, `gnrecon.ingest`, `gnrecon.fit` and `gnrecon.export`; here they are called in order, timed, and reported.
+Each step is a stage of its own in `gnrecon.io`, `gnrecon.ingest`, `gnrecon.fit` and `gnrecon.export`. `reconstruct`
+runs them in order, times them, passes on what users should know, and returns a verified mesh with its report.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-import torch
 
 from gnrecon.export import (
     Attribute,
-    Invented,
-    MeshFacts,
     Metrics,
     Neighbourhood,
-    Trimming,
     invented,
     measure,
-    quality,
     require_bordered,
     require_sound,
     trim,
@@ -37,7 +31,7 @@ from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units, layers_of, prepare, survey
+from gnrecon.ingest import layers_of, prepare, survey
 from gnrecon.io import (
     Reading,
     as_cloud,
@@ -50,12 +44,12 @@ from gnrecon.io import (
     to_trimesh,
     write_mesh,
 )
-from gnrecon.optim import Record, Solution
+from gnrecon.optim import Record
 from gnrecon.options import Options
-from gnrecon.report.report import SCHEMA_VERSION, Stages, plain, versions
-from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
+from gnrecon.report.report import Stages
+from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
+from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
-from gnrecon.runtime.parallel import torch_threads
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import Sources, adorn, fitting, wanted
 
@@ -63,7 +57,7 @@ _log = logging.getLogger(__name__)
 
 
 class Progress:
-    """What a caller may want to know while a reconstruction runs; this one ignores everything.
+    """Callbacks of a running reconstruction; this base class ignores them all.
 
     Any method may raise `gnrecon.Cancelled` to end the run, which then returns nothing.
     """
@@ -72,13 +66,13 @@ class Progress:
         """Called when a stage begins."""
 
     def advance(self, share: float) -> None:
-        """Called now and then with the share of the stage that is done, from 0 to 1 and never less than before."""
+        """Called from time to time with the share of the stage that is done, from 0 to 1, never decreasing."""
 
     def step(self, record: Record, total: int) -> None:
-        """Called after each Gauss-Newton step, of `total` at most."""
+        """Called after each step of the fit, of `total` at most."""
 
     def remark(self, sentence: str) -> None:
-        """Called with what a user should know, such as what was dropped."""
+        """Called with a sentence for the user, such as what was dropped."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,7 @@ class Reconstruction:
     Parameters
     ----------
     mesh : Mesh
-        Closed, oriented 2-manifold, in file units; with borders where it was trimmed.
+        Closed, oriented 2-manifold in file units; with borders where it was trimmed.
     sdf : NeuralSDF
     report : dict
         Options, versions, stages, counts, fit history, mesh facts and metrics as plain values, ready for JSON;
@@ -96,11 +90,11 @@ class Reconstruction:
     metrics : Metrics, optional
         Distances to the reference, where one was given.
     interrupted : bool
-        Whether the fit was stopped early by Ctrl-C; the mesh then shows the best field until then.
+        Whether Ctrl-C stopped the fit early; the mesh is then that of the best field so far.
     uncertainty : Uncertainty, optional
-        Standard deviations of the surface, where they were asked for.
+        Standard deviations of the surface, with ``uncertainty=True``.
     cloud : PointCloud, optional
-        The scan as it was read, without what was cropped.
+        The scan as it was read, cropped.
     """
 
     mesh: Mesh
@@ -114,16 +108,16 @@ class Reconstruction:
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
 
-        Returns sentences about what the format could not hold, such as attributes or digits.
+        Returns sentences about what the format cannot hold, such as attributes or digits.
 
         Raises
         ------
         MeshError
-            When the mesh as read back is no closed, oriented 2-manifold; of a trimmed one, no oriented edge-manifold.
+            When the mesh as read back is not a closed, oriented 2-manifold or, if trimmed, an oriented edge-manifold.
         OutputError
             When the file cannot be written.
         """
-        # Only trimming makes a mesh open; it was verified as what it is, and so is the file.
+        # Only trimming makes a mesh open, and the file is verified as the mesh was.
         bordered = not self.report["mesh"]["closed"]
         mesh = fitting(self.mesh, Path(path), self.report["options"]["attributes"])
         return write_mesh(mesh, path, overwrite, verify=lambda written: _verify(written, bordered))
@@ -154,155 +148,174 @@ def reconstruct(
 
     Parameters
     ----------
-    source : path, list of paths, array of shape (N, 3) or (N, 6), PointCloud, or whatever else `as_cloud` takes
+    source : path, list of paths, array of shape (N, 3) or (N, 6), PointCloud, or what else `as_cloud` takes
         Points, in any unit, with or without normals: other libraries' clouds and meshes, tensors, named columns.
-        Several files are merged, after the poses that they hold.
+        Several files are merged by the poses that they hold.
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
     reference : path, Mesh, PointCloud, or another library's, optional
-        Truth to measure the mesh against.
+        MeshedScan to measure the mesh against.
     format : str, optional
-        Extension that says how the scan's file is read, such as ``"ply"``; by default its own.
+        Format of the scan's file, such as ``"ply"``; by default its extension.
     progress : Progress, optional
-        Told of stages, steps and remarks; it may end the run by raising `gnrecon.Cancelled`.
+        Receives stages, steps and remarks; it may end the run by raising `gnrecon.Cancelled`.
     **options
         The fields of `Options`, by name.
 
     Raises
     ------
     UsageError, InputError, FitError, MeshError, MemoryLimitError
-        See `gnrecon.runtime.errors`; each says in one sentence what is wrong.
+        See `gnrecon.runtime.errors`; each message is one sentence.
     """
     chosen = Options.of(**options)
     require_device(chosen.device)
     if chosen.work_dir is not None:
         require_work_folder(chosen.work_dir)
     with limited(chosen.threads):
-        return _run(
-            lambda: read_source(source, normals, format, chosen.read_points, chosen.region()),
-            source,
-            reference,
-            progress or Progress(),
-            chosen,
-        )
+        run = _Run(source_name(source), chosen, progress or Progress())
+        scan = _read(run, source, normals, format, reference)
+        ingested = _ingest(run, scan)
+        fitted = _fit(run, ingested)
+        surface = _trim(run, _mesh(run, scan, fitted))
+        finished, uncertainty = _finish(run, scan, ingested, fitted, surface)
+        report = run_report(run.source, run.options, run.stages, scan, ingested, fitted, surface, finished)
+    interrupted = fitted.solution.interrupted
+    return Reconstruction(finished.mesh, fitted.sdf, report, finished.metrics, interrupted, uncertainty, scan.cloud)
 
 
-@contextmanager
-def limited(threads: int | None) -> Iterator[None]:
-    """Run a block with so many of torch's threads (None: as many as before), and say so where memory does not suffice.
+@dataclass
+class _Run:
+    """What all steps of a run share.
 
-    Other threads of the program, and those that it starts later, have as many of torch's threads as before.
-
-    Raises
-    ------
-    MemoryLimitError
-        When an allocation in the block failed.
+    Parameters
+    ----------
+    source : files of the scan, or the type of another source
+    chosen : options as they were given
+    progress : of the caller
+    options : in effect: a resolution that was not given is filled in once the scan and the field are known
+    stages : times and memory
     """
-    try:
-        with torch_threads(threads):
-            yield
-    except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and has said already what is too large
-        raise
-    except MemoryError as error:
-        raise _out_of_memory(error) from error
-    except RuntimeError as error:
-        # torch reports a failed allocation as a RuntimeError, on the CPU by its text alone.
-        if isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error):
-            raise _out_of_memory(error) from error
-        raise
+
+    source: str
+    chosen: Options
+    progress: Progress
+    options: Options = field(init=False)
+    stages: Stages = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.options = self.chosen
+        self.stages = Stages(self.progress.stage, self.chosen.device)
+        _log.info("gnrecon %s reconstructs %s.", __version__, self.source)
+        _log.debug("Options: %s.", self.chosen)
+
+    def remark(self, sentences: Iterable[str]) -> None:
+        """Pass on sentences to the log and to the caller."""
+        for sentence in sentences:
+            _log.info(sentence, extra=ALREADY_SHOWN)
+            self.progress.remark(sentence)
+
+    @property
+    def refines_resolution(self) -> bool:
+        """Whether the field may raise the resolution, because no size of the faces was given."""
+        chosen = self.chosen
+        return chosen.resolution is None and chosen.edge_length is None and chosen.max_error is None
 
 
-def _run(
-    read: Callable[[], tuple[PointCloud, Reading]], source: Any, reference: Any, progress: Progress, options: Options
-) -> Reconstruction:
-    stages = Stages(progress.stage, options.device)
-    _log.info("gnrecon %s reconstructs %s.", __version__, _named(source))
-    _log.debug("Options: %s.", options)
+def _read(run: _Run, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
+    """Read the scan and the reference."""
+    with run.stages("read"):
+        cloud, reading = read_source(source, normals, format, run.options.read_points, run.options.region())
+        run.progress.advance(0.5)
+        scan = ScanRead(cloud, reading, _reference(reference))
+    wanted(cloud, run.options.attributes)  # a misspelt name is refused before the work
+    return scan
 
-    def remark(sentence: str) -> None:
-        _log.info(sentence, extra=ALREADY_SHOWN)
-        progress.remark(sentence)
+
+def _ingest(run: _Run, scan: ScanRead) -> Ingested:
+    """Clean and thin the points, orient their normals, and choose a resolution from their spacing."""
+    with run.stages("ingest"):
+        samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
+        ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals))
+    bounds = bounds_of(samples)
+    run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
+    run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    warnings = [] if ingested.layers is None else [ingested.layers.describe()]
+    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
+    return ingested
+
+
+def _fit(run: _Run, ingested: Ingested) -> Fitted:
+    """Fit the field, and measure its residuals."""
+    options, samples = run.options, ingested.samples
+    total = options.fit().steps_for(len(samples))
 
     def step(record: Record) -> None:
         _log.debug("Step %d of at most %d: %s.", record.step, total, record)
-        progress.step(record, total)
+        run.progress.step(record, total)
 
-    with stages("read"):
-        cloud, reading = read()
-        progress.advance(0.5)
-        truth = _reference(reference)
-    wanted(cloud, options.attributes)  # a misspelt name is refused before the work
-    with stages("ingest"):
-        samples, counts = prepare(cloud, **options.ingest(), advance=progress.advance)
-        scan, layers = survey(cloud), layers_of(samples, counts.normals)
-    free = options.resolution is None and options.edge_length is None and options.max_error is None
-    options = options.for_scan(samples.frame.to_world(samples.points), bounds_of(samples))
-    options.mesh().cells(bounds_of(samples))  # an impossible edge length is refused before the work
-    warnings = [] if layers is None else [layers.describe()]
-    for sentence in [*reading.remarks(), *counts.remarks(), *warnings]:
-        remark(sentence)
-    with stages("fit"):
-        total = options.fit().steps_for(len(samples))
-        sdf, solution = fit(samples, options.fit(), step, progress.advance, options.work_dir, options.block_scheduler)
+    with run.stages("fit"):
+        sdf, solution = fit(
+            samples, options.fit(), step, run.progress.advance, options.work_dir, options.block_scheduler
+        )
         residuals = Misfit.of(sdf, samples)
-        unseen = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
-    remark(solution.status)
-    if unseen is not None:
-        remark(f"At {counts.held_out} points that the fit never saw: {unseen.describe()}")
-    if free and options.resolution is not None:
-        options = replace(options, resolution=fine_enough(sdf, options.resolution))
-    # The field's own points, so that a saved field makes the same mesh again.
-    meshed = mesh_field(sdf, options.mesh(), data=sdf.data, stages=stages, advance=progress.advance)
-    mesh, actions = meshed.mesh, meshed.actions
-    around = Neighbourhood(cloud.points)
-    spacing, trimming = around.spacing(), None
-    reach = options.trim_at(spacing)
+        held_out = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
+    run.remark([solution.status])
+    if held_out is not None:
+        run.remark([f"At {ingested.counts.held_out} points held out of the fit: {held_out.describe()}"])
+    return Fitted(sdf, solution, residuals, held_out)
+
+
+def _mesh(run: _Run, scan: ScanRead, fitted: Fitted) -> MeshedScan:
+    """Mesh the field, so finely that faces are no farther off the surface than the field is."""
+    sdf = fitted.sdf
+    if run.refines_resolution and run.options.resolution is not None:
+        run.options = replace(run.options, resolution=fine_enough(sdf, run.options.resolution))
+    # With the field's own points, so that a saved field makes the same mesh again.
+    meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
+    neighbourhood = Neighbourhood(scan.cloud.points)
+    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, neighbourhood.spacing(), None)
+
+
+def _trim(run: _Run, surface: MeshedScan) -> MeshedScan:
+    """Cut off what is farther from the points than ``trim``, where that was given."""
+    reach = run.options.trim_at(surface.spacing)
     if reach is not None:
-        with stages("trim"):
-            mesh, trimming = trim(mesh, around.distances(mesh.vertices), reach)
-        actions = [*actions, *trimming.describe()]
-    for sentence in actions:
-        remark(sentence)
-    with stages("verify"):
+        with run.stages("trim"):
+            mesh, trimming = trim(surface.mesh, surface.neighbourhood.distances(surface.mesh.vertices), reach)
+        actions = [*surface.actions, *trimming.describe()]
+        surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)
+    run.remark(surface.actions)
+    return surface
+
+
+def _finish(
+    run: _Run, scan: ScanRead, ingested: Ingested, fitted: Fitted, surface: MeshedScan
+) -> tuple[FinishedMesh, Uncertainty | None]:
+    """Verify the mesh, give its vertices attributes, and measure it against the reference."""
+    mesh, trimming = surface.mesh, surface.trimming
+    with run.stages("verify"):
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
-    with stages("attributes"):
-        distances = around.distances(mesh.vertices)
-        unsupported = invented(mesh, distances, spacing)
-        sources = Sources(mesh, sdf, cloud, around, distances, samples, options)
-        mesh, attributes, remarks = adorn(sources, progress.advance)
-    for sentence in [*(unsupported.describe() if trimming is None else []), *remarks]:
-        remark(sentence)
-    metrics = None
-    if truth is not None:
-        with stages("measure"):
-            metrics = measure(mesh, truth, seed=options.seed, advance=progress.advance)
-            if options.attributes != "none":
-                error = Attribute("error", vertex_error(mesh, truth), "signed distance to the reference, file units")
-                mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
-    surface = _surface(mesh, facts, unsupported, trimming) | {
-        "reading": reading.as_dict(),
-        "scan": described(scan, layers, reading),
-        "fineness": meshed.fineness.as_dict(),
-    }
-    report = _report(
-        source, options, stages, counts, solution, (residuals, unseen), sdf, surface, actions, attributes, metrics
-    )
-    return Reconstruction(mesh, sdf, report, metrics, solution.interrupted, sources.uncertainty, cloud)
+    with run.stages("attributes"):
+        distances = surface.neighbourhood.distances(mesh.vertices)
+        unsupported = invented(mesh, distances, surface.spacing)
+        sources = Sources(mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options)
+        mesh, attributes, remarks = adorn(sources, run.progress.advance)
+    run.remark([*(unsupported.describe() if trimming is None else []), *remarks])
+    finished = FinishedMesh(mesh, facts, unsupported, attributes, None)
+    if scan.reference is not None:
+        finished = _measure(run, finished, scan.reference)
+    return finished, sources.uncertainty
 
 
-def require_device(device: str) -> None:
-    """Refuse a device that torch does not have.
-
-    Raises
-    ------
-    UsageError
-        When the device is unknown or not there.
-    """
-    kind = device.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
-        raise UsageError(f"The device is {device!r}, but must be cpu or cuda.")
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise UsageError("The device is 'cuda', but torch sees no CUDA GPU; `gnrecon doctor` tells what it sees.")
+def _measure(run: _Run, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:
+    """Measure the mesh against the reference; its vertices get the attribute ``error``."""
+    mesh, attributes = finished.mesh, finished.attributes
+    with run.stages("measure"):
+        metrics = measure(mesh, reference, seed=run.options.seed, advance=run.progress.advance)
+        if run.options.attributes != "none":
+            error = Attribute("error", vertex_error(mesh, reference), "signed distance to the reference, file units")
+            mesh, attributes = mesh.with_attributes({error.name: error.values}), [*attributes, error]
+    return replace(finished, mesh=mesh, attributes=attributes, metrics=metrics)
 
 
 def read_source(source: Any, normals: Any, format: str | None, most: int, region: Region) -> tuple[PointCloud, Reading]:
@@ -313,20 +326,16 @@ def read_source(source: Any, normals: Any, format: str | None, most: int, region
     Raises
     ------
     InputError, UsageError
-        When it cannot be read, is nothing that holds points, or none lie in the region.
+        When it cannot be read, holds no points, or none lie in the region.
     """
     if files := _files(source):
         return read_scans(files, format, most, region)
     return cropped(as_cloud(source, normals), region)
 
 
-def described(scan: Survey | None, layers: Layers | None, reading: Reading) -> dict[str, Any] | None:
-    """Return what is known of a scan as plain values; None where it has too few points."""
-    if scan is None:
-        return None
-    units = guess_units(scan.lower, scan.upper, reading.files)
-    found = scan.as_dict() | {"layers": None if layers is None else layers.as_dict()}
-    return found | {"units_guess": units.unit, "units_reason": units.reason}
+def source_name(source: Any) -> str:
+    """Return the source for the report: its files, or its type."""
+    return ", ".join(map(str, _files(source))) or type(source).__name__
 
 
 def _files(source: Any) -> list[str | Path]:
@@ -337,11 +346,6 @@ def _files(source: Any) -> list[str | Path]:
     return paths if all(isinstance(path, str | Path) for path in paths) else []
 
 
-def _named(source: Any) -> str:
-    """The source for the report: its files, or its type."""
-    return ", ".join(map(str, _files(source))) or type(source).__name__
-
-
 def _reference(reference: Any) -> Mesh | PointCloud | None:
     if reference is None:
         return None
@@ -350,62 +354,3 @@ def _reference(reference: Any) -> Mesh | PointCloud | None:
 
 def _verify(path: Path, bordered: bool) -> None:
     verify_file(path, bordered)
-
-
-def _out_of_memory(error: Exception) -> MemoryLimitError:
-    return MemoryLimitError(
-        f"There is not enough memory ({str(error).splitlines()[0] if str(error) else 'allocation failed'}); "
-        f"use fewer points (--max-points) or a coarser mesh (--resolution)."
-    )
-
-
-def _surface(mesh: Mesh, facts: MeshFacts, unsupported: Invented, trimming: Trimming | None) -> dict[str, Any]:
-    """What the mesh is and what was cut off it, as plain values; an open one has no volume."""
-    guarantee = "closed, oriented 2-manifold" if facts.closed else "oriented edge-manifold with borders"
-    found = {**facts.as_dict(), **unsupported.as_dict(), "guarantee": guarantee, "quality": quality(mesh).as_dict()}
-    if not facts.closed:
-        found["volume"] = None
-    return {"mesh": found, "trim": None if trimming is None else trimming.as_dict()}
-
-
-def _report(
-    source: Any,
-    options: Options,
-    stages: Stages,
-    counts: IngestCounts,
-    solution: Solution,
-    misfits: tuple[Misfit, Misfit | None],
-    sdf: NeuralSDF,
-    surface: dict[str, Any],
-    actions: list[str],
-    attributes: list[Attribute],
-    metrics: Metrics | None,
-) -> dict[str, Any]:
-    found = {
-        "schema_version": SCHEMA_VERSION,
-        "command": None,
-        "origin": None,
-        "input": _named(source),
-        "options": options.as_dict(),
-        "versions": versions(),
-        "ingest": counts.as_dict(),
-        "frame": {"center": sdf.frame.center.tolist(), "scale": sdf.frame.scale},
-        "fit": {
-            "status": solution.status,
-            "method": solution.method,
-            "interrupted": solution.interrupted,
-            "parameters": sdf.parameters,
-            "detail": None if sdf.detail is None else sdf.detail.as_dict(sdf.frame.scale),
-            "history": [vars(record) for record in solution.history],
-            "residuals": misfits[0].as_dict(),
-            "held_out": None if misfits[1] is None else misfits[1].as_dict(),
-        },
-        **surface,
-        "actions": actions,
-        "attributes": [{"name": one.name, "origin": one.origin} for one in attributes],
-        "metrics": None if metrics is None else metrics.as_dict(),
-        "stages": stages.as_list(),
-        "resources": stages.resources(),
-    }
-    values: dict[str, Any] = plain(found)
-    return values

@@ -15,7 +15,7 @@ from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Samples
-from gnrecon.io import holds
+from gnrecon.io import supports_attribute
 from gnrecon.options import Options
 from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
@@ -115,7 +115,9 @@ def fitting(mesh: Mesh, path: Path, attributes: str) -> Mesh:
     if attributes != "auto":
         return mesh
     kept = {
-        name: values for name, values in mesh.attributes.items() if name not in UNASKED or holds(path, name, values)
+        name: values
+        for name, values in mesh.attributes.items()
+        if name not in UNASKED or supports_attribute(path, name, values)
     }
     return replace(mesh, attributes=kept)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from reproduction.__main__ import main
-from reproduction.figures import HIGH, LOW, MIDDLE, coloured
+from reproduction.figures import HIGH, LOW, MIDDLE, coloured, draw_surfaces
 
 from gnrecon.geometry.mesh import Mesh
 
@@ -17,7 +18,8 @@ def test_an_experiment_is_run_once_and_drawn(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr("reproduction.figures.SIZES", ((70, 56), (46, 40)))
+    small = partial(draw_surfaces, size=(70, 56), panel=(46, 40))
+    monkeypatch.setattr("reproduction.__main__.draw_surfaces", small)
     words = ["-o", str(tmp_path), "--only", "cone", "--steps", "1", "--resolution", "16"]
     assert main(words) == 0
     assert "cone by gn" in capfd.readouterr().err

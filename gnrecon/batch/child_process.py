@@ -156,6 +156,7 @@ class ForkServerClient:
         # The server must run this very copy of gnrecon, and find the work module where this process would.
         path = [str(Path(str(gnrecon.__file__)).parents[1]), *filter(None, sys.path)]
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(self._threads))
+        # Passive: idle OpenMP threads of one scan sleep instead of spinning on cores that other scans use.
         return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **threads, "PYTHONPATH": os.pathsep.join(path)}
 
     def close(self, *, exit_seconds: float = 10.0) -> None:

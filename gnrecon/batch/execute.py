@@ -111,6 +111,7 @@ def _attempt(job: Job, identity: dict[str, Any], launch: _Launch) -> JobOutcome:
     with _attempt_folder(job) as folder:
         if "config" in job.kinds:
             (folder / "files" / job.file_names()["config"]).write_text(job.config, encoding="utf-8")
+        # Libraries write temporary files to TMPDIR, within the folder, so that they are deleted even after a crash.
         end = run_child(
             _argument(job, folder),
             threads=job.options["threads"],
@@ -177,6 +178,7 @@ def _publish(job: Job, folder: Path, identity: dict[str, Any], end: ChildEnd) ->
     facts = {"figures": figures_of(report), "metrics": report["metrics"], "peak_memory_mb": end.peak_memory_mb}
     job.thumbnail().parent.mkdir(parents=True, exist_ok=True)
     (folder / files["thumbnail"]).replace(job.thumbnail())
+    # The hashes of replaced files let a batch that is killed before the renaming know them as its own.
     existing = {name: hash_if_exists(job.output / name) for name in names.values()}
     record = JobRecord(
         identity,
@@ -187,6 +189,7 @@ def _publish(job: Job, folder: Path, identity: dict[str, Any], end: ChildEnd) ->
     )
     record.write(job.record())
     record.move_into_place(job.output)
+    # Makes the new names durable, so that a power failure does not undo them.
     sync(job.output)
     return _succeeded(job, Status.MADE, facts)
 

@@ -118,6 +118,7 @@ def run_on_cluster(
         futures = {}
         for job in jobs:
             task = replace(job, scan=job.scan.absolute(), output=job.output.absolute())
+            # A unique key, because Dask returns the stored result of an equal key, such as that of an earlier batch.
             key = f"gnrecon-{job.name}-{secrets.token_hex(4)}"
             futures[client.submit(run_on_worker, task, alive, list(devices), work, key=key, retries=retries)] = job
         try:

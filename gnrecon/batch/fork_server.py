@@ -155,6 +155,7 @@ def detach_child(log: str, environment: Mapping[str, str], parent: int) -> None:
     environment : variables to set
     parent : process whose end also ends this one
     """
+    # A session of its own, so that the whole process group can be killed.
     os.setsid()
     die_with_parent(parent)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)

@@ -68,6 +68,7 @@ def _job(request: Request, found: FoundScan, name: str, paired: Path | None) -> 
 def _require_distinct_from_inputs(jobs: Sequence[Job], others: Sequence[Path]) -> None:
     """Refuse outputs that are inputs: scans, files that scans name, references, or the `others`."""
     read = [path for job in jobs for path in (job.scan, job.reference) if path is not None]
+    # Resolved, because links and relative paths may lead to the same file.
     inputs = {path.resolve() for path in [*all_input_files(read), *others]}
     for job in jobs:
         for name in job.file_names().values():

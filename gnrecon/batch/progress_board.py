@@ -66,6 +66,7 @@ class ProgressBoard:
         run = [outcome for outcome in self._outcomes if outcome.attempts]
         text.append(f"  {_clock(seconds)}")
         if run and len(self._outcomes) < self._total:
+            # Unchanged scans take no time, so the estimate counts only those that were run.
             left = seconds / len(run) * (self._total - len(self._outcomes))
             text.append(f", about {_clock(left)} left", style="dim")
         return text

@@ -119,6 +119,7 @@ def locked_output_folder(output: Path) -> Iterator[None]:
             ) from None
         for record in all_records(output):
             record.move_into_place(output)
+        # After the recorded results were moved, these folders only hold files of killed attempts.
         shutil.rmtree(running_folder(output), ignore_errors=True)
         for incomplete in records_folder(output).rglob(".*.json"):
             incomplete.unlink(missing_ok=True)

@@ -53,8 +53,8 @@ def find_scans(sources: Sequence[str], lists: Sequence[Path], search: ScanSearch
                 found.setdefault(scan.scan.absolute(), scan)
     if not found:
         searched = ", ".join([*sources, *map(str, lists)])
-        wanted = f"that match {' or '.join(search.patterns)}; " if search.patterns else "; "
-        raise InputError(f"There are no scans in {searched} {wanted}extensions read are {', '.join(readable())}.")
+        matching = f" that match {' or '.join(search.patterns)}" if search.patterns else ""
+        raise InputError(f"There are no scans in {searched}{matching}; extensions read are {', '.join(readable())}.")
     return list(found.values())
 
 
@@ -225,6 +225,7 @@ def reference_of(found: FoundScan, index: int, request: Request) -> Path | None:
     templates = ("{folder}/{stem}", "{stem}") if request.reference_name is None else (request.reference_name,)
     for template in templates:
         path = request.references / fill_template(template, found, index)
+        # The extension of a reference need not be that of the scan, so all readable ones are tried.
         candidates = [path, *(path.with_name(path.name + extension) for extension in readable())]
         reference = next((candidate for candidate in candidates if candidate.is_file()), None)
         if reference is not None:

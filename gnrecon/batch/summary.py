@@ -97,6 +97,7 @@ def write_summary(summary: BatchSummary, folder: Path) -> Path:
     OutputError
         When a file cannot be written.
     """
+    # JSON has no NaN; a value that is not finite would make the file unreadable for other programs.
     text = json.dumps(summary.as_dict(), indent=2, allow_nan=False) + "\n"
     write_text(folder / "summary.json", text, overwrite=True)
     write_text(folder / "summary.csv", summary_csv(summary.outcomes), overwrite=True)

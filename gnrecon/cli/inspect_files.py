@@ -1,4 +1,4 @@
-"""``gnrecon info SCAN``: what is in a scan and what would trouble a fit; and what a run would do, without doing it."""
+"""The commands on files: ``gnrecon check``, ``eval`` and ``convert``."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import (
     CLOUD_WRITERS,
     all_input_files,
-    holds,
     read_any,
     read_mesh,
     read_reference,
-    unverified,
+    supports_attribute,
+    unverified_remark,
     writable,
     write_cloud,
     write_mesh,
     written_origin,
 )
-from gnrecon.io.origin import told
-from gnrecon.io.write import losses
+from gnrecon.io.origin import origin_remark
+from gnrecon.io.write import round_trip_losses
 from gnrecon.runtime.errors import ExitCode, MeshError, UsageError
 from gnrecon.runtime.files import require_files, write_text
 
@@ -123,14 +123,14 @@ def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]
     lost: list[str] = []
 
     def compare(path: Path) -> None:
-        lost.extend(losses(found, read_any(path)[0]))
+        lost.extend(round_trip_losses(found, read_any(path)[0]))
 
     if isinstance(found, Mesh) and target.suffix.lower() in writable():
-        unheld = [name for name, values in found.attributes.items() if not holds(target, name, values)]
+        unheld = [name for name, values in found.attributes.items() if not supports_attribute(target, name, values)]
         write_mesh(found, target, overwrite, compare)
         origin = written_origin(found, target)
-        lost += [] if origin is None else [told(origin)]
-        lost += unverified(target)
+        lost += [] if origin is None else [origin_remark(origin)]
+        lost += unverified_remark(target)
         lost += [f"The format has no place for {', '.join(unheld)} of the vertices; PLY has."] if unheld else []
     else:
         cloud = PointCloud(found.vertices, found.normals, found.attributes) if isinstance(found, Mesh) else found

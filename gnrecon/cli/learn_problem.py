@@ -16,8 +16,8 @@ from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import all_input_files, check_writable, write_mesh
-from gnrecon.pipeline import limited
 from gnrecon.report.report import plain, versions
+from gnrecon.runtime.compute_limits import limited
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
 from gnrecon.shape_learning import (

@@ -12,11 +12,11 @@ from gnrecon.export import Neighbourhood, require_sound, verify_file
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io import check_writable, holds, write_mesh
+from gnrecon.io import check_writable, supports_attribute, write_mesh
 from gnrecon.options import Options
-from gnrecon.pipeline import limited, require_device
 from gnrecon.report.report import Stages
 from gnrecon.run import shown, summarise
+from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import require_files
 from gnrecon.solid import Shape, shaped
@@ -74,7 +74,7 @@ def _adorned(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path) -> Mesh
     made = {one.name: one.values for one in (curvature_of(mesh, sdf) if options.curvature else [])}
     if options.attributes != "none" and sdf.data is not None:
         distances = Neighbourhood(sdf.data).distances(mesh.vertices)
-        if options.attributes != "auto" or holds(output, "distance", distances):
+        if options.attributes != "auto" or supports_attribute(output, "distance", distances):
             made["distance"] = distances
     return mesh.with_attributes(made)
 

@@ -14,8 +14,9 @@ from gnrecon.io import (
     Reading,
 )
 from gnrecon.options import Options
-from gnrecon.pipeline import described, read_source
+from gnrecon.pipeline import read_source
 from gnrecon.report.estimate import estimate
+from gnrecon.report.run_report import scan_facts
 from gnrecon.runtime.errors import ExitCode, InputError
 
 _NORMALS = {
@@ -41,7 +42,7 @@ def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = No
     chosen = Options.of(**options)
     cloud, reading = read_source(list(scans), None, format, chosen.read_points, chosen.region())
     plan, layers = _plan(cloud, reading, chosen)
-    facts = described(survey(cloud), layers, reading)
+    facts = scan_facts(survey(cloud), layers, reading)
     if facts is None:
         raise InputError("The scan holds fewer than 25 finite and distinct points, so that nothing can be told of it.")
     if as_json:

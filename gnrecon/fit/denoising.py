@@ -19,8 +19,8 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import DenoisingParameters
-from gnrecon.fit.shape_priors.bilateral_filter import Averaging
-from gnrecon.fit.shape_priors.sharp_shape import Sharp, has_edges
+from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape, has_edges
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import Samples
 
@@ -42,10 +42,10 @@ class LocalData:
     samples: Samples
     residuals: FieldResiduals
     hyperparameters: Hyperparameters
-    averaging: Averaging | None = None
+    averaging: BilateralFilter | None = None
 
     @classmethod
-    def of_faces(cls, sdf: NeuralSDF, sharp: Sharp) -> LocalData:
+    def of_faces(cls, sdf: NeuralSDF, sharp: SharpShape) -> LocalData:
         """Return the data of a shape with sharp edges, whose samples and hyperparameters are known."""
         return cls(sharp.samples, FieldResiduals.of(sdf, sharp.samples), sharp.hyperparameters, sharp.averaging)
 
@@ -89,30 +89,30 @@ def choose_local_data(
     if samples.estimated or selected.hyperparameters.position <= 1.001 * parameters.least_noise_disk_radii * radius:
         return LocalData(samples, residuals, plain)
 
-    def with_kept(averaging: Averaging) -> CrossValidation:
+    def with_kept(averaging: BilateralFilter) -> CrossValidation:
         points, normals = samples.points.copy(), samples.normals.copy()
-        points[~held_out], normals[~held_out] = averaging.of(points[~held_out], normals[~held_out])
+        points[~held_out], normals[~held_out] = averaging.apply(points[~held_out], normals[~held_out])
         # Averaged points have correlated noise, for which the marginal likelihood is wrong.
         of_averaged = FieldResiduals.of(sdf, replace(samples, points=points, normals=normals))
         return replace(validation, residuals=of_averaged, likelihood=None)
 
     first = _candidates(parameters)[0]
-    found = _best(selected, with_kept, lambda: has_edges(*first.of(samples.points, samples.normals)), parameters)
+    found = _best(selected, with_kept, lambda: has_edges(*first.apply(samples.points, samples.normals)), parameters)
     if found is None:
         return LocalData(samples, residuals, plain)
     averaging, better = found
-    points, normals = averaging.of(samples.points, samples.normals)
+    points, normals = averaging.apply(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
-    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width)
+    _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width_radii)
     return LocalData(samples, FieldResiduals.of(sdf, samples), better.select().hyperparameters, averaging)
 
 
 def _best(
     selected: SelectedModel,
-    kept_averaged: Callable[[Averaging], CrossValidation],
+    kept_averaged: Callable[[BilateralFilter], CrossValidation],
     edges: Callable[[], bool],
     parameters: DenoisingParameters = DenoisingParameters(),
-) -> tuple[Averaging, CrossValidation] | None:
+) -> tuple[BilateralFilter, CrossValidation] | None:
     """Return the filter that predicts best and its cross-validation, or None if no filter is better.
 
     Edges are looked for only if the patches do not decide. All filters are compared at the length scale of the scanned
@@ -121,7 +121,7 @@ def _best(
     plain = _of_best_noise(selected.scores)
     first, *others = _candidates(parameters)
 
-    def tried(averaging: Averaging) -> tuple[Float, CrossValidation]:
+    def tried(averaging: BilateralFilter) -> tuple[Float, CrossValidation]:
         validation = kept_averaged(averaging)
         return plain - _of_best_noise(validation.scores(selected.hyperparameters.length)), validation
 
@@ -137,9 +137,9 @@ def _best(
     return averaging, validation
 
 
-def _candidates(parameters: DenoisingParameters) -> list[Averaging]:
+def _candidates(parameters: DenoisingParameters) -> list[BilateralFilter]:
     """Return the filters to try, of which the others are tried only where the first one helps."""
-    return [Averaging(width, parameters.normal_difference) for width in parameters.widths_disk_radii]
+    return [BilateralFilter(width, parameters.normal_difference) for width in parameters.widths_disk_radii]
 
 
 def _of_best_noise(scores: Float) -> Float:

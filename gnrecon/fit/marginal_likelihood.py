@@ -25,7 +25,7 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.local_solve import Patch, data_kernel
 from gnrecon.fit.parameters import CleanScanParameters, MarginalLikelihoodParameters
-from gnrecon.fit.shape_priors.edge_completion import over_planes
+from gnrecon.fit.shape_priors.edge_completion import heights_over_planes
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.runtime.parallel import map_in_threads
@@ -187,5 +187,5 @@ def median_pair_height(
     paired = (distance > 0) & (distance < parameters.reach_disk_radii * disks) & (cosine > least_cosine)
     if paired.sum() < parameters.least_pairs:
         return np.nan
-    height, own = over_planes(points, normals, some, near)
+    height, own = heights_over_planes(points, normals, some, near)
     return float(np.median((np.abs(height - own) / 2 / np.maximum(distance, disks))[paired]))

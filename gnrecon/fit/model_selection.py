@@ -164,7 +164,7 @@ def select_hyperparameters(
 
     Parameters
     ----------
-    leftover : Leftover
+    residuals : at the points
     held_out : mask of shape (N,), of the validation points
     radius : of the disk that a point stands for, unit coordinates
     rng : draws patches and features

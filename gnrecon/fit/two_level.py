@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.field.partition_of_unity import Detail
-from gnrecon.fit.blocks.solve import LARGE, fit_large
+from gnrecon.fit.blocks.block_parameters import BlockParameters
+from gnrecon.fit.blocks.solve import fit_large
 from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
 from gnrecon.fit.denoising import LocalData, choose_local_data
 from gnrecon.fit.field_model import NeuralSDF
@@ -26,9 +27,9 @@ from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
 from gnrecon.fit.parameters import FitParameters
-from gnrecon.fit.shape_priors.ball_fit import Ball
-from gnrecon.fit.shape_priors.hole_completion import Continued, continued
-from gnrecon.fit.shape_priors.sharp_shape import Sharp
+from gnrecon.fit.shape_priors.ball_fit import BallFit
+from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape
 from gnrecon.fit.summary import FitSummary, describe
 from gnrecon.fit.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.geometry.arrays import Int, Mask
@@ -69,11 +70,11 @@ def fit_two_level(
     FitError
         When a linear system cannot be solved.
     """
-    by_blocks = folder is not None or len(samples) >= LARGE
+    by_blocks = folder is not None or len(samples) >= BlockParameters.large_scan_points
     if by_blocks and options.regularisers:
         raise UsageError(
-            f"smooth, fill and prior are for fits of fewer than {LARGE} points without a work folder; "
-            "thin the scan with --max-points."
+            f"smooth, fill and prior are for fits of fewer than {BlockParameters.large_scan_points} points without a "
+            "work folder; thin the scan with --max-points."
         )
     steps = _Steps(options, by_blocks, rng, parameters)
     share = parameters.two_level.global_time_share
@@ -118,17 +119,17 @@ class _Data:
     samples: Samples
     held_out: Mask
     seen: Int
-    sharp: Sharp | None
-    across: Continued
+    sharp: SharpShape | None
+    across: HoleCompletion
 
     def across_holes(self, rng: np.random.Generator) -> _Data:
         """Return the data with samples across the holes; a shape with sharp edges has them already."""
         if self.sharp is not None:
             return self
-        across = continued(self.samples.points, self.samples.normals, not self.samples.estimated)
+        across = complete_holes(self.samples.points, self.samples.normals, not self.samples.estimated)
         if not len(across):
             return self
-        points, normals = across.joined(self.samples.points, self.samples.normals)
+        points, normals = across.appended_to(self.samples.points, self.samples.normals)
         held_out = np.concatenate([self.held_out, np.zeros(len(across), dtype=bool)])
         # The global field sees the same share of them as of the points that are not held out.
         share = len(self.seen) / max(len(self.samples) - int(self.held_out.sum()), 1)
@@ -142,7 +143,7 @@ class _Data:
         seen = np.zeros(len(outliers), dtype=bool)
         seen[self.seen] = True
         rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
-        return _Data(rest, rest, self.held_out[kept], np.flatnonzero(seen[kept]), None, Continued.none())
+        return _Data(rest, rest, self.held_out[kept], np.flatnonzero(seen[kept]), None, HoleCompletion.none())
 
 
 @dataclass(frozen=True)
@@ -159,18 +160,18 @@ class _Steps:
         """Whether balls and sharp edges are looked for."""
         return not (self.by_blocks or self.options.regularisers)
 
-    def detect_ball(self, samples: Samples) -> Ball | None:
+    def detect_ball(self, samples: Samples) -> BallFit | None:
         """Return the samples snapped to a ball, or None of any other shape."""
-        return Ball.of(samples) if self._finds_edges else None
+        return BallFit.of(samples) if self._finds_edges else None
 
     def prepare(self, scan: Samples) -> tuple[_Data, float]:
         """Return the data with faces extended to sharp edges, and the share of normals that were turned around."""
-        sharp = Sharp.of(scan) if self._finds_edges and not scan.estimated else None
+        sharp = SharpShape.of(scan) if self._finds_edges and not scan.estimated else None
         data = self._draw(scan, sharp)
         if not scan.estimated:
             return data, 0.0
         scan, flipped_share = flip_contradicted_normals(scan, data.seen, self.options)
-        sharp = Sharp.of(scan) if self._finds_edges else None
+        sharp = SharpShape.of(scan) if self._finds_edges else None
         data = replace(data, scan=scan, samples=scan) if sharp is None else self._draw(scan, sharp)
         return data, flipped_share
 
@@ -190,7 +191,7 @@ class _Steps:
             data = data.without(outliers)
         else:
             scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
-            data = self._draw(scan, Sharp.of(scan))
+            data = self._draw(scan, SharpShape.of(scan))
         return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
 
     def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, PenaltiesFor | None]:
@@ -226,7 +227,7 @@ class _Steps:
             )
         advance(self.parameters.local_fields.selection_time_share)
         detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties)
-        return detail, None if local.averaging is None else local.averaging.width
+        return detail, None if local.averaging is None else local.averaging.width_radii
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
         """Return the data with samples across holes, and the global field that is fitted to them."""
@@ -235,7 +236,7 @@ class _Steps:
         seen = completed.samples, completed.held_out, completed.seen
         return completed, fit_global(*seen, self.options, self.rng, advance, parameters=self.parameters.global_field)
 
-    def _draw(self, scan: Samples, sharp: Sharp | None) -> _Data:
+    def _draw(self, scan: Samples, sharp: SharpShape | None) -> _Data:
         """Draw the validation points and those that the global field sees."""
         limits = self.parameters.two_level
         samples = scan if sharp is None else sharp.samples
@@ -246,20 +247,20 @@ class _Steps:
         held_out: Mask = np.zeros(len(samples), dtype=bool)
         held_out[order[:count]] = True
         seen = np.sort(order[count:][: limits.global_field_points])
-        return _Data(scan, samples, held_out, seen, sharp, Continued.none() if sharp is None else sharp.across)
+        return _Data(scan, samples, held_out, seen, sharp, HoleCompletion.none() if sharp is None else sharp.holes)
 
 
 def _summary(detail: Detail, data: _Data, options: FitOptions) -> FitSummary:
     """Return the part of the summary that the final data and the local fields determine."""
     chosen = detail.as_dict(data.scan.frame.scale)
-    snapped = None if data.sharp is None else data.sharp.laid
+    snapped = None if data.sharp is None else data.sharp.snapped
     return FitSummary(
         cubes=len(detail),
         length=chosen["length"],
         position_noise=chosen["position_noise"],
         angle_noise=chosen["angle_noise"],
-        snapped_points=0 if snapped is None else int(snapped.on.sum()),
-        primitives=0 if snapped is None else snapped.surfaces,
+        snapped_points=0 if snapped is None else int(snapped.snapped.sum()),
+        primitives=0 if snapped is None else snapped.primitives,
         edge_samples=None if data.sharp is None else len(data.samples) - len(data.scan) - len(data.across),
         hole_samples=len(data.across),
         holes=data.across.holes,

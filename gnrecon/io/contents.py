@@ -1,4 +1,7 @@
-"""What a reader returns: the points, and whatever else its file stores, before it becomes a cloud or a mesh."""
+"""`Contents`, what a reader returns: the points and all else that a file stores, before it becomes a cloud or a mesh.
+
+Also holds what many readers need: sorting named columns, concatenating scans, and cutting polygons into triangles.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,6 @@ from gnrecon.runtime.plugins import describe_error, guarded
 
 Columns = Mapping[str, Values]
 
-_POSITION = (("x", "y", "z"),)
-
-_NORMAL = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
-
-_COLOR = (
-    ("red", "green", "blue", "alpha"),
-    ("red", "green", "blue"),
-    ("r", "g", "b", "a"),
-    ("r", "g", "b"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-)
-
 
 def no_faces() -> Int:
     """Return an empty face array, of shape (0, 3)."""
@@ -34,16 +25,16 @@ def no_faces() -> Int:
 
 @dataclass(frozen=True)
 class Contents:
-    """Arrays of one file, in its own order.
+    """Arrays of one file, in the file's order.
 
     Parameters
     ----------
     points : array of shape (N, 3), file units
     normals : array of shape (N, 3), optional, as stored
-    faces : integer array of shape (F, 3); empty for a bare cloud
+    faces : integer array of shape (F, 3); empty for a cloud
     attributes : mapping of name to array of N rows
-    unread : what else the file holds, in words such as ``"texture coordinates"``
-    origins : array of shape (N, 3), optional, where the scanner stood for each point; NaN where that is not known
+    unread : descriptions of what else the file holds, such as ``"texture coordinates"``
+    origins : array of shape (N, 3), optional, the scanner position for each point; NaN where it is unknown
     """
 
     points: Float
@@ -72,12 +63,21 @@ def from_columns(columns: Columns, faces: Int | None = None) -> Contents:
         When x, y or z is missing.
     """
     rest = dict(columns)
-    position = _take(rest, _POSITION)
+    position = _take(rest, (("x", "y", "z"),))
     if position is None:
         found = ", ".join(columns) if columns else "none"
         raise InputError(f"expected columns named x, y and z, but found {found}.")
-    normal = _take(rest, _NORMAL)
-    color = _take(rest, _COLOR)
+    normal = _take(rest, (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz")))
+    color = _take(
+        rest,
+        (
+            ("red", "green", "blue", "alpha"),
+            ("red", "green", "blue"),
+            ("r", "g", "b", "a"),
+            ("r", "g", "b"),
+            ("diffuse_red", "diffuse_green", "diffuse_blue"),
+        ),
+    )
     if color is not None:
         rest["colors"] = np.column_stack(list(color.values()))
     return Contents(
@@ -88,11 +88,11 @@ def from_columns(columns: Columns, faces: Int | None = None) -> Contents:
     )
 
 
-def joined(pieces: Sequence[Contents]) -> Contents:
+def concatenated(pieces: Sequence[Contents]) -> Contents:
     """Return the contents of all pieces, in their order, as one.
 
-    Normals and attributes are kept where all pieces have them in the same shape; which ones are not is told by
-    `Contents.unread`. Scan origins that only some pieces have are NaN for the others.
+    Normals and attributes are kept where all pieces have them in the same shape; `Contents.unread` names the others.
+    Scan origins that only some pieces have are NaN for the rest.
     """
     if len(pieces) == 1:
         return pieces[0]
@@ -100,6 +100,7 @@ def joined(pieces: Sequence[Contents]) -> Contents:
     normals = [piece.normals for piece in pieces if piece.normals is not None]
     names = dict.fromkeys(name for piece in pieces for name in piece.attributes)
     shared = {name: values for name in names if (values := _shared(name, pieces)) is not None}
+    # Dropped rather than filled up, because later stages cannot tell made-up values from measured ones.
     lost = [f"{name} of some of the scans" for name in names if name not in shared]
     if 0 < len(normals) < len(pieces):
         lost.append("normals of some of the scans")
@@ -114,7 +115,7 @@ def joined(pieces: Sequence[Contents]) -> Contents:
 
 
 def _shared(name: str, pieces: Sequence[Contents]) -> list[Values] | None:
-    """The values of an attribute in each piece, or None where they are missing or of differing shape."""
+    """The values of an attribute in each piece, or None where they are missing or differ in shape."""
     values = [piece.attributes[name] for piece in pieces if name in piece.attributes]
     same = len(values) == len(pieces) and len({one.shape[1:] for one in values}) == 1
     return values if same else None
@@ -128,18 +129,15 @@ def _origins(pieces: Sequence[Contents]) -> Float | None:
     )
 
 
-# Polygons of any number of corners, cut into fans of triangles.
-
-
-def fan(counts: Int, corners: Int) -> Int:
-    """Return triangles, of shape (F, 3), that cover polygons.
+def fan_triangles(counts: Int, corners: Int) -> Int:
+    """Return the triangles, of shape (F, 3), of polygons that are each cut into a fan.
 
     A polygon v0 v1 ... v(n-1) becomes the n - 2 triangles v0 v(k+1) v(k+2); fewer than three corners give none.
 
     Parameters
     ----------
     counts : integer array of shape (P,), the number of corners of each polygon
-    corners : integer array of shape (counts.sum(),), the vertex indices of all polygons in a row
+    corners : integer array of shape (counts.sum(),), the concatenated vertex indices of all polygons
     """
     triangles = np.maximum(counts - 2, 0)
     polygon = np.repeat(np.arange(len(counts)), triangles)
@@ -148,8 +146,8 @@ def fan(counts: Int, corners: Int) -> Int:
     return np.column_stack([corners[first], corners[first + k + 1], corners[first + k + 2]])
 
 
-def not_triangles(counts: Int) -> tuple[str, ...]:
-    """Say what `fan` does not keep of polygons with so many corners, of shape (P,); nothing for triangles."""
+def polygon_remarks(counts: Int) -> tuple[str, ...]:
+    """Return sentences on what `fan_triangles` changes in polygons of so many corners, an array of shape (P,)."""
     larger, smaller = int((counts > 3).sum()), int((counts < 3).sum())
     sentences = (
         (larger, f"{larger} polygons of more than three corners as such (they are cut into triangles)"),
@@ -158,15 +156,12 @@ def not_triangles(counts: Int) -> tuple[str, ...]:
     return tuple(sentence for count, sentence in sentences if count)
 
 
-# Guarding a call into a library that parses files.
-
-
-def parsing(kind: str) -> AbstractContextManager[None]:
+def guard_parser(kind: str) -> AbstractContextManager[None]:
     """Guard a block that parses a file of a kind, such as ``"LAS"``.
 
     Raises
     ------
     InputError
-        When the library in the block fails in whichever way; see `gnrecon.runtime.plugins.guarded`.
+        When the library in the block raises any exception; see `gnrecon.runtime.plugins.guarded`.
     """
     return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({describe_error(error)}).")

@@ -1,4 +1,10 @@
-"""The table of file formats: to add one, write a module beside this and a line here."""
+"""The tables of file formats, and how files are read and written by their extension.
+
+To add a format, write a module in `gnrecon.io.formats` and add a line to the tables. Other extensions are looked up
+among the plugins of installed packages. Their reader takes a path and returns a `PointCloud`, a `Mesh`, or anything
+else that `as_shape` accepts; their writer takes a `Mesh` and a path. The returned values are checked like any input.
+Plugins cannot replace built-in formats.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +20,7 @@ from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats.e57 import read_e57
-from gnrecon.io.formats.gltf import fits_glb, read_glb, read_gltf, write_glb
+from gnrecon.io.formats.gltf import glb_supports, read_glb, read_gltf, write_glb
 from gnrecon.io.formats.las import read_las
 from gnrecon.io.formats.obj import read_obj, write_obj
 from gnrecon.io.formats.off import read_off, write_off
@@ -68,41 +74,34 @@ CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".txt": write_xyz,
     ".csv": write_xyz,
 }
-"""Writers of vertices without faces."""
+"""Writers of points without faces."""
 
 
-def _color(name: str, values: Values) -> bool:
+def _is_color(name: str, values: Values) -> bool:
     del values
     return name == "colors"
 
 
-def _number(name: str, values: Values) -> bool:
+def _is_numeric(name: str, values: Values) -> bool:
     del name
     return values.dtype.kind in "biuf"
 
 
-def _nothing(name: str, values: Values) -> bool:
+def _never(name: str, values: Values) -> bool:
     del name, values
     return False
 
 
-HOLDS: dict[str, Callable[[str, Values], bool]] = {
-    ".obj": _color,
-    ".ply": _number,
-    ".stl": _nothing,
-    ".off": _color,
-    ".glb": fits_glb,
-    ".3mf": _color,
+ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
+    ".obj": _is_color,
+    ".ply": _is_numeric,
+    ".stl": _never,
+    ".off": _is_color,
+    ".glb": glb_supports,
+    ".3mf": _is_color,
 }
-"""Which attributes of vertices a format can hold, by name and values."""
+"""Whether a format can store a vertex attribute, by its name and values."""
 
-ZIPPED = (".3mf",)
-"""Formats that are ZIP archives of their parts."""
-
-SAME_BEGINNING = ({".las", ".laz"},)
-"""Formats that begin alike and have one reader."""
-
-# How files begin, to name what a wrongly named file really is.
 SIGNATURES: dict[bytes, str] = {
     b"ply\n": ".ply",
     b"ply\r": ".ply",
@@ -121,13 +120,7 @@ SIGNATURES: dict[bytes, str] = {
     b"ASTM-E57": ".e57",
     b"# vtk DataFile": ".vtk",
 }
-
-
-# How files are read and written by their extension: by the built-in table, else by what other packages bring.
-#
-# A reader of another package takes a path and returns a `PointCloud`, a `Mesh`, or anything else that `as_shape` takes;
-# a writer takes a `Mesh` and a path. What comes back is checked as any input is, because nothing is known of that code.
-# Extensions that are built in stay what they are.
+"""First bytes of files, and the extension or kind that they belong to."""
 
 
 def is_readable(extension: str) -> bool:
@@ -137,16 +130,16 @@ def is_readable(extension: str) -> bool:
 
 def readable() -> list[str]:
     """Return the extensions, with their dots, of all files that can be read."""
-    return _all(READERS, "reader")
+    return _with_plugins(READERS, "reader")
 
 
 def writable() -> list[str]:
     """Return the extensions, with their dots, of all files that a mesh can be written to."""
-    return _all(WRITERS, "writer")
+    return _with_plugins(WRITERS, "writer")
 
 
 def reader_of(extension: str) -> Callable[[Path], Contents] | None:
-    """Return what reads files of an extension; None where nothing does.
+    """Return the reader for files of an extension; None where there is none.
 
     Raises
     ------
@@ -159,11 +152,11 @@ def reader_of(extension: str) -> Callable[[Path], Contents] | None:
     if plugin is None:
         return None
     read = plugin.load()
-    return lambda path: _read(plugin, read, path)
+    return lambda path: _read_with_plugin(plugin, read, path)
 
 
 def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
-    """Return what writes meshes to files of an extension; None where nothing does.
+    """Return the writer of meshes for files of an extension; None where there is none.
 
     Raises
     ------
@@ -176,21 +169,21 @@ def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
     if plugin is None:
         return None
     write = plugin.load()
-    return lambda mesh, path: _write(plugin, write, mesh, path)
+    return lambda mesh, path: _write_with_plugin(plugin, write, mesh, path)
 
 
-def _all(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
+def _with_plugins(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
     return list(dict.fromkeys([*built_in, *(f".{plugin.entry.name}" for plugin in installed(kind))]))
 
 
-def _read(plugin: Plugin, read: Callable[[Path], Any], path: Path) -> Contents:
+def _read_with_plugin(plugin: Plugin, read: Callable[[Path], Any], path: Path) -> Contents:
     with plugin.guarded(InputError):
         found = read(path)
     with plugin.guarded(InputError):
         try:
             shape = as_shape(found)
         except InputError as error:
-            raise InputError(f"{plugin} returned what is no cloud: {error}") from error
+            raise InputError(f"{plugin} returned something that is not a cloud: {error}") from error
         attributes = {name: _column(plugin, name, values) for name, values in shape.attributes.items()}
         if isinstance(shape, Mesh):
             return Contents(shape.vertices, shape.normals, shape.faces, attributes)
@@ -208,23 +201,22 @@ def _column(plugin: Plugin, name: str, values: Any) -> Values:
     return column
 
 
-def _write(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh: Mesh, path: Path) -> None:
+def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh: Mesh, path: Path) -> None:
     with plugin.guarded(OutputError):
-        write(_kept(mesh), path)
+        write(_read_only(mesh), path)
     if not path.is_file() or not path.stat().st_size:
         raise OutputError(f"{plugin.subject} wrote nothing.")
 
 
-def _kept(mesh: Mesh) -> Mesh:
-    """The same mesh in arrays that cannot be written to, because the caller's mesh is used after it was written."""
-    normals = None if mesh.normals is None else _locked(mesh.normals)
-    attributes = {name: _locked(values) for name, values in mesh.attributes.items()}
-    return replace(
-        mesh, vertices=_locked(mesh.vertices), faces=_locked(mesh.faces), normals=normals, attributes=attributes
-    )
+def _read_only(mesh: Mesh) -> Mesh:
+    """The same mesh in read-only arrays, because the caller still uses the mesh after it was written."""
+    normals = None if mesh.normals is None else _locked_view(mesh.normals)
+    attributes = {name: _locked_view(values) for name, values in mesh.attributes.items()}
+    vertices, faces = _locked_view(mesh.vertices), _locked_view(mesh.faces)
+    return replace(mesh, vertices=vertices, faces=faces, normals=normals, attributes=attributes)
 
 
-def _locked(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _locked_view(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     view = values.view()
     view.flags.writeable = False
     return view

@@ -1,6 +1,7 @@
-"""Clouds and meshes of other libraries as ours.
+"""Converts clouds and meshes from and to trimesh, open3d and pymeshlab, and from arrays, tensors and data frames.
 
-An object's type is told from the module that defines it, so that no library is imported that the caller has not loaded.
+An object's type is recognised by the module that defines it, so that no library is imported that the caller has not
+loaded. Nothing is processed: vertices and faces stay the same, in the same order.
 """
 
 from __future__ import annotations
@@ -10,23 +11,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.arrays import Float, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import from_columns, no_faces
 from gnrecon.runtime.errors import InputError
 
-_POINTS = (
-    "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, or a cloud of open3d, trimesh or "
-    "pymeshlab"
-)
-
-_MESH = "a mesh of open3d, trimesh or pymeshlab, or a pair of vertices, of shape (V, 3), and faces, of shape (F, 3)"
-
 
 def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
-    """Return a cloud from any of the common carriers of points.
+    """Return a cloud from any common representation of points.
 
     Parameters
     ----------
@@ -35,14 +29,14 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
         PointCloud; pymeshlab Mesh or MeshSet (its current mesh); PointCloud; Mesh and other libraries' meshes, of which
         the vertices are taken
     normals : array of shape (N, 3), optional
-        Used instead of those that `obj` carries.
+        Used instead of those of `obj`.
 
     Raises
     ------
     InputError
         When `obj` is none of these, or shapes do not fit.
     """
-    found = _known(obj)
+    found = _from_library(obj)
     if found is None:
         found = _columns(obj) if _names(obj) else _from_array(_array(obj))
     cloud = PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
@@ -50,7 +44,7 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
 
 
 def as_mesh(obj: Any) -> Mesh:
-    """Return a mesh from any of the common carriers of meshes.
+    """Return a mesh from any common representation of meshes.
 
     Parameters
     ----------
@@ -62,13 +56,16 @@ def as_mesh(obj: Any) -> Mesh:
     InputError
         When `obj` is none of these, has no faces, or shapes do not fit.
     """
-    found = _known(obj)
+    expected = (
+        "a mesh of open3d, trimesh or pymeshlab, or a pair of vertices, of shape (V, 3), and faces, of shape (F, 3)"
+    )
+    found = _from_library(obj)
     if found is None and isinstance(obj, tuple | list) and len(obj) == 2:
-        vertices, faces = (_array(part, _MESH) for part in obj)
+        vertices, faces = (_array(part, expected) for part in obj)
         if vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3:
             found = Mesh(vertices, faces.astype(np.int64))
     if not isinstance(found, Mesh) or not len(found.faces):
-        raise InputError(f"Expected {_MESH}, but got {type(obj).__name__}{' without faces' if found else ''}.")
+        raise InputError(f"Expected {expected}, but got {type(obj).__name__}{' without faces' if found else ''}.")
     return found
 
 
@@ -80,14 +77,15 @@ def as_shape(obj: Any) -> Mesh | PointCloud:
     InputError
         As `as_cloud` does.
     """
-    found = _known(obj)
+    found = _from_library(obj)
     return as_cloud(obj) if found is None else found
 
 
-def _known(obj: Any) -> Mesh | PointCloud | None:
-    """What an object of a library that is known here holds; None where it is none."""
+def _from_library(obj: Any) -> Mesh | PointCloud | None:
+    """The mesh or cloud of an object of a known library; None for other objects."""
     if isinstance(obj, PointCloud | Mesh):
         return obj
+    # All base classes count, so that subclasses of a library's types are recognised.
     libraries = {kind.__module__.partition(".")[0] for kind in type(obj).__mro__}
     if "open3d" in libraries and (hasattr(obj, "point") or hasattr(obj, "vertex")):
         return _from_open3d_tensor(obj)
@@ -100,7 +98,7 @@ def _known(obj: Any) -> Mesh | PointCloud | None:
     return None
 
 
-def _made(
+def _mesh_or_cloud(
     points: Any, faces: Any, normals: Any = None, attributes: dict[str, npt.NDArray[Any]] | None = None
 ) -> Mesh | PointCloud:
     """A mesh where there are faces, with colours as 8-bit numbers, else a cloud."""
@@ -113,10 +111,10 @@ def _made(
 def _from_open3d(obj: Any) -> Mesh | PointCloud:
     if hasattr(obj, "points"):
         colors = {"colors": np.array(obj.colors)} if obj.has_colors() else {}
-        return _made(np.array(obj.points), None, np.array(obj.normals) if obj.has_normals() else None, colors)
+        return _mesh_or_cloud(np.array(obj.points), None, np.array(obj.normals) if obj.has_normals() else None, colors)
     colors = {"colors": np.array(obj.vertex_colors)} if obj.has_vertex_colors() else {}
     normals = np.array(obj.vertex_normals) if obj.has_vertex_normals() else None
-    return _made(np.array(obj.vertices), np.array(obj.triangles), normals, colors)
+    return _mesh_or_cloud(np.array(obj.vertices), np.array(obj.triangles), normals, colors)
 
 
 def _from_open3d_tensor(obj: Any) -> Mesh | PointCloud:
@@ -127,18 +125,18 @@ def _from_open3d_tensor(obj: Any) -> Mesh | PointCloud:
     points = arrays.pop("positions")
     indexed = hasattr(obj, "triangle") and "indices" in obj.triangle
     faces = obj.triangle.indices.cpu().numpy() if indexed else None
-    return _made(points, faces, arrays.pop("normals", None), arrays)
+    return _mesh_or_cloud(points, faces, arrays.pop("normals", None), arrays)
 
 
 def _from_trimesh(obj: Any) -> Mesh | PointCloud:
     has_faces = hasattr(obj, "faces") and len(obj.faces) > 0
-    seen = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
-    # A cloud without colours may say that it has some, and hold none.
-    held = {"colors": seen} if len(seen) else {}
+    colors = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
+    # trimesh may report vertex colours for a cloud that has none.
+    held = {"colors": colors} if len(colors) else {}
     if not has_faces:
-        return _made(np.array(obj.vertices), None, None, held)
+        return _mesh_or_cloud(np.array(obj.vertices), None, None, held)
     held = {name: np.array(values) for name, values in obj.vertex_attributes.items()} | held
-    return _made(np.array(obj.vertices), np.array(obj.faces), np.array(obj.vertex_normals), held)
+    return _mesh_or_cloud(np.array(obj.vertices), np.array(obj.faces), np.array(obj.vertex_normals), held)
 
 
 def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
@@ -148,16 +146,16 @@ def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
         obj = obj.current_mesh()
     points, faces, normals = obj.transformed_vertex_matrix(), obj.face_matrix(), obj.vertex_normal_matrix()
     colors, values = obj.vertex_color_matrix(), obj.vertex_scalar_array()
-    # Every mesh there has normals, made of its faces, and colours and values, white and zero where nothing was given.
+    # Every pymeshlab mesh has normals (computed from its faces), colours (white by default) and values (0 by default).
     held = {} if (colors == 1).all() else {"colors": np.rint(255 * colors).astype(np.uint8)}
     held |= {"quality": values} if values.any() else {}
-    turn = obj.transform_matrix()[:3, :3]
-    own = np.linalg.solve(turn.T, normals.T).T if normals.any() and not len(faces) else None
-    return _made(points, faces, own, held)
+    linear = obj.transform_matrix()[:3, :3]
+    own = np.linalg.solve(linear.T, normals.T).T if normals.any() and not len(faces) else None
+    return _mesh_or_cloud(points, faces, own, held)
 
 
 def _columns(obj: Any) -> PointCloud:
-    """A cloud of named columns, which may be those of a structured array, a mapping or a data frame."""
+    """A cloud from named columns of a structured array, a mapping or a data frame."""
     contents = from_columns({name: _column(obj[name]) for name in _names(obj)})
     return PointCloud(contents.points, contents.normals, contents.attributes)
 
@@ -175,8 +173,15 @@ def _column(values: Any) -> npt.NDArray[Any]:
     return column
 
 
-def _array(obj: Any, expected: str = _POINTS) -> Float:
-    if hasattr(obj, "detach"):  # a torch tensor, on whatever device
+def _array(
+    obj: Any,
+    expected: str = (
+        "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, or a cloud of open3d, trimesh or "
+        "pymeshlab"
+    ),
+) -> Float:
+    """An array of float64; `expected` is what the message on anything else asks for."""
+    if hasattr(obj, "detach"):  # a torch tensor, on any device
         obj = obj.detach().cpu().numpy()
     try:
         return np.array(obj, dtype=np.float64)
@@ -190,12 +195,6 @@ def _from_array(rows: Float) -> PointCloud:
     return PointCloud(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
 
 
-Values = npt.NDArray[Any]
-
-
-# Our clouds and meshes as those of other libraries, unprocessed: the same vertices and faces in the same order.
-
-
 def to_trimesh(shape: Mesh | PointCloud) -> Any:
     """Return a ``trimesh.Trimesh`` with normals and attributes, or of a cloud a ``trimesh.PointCloud`` with colours."""
     import trimesh
@@ -205,7 +204,7 @@ def to_trimesh(shape: Mesh | PointCloud) -> Any:
     return trimesh.Trimesh(
         shape.vertices,
         shape.faces,
-        # A copy of the normals, because trimesh makes the array that it is given read-only.
+        # A copy of the normals, because trimesh makes the given array read-only.
         vertex_normals=shape.vertex_normals().copy(),
         vertex_colors=shape.attributes.get("colors"),
         vertex_attributes={name: values for name, values in shape.attributes.items() if name != "colors"},
@@ -219,7 +218,7 @@ def to_open3d(shape: Mesh | PointCloud, *, tensor: bool = False) -> Any:
     Parameters
     ----------
     shape : Mesh or PointCloud
-    tensor : whether it is one of ``open3d.t.geometry``, which keeps all attributes, and not a legacy one
+    tensor : whether to return one of ``open3d.t.geometry``, which keeps all attributes, instead of a legacy one
     """
     import open3d
 
@@ -245,8 +244,8 @@ def to_open3d(shape: Mesh | PointCloud, *, tensor: bool = False) -> Any:
 def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
     """Return a ``pymeshlab.MeshSet`` of one mesh, with colours; a cloud is a mesh without faces, and has its normals.
 
-    A mesh's normals are those that MeshLab makes of its faces, whichever it is given. The attribute ``quality`` becomes
-    MeshLab's own value of a vertex, and others of one or three columns custom attributes of the same name.
+    MeshLab always computes the normals of a mesh from its faces. The attribute ``quality`` becomes MeshLab's vertex
+    quality; others of one or three columns become custom attributes of the same name.
     """
     import pymeshlab
 
@@ -262,13 +261,13 @@ def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
     made = pymeshlab.Mesh(points, faces.astype(np.int32), **given)
     for name, column in shape.attributes.items():
         if name not in ("colors", "quality") and column.dtype.kind in "biuf":
-            _add(made, name, column.astype(np.float64))
+            _add_attribute(made, name, column.astype(np.float64))
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(made)
     return meshes
 
 
-def _add(mesh: Any, name: str, values: Values) -> None:
+def _add_attribute(mesh: Any, name: str, values: Values) -> None:
     if values.ndim == 1:
         mesh.add_vertex_custom_scalar_attribute(values, name)
     elif values.shape[1] == 3:
@@ -291,11 +290,11 @@ def _to_open3d_tensor(shape: Mesh | PointCloud) -> Any:
     normals = shape.normals if isinstance(shape, PointCloud) else shape.vertex_normals()
     held = dict(shape.attributes) | ({} if normals is None else {"normals": normals})
     for name, values in held.items():
-        # Each attribute there has rows and columns.
+        # Attributes of open3d tensors need two dimensions.
         getattr(made, carrier)[name] = tensor(values if values.ndim > 1 else values[:, None])
     return made
 
 
-def _colors(shape: Mesh | PointCloud) -> Values | None:
-    """8-bit colours, of shape (N, 3 or 4), where there are some."""
+def _colors(shape: Mesh | PointCloud) -> npt.NDArray[np.uint8] | None:
+    """8-bit colours, of shape (N, 3 or 4), or None."""
     return as_bytes(shape.attributes["colors"]) if "colors" in shape.attributes else None

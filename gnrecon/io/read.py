@@ -1,4 +1,8 @@
-"""Reading a file as a cloud, as a mesh, or as whichever it holds; every malformed file is one `InputError`."""
+"""Reads a file as a cloud, as a mesh, or as whichever it holds; every malformed file gives one `InputError`.
+
+The source may be a file, a gzip-compressed file, or standard input. Readers seek, compare sizes and pass names to
+libraries, so anything but a plain file is first copied into a temporary one.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import Contents
-from gnrecon.io.format_registry import READERS, SAME_BEGINNING, SIGNATURES, ZIPPED, is_readable, readable, reader_of
+from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import is_standard_input
 
@@ -26,8 +30,8 @@ _log = logging.getLogger(__name__)
 def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     """Read the points of a cloud or the vertices of a mesh, in the file's own units, exactly.
 
-    Normals are the file's own; a mesh without any gives the area-weighted normals of its faces (zero for a vertex that
-    no face uses). Rows with NaN come as they are.
+    Normals are those of the file; a mesh without any gives the area-weighted normals of its faces (zero for a vertex
+    that no face uses). Rows with NaN are kept.
 
     Parameters
     ----------
@@ -37,9 +41,9 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     Raises
     ------
     InputError
-        When the file is missing, empty, malformed, or of no supported kind.
+        When the file is missing, empty, malformed, or of an unsupported kind.
     UsageError
-        When `format` is no supported one, or standard input is read without one.
+        When `format` is not supported, or standard input is read without one.
     """
     contents = read_contents(Path(path), format)
     normals = contents.normals
@@ -49,7 +53,7 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a mesh with exactly the stored vertices and triangles (polygons are cut into fans; STL corners merged).
+    """Read a mesh with exactly the stored vertices and triangles; polygons are cut into fans, and STL corners merged.
 
     Raises
     ------
@@ -74,7 +78,7 @@ def read_reference(path: str | Path) -> Mesh | PointCloud:
 
 
 def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
-    """Read a mesh where the file has faces, else a cloud; and name what else the file holds, which is not read.
+    """Read a mesh where the file has faces, else a cloud; and describe what else the file holds, which is not read.
 
     Raises
     ------
@@ -96,13 +100,13 @@ def _mesh(contents: Contents, path: Path) -> Mesh:
         raise InputError(f"{path}: {error}") from None
 
 
-def extension_for(path: Path, format: str | None) -> str:
+def reader_extension(path: Path, format: str | None) -> str:
     """Return the extension, with its dot, that says how a file is read.
 
     Raises
     ------
     UsageError
-        When `format` is no supported one, or standard input is read without one.
+        When `format` is not supported, or standard input is read without one.
     """
     if format is None and is_standard_input(path):
         supported = ", ".join(suffix[1:] for suffix in readable())
@@ -115,9 +119,9 @@ def extension_for(path: Path, format: str | None) -> str:
 
 
 def read_contents(path: Path, format: str | None) -> Contents:
-    """Read all that a file holds; the arguments and errors are those of `read_cloud`."""
-    extension = extension_for(path, format)
-    with reading(path), plain_file(path, extension) as file:
+    """Read everything in a file; the arguments and errors are those of `read_cloud`."""
+    extension = reader_extension(path, format)
+    with input_errors_for(path), uncompressed_file(path, extension) as file:
         check_file(file, extension)
         read = reader_of(extension)
         assert read is not None, "check_file refuses what nothing reads"
@@ -129,8 +133,8 @@ def read_contents(path: Path, format: str | None) -> Contents:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn every failure of reading a file into one sentence that begins with its name."""
+def input_errors_for(path: Path) -> Iterator[None]:
+    """Turn every failure to read a file into an error of one sentence that begins with the file's name."""
     name = "standard input" if is_standard_input(path) else path
     try:
         yield
@@ -144,18 +148,18 @@ def reading(path: Path) -> Iterator[None]:
         raise InputError(f"{name}: the file cannot be read: {error.strerror or error}.") from None
     except UsageError:
         raise
-    # Damaged numbers can break a parser in ways that its own checks do not foresee; the user needs one sentence.
+    # Damaged numbers can break a parser in ways that its checks do not cover; the user still gets one sentence.
     except (ValueError, OverflowError, IndexError, KeyError, TypeError, RuntimeError) as error:
         raise InputError(f"{name}: the file is malformed ({error}).") from None
 
 
 def check_file(path: Path, extension: str) -> None:
-    """Refuse what is no file, is empty, or begins as a file of another kind.
+    """Refuse a path that is not a file, an empty file, or one that begins like a file of another kind.
 
     Raises
     ------
     InputError
-        With the sentence that says which.
+        With a sentence on what is wrong.
     """
     if not path.exists():
         raise InputError("there is no such file.")
@@ -169,46 +173,36 @@ def check_file(path: Path, extension: str) -> None:
         supported = ", ".join(suffix[1:] for suffix in readable())
         raise InputError(f"the extension {extension!r} is not supported; expected one of {supported}.")
     if extension not in READERS:
-        return  # how files of other packages' formats begin is not known
+        return  # the signatures of plugin formats are unknown
     kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
-    if kind == extension or {kind, extension} in SAME_BEGINNING or (kind == "ZIP archive" and extension in ZIPPED):
+    # LAS and LAZ have the same signature and reader; 3MF files are ZIP archives.
+    if kind == extension or {kind, extension} in ({".las", ".laz"}, {"ZIP archive", ".3mf"}):
         return
     if kind in READERS:
         raise InputError(f"the file holds {kind[1:].upper()} data; rename it or give its format as {kind[1:]!r}.")
     raise InputError(f"expected {extension[1:].upper()} data, but the file is a {kind} file.")
 
 
-_GZIP = b"\x1f\x8b"
-
-_SUFFIX = ".gz"
-
-
-# Where a scan's bytes come from: a file, a gzip-compressed one, or standard input, always as a file to be read.
-#
-# Readers seek, compare sizes and hand names to libraries, so what is no plain file is first copied into a temporary
-# one.
-
-
 def extension_of(path: Path) -> str:
-    """Return the extension that says how a file is read: the one before ``.gz`` where it ends so; in lower case."""
-    return Path(path.stem if path.suffix.lower() == _SUFFIX else path.name).suffix.lower()
+    """Return the extension that says how a file is read, in lower case; ``.gz`` is skipped."""
+    return Path(path.stem if path.suffix.lower() == ".gz" else path.name).suffix.lower()
 
 
 @contextmanager
-def plain_file(path: Path, extension: str) -> Iterator[Path]:
-    """Yield a file that holds what is to be read, neither compressed nor a stream.
+def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
+    """Yield a plain file with the data to read: the file itself, or a temporary copy of compressed data or a stream.
 
     Parameters
     ----------
     path : file to read; ``-`` for standard input
-    extension : how it is to be read, with the dot; a copy has it
+    extension : how it is to be read, with the dot; the copy has this extension
 
     Raises
     ------
     InputError
         When compressed data is damaged.
     UsageError
-        When standard input is a terminal, where nobody would be waiting for points to be typed.
+        When standard input is a terminal, so that no file is sent.
     """
     if not is_standard_input(path) and not _is_compressed(path):
         yield path
@@ -222,7 +216,7 @@ def _is_compressed(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return file.read(2) == _GZIP
+        return file.read(2) == b"\x1f\x8b"  # the magic number of gzip
 
 
 def _from_standard_input(copy: Path) -> Path:

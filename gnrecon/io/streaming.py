@@ -1,13 +1,14 @@
-"""Gathering a scan's chunks in bounded memory: beyond a number of points, the first one of each occupied cube stays.
+"""Reads large files by chunks, and thins the points in bounded memory by a voxel grid (`VoxelThinning`).
 
-Cubes begin so small that they hardly ever join two points. Whenever too many are occupied, their side is doubled: eight
-cubes become one, whose first point is the first of theirs. So the result is that of the final side alone: it depends
-neither on how the scan was cut into chunks nor on when the side was doubled. The points that stay are real ones.
+Beyond a number of points, only the first point in each occupied voxel is kept. Voxels start so small that they hardly
+ever hold two points. Whenever too many are occupied, their side is doubled: eight voxels become one, whose first point
+is the first of all eight. The result therefore depends on the final side only, not on how the scan was cut into chunks
+or when the side was doubled. The kept points are measured ones, never averages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,29 +16,24 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Region
-from gnrecon.io.contents import Contents, joined
+from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.format_registry import reader_of
-from gnrecon.io.formats.las import las_chunks, settled
+from gnrecon.io.formats.las import drop_unused_attributes, las_chunks
 from gnrecon.io.formats.ply import ply_chunks
 from gnrecon.io.formats.ptx import ptx_chunks
 from gnrecon.io.formats.xyz import xyz_chunks
-
-_REACH = 1 << 20
-"""Cubes from the first point in each direction: three such numbers fit into one key of 64 bits."""
-
-_DIGITS = 2.0**-40
-"""Least reach of the cubes as a share of the largest coordinate, so that a quotient of the two never overflows."""
+from gnrecon.io.io_parameters import IOParameters
 
 
-class Gatherer:
-    """Keeps at most `most` points of all that it is given in a region.
+class VoxelThinning:
+    """Keeps at most `most` of the points in a region that are added.
 
     Attributes
     ----------
-    seen : how many points it was given
-    cropped : how many of them lie outside of the region
-    non_finite : how many of them were dropped because a coordinate was not finite, while thinning
-    side : of the cubes, in file units; None while every point is kept
+    seen : number of points added
+    cropped : number of points dropped because they lie outside of the region
+    non_finite : number of points dropped because of a coordinate that is not finite, while thinning
+    side : of the voxels, in file units; None while every point is kept
     """
 
     def __init__(self, most: int, region: Region | None = None) -> None:
@@ -49,7 +45,7 @@ class Gatherer:
         self._first: Float | None = None
 
     def add(self, contents: Contents) -> None:
-        """Take a chunk, which holds no faces once there are more points than may be kept."""
+        """Add a chunk of points; faces are dropped once there are more points than may be kept."""
         self.seen += len(contents.points)
         if not self.region.everything:
             rows = np.flatnonzero(self.region.holds(contents.points))
@@ -59,47 +55,50 @@ class Gatherer:
         if self.side is not None or self.seen - self.cropped > self.most:
             self._thin()
 
-    def gathered(self) -> Contents:
-        """Return what is kept, in the order in which it came.
-
-        Cut off are only points: normals, attributes and origins of those that stay are kept.
-        """
-        return joined(self._pieces) if self._pieces else Contents(np.empty((0, 3)))
+    def result(self) -> Contents:
+        """Return the kept points with their normals, attributes and origins, in the order in which they came."""
+        return concatenated(self._pieces) if self._pieces else Contents(np.empty((0, 3)))
 
     def _thin(self) -> None:
-        kept = joined(self._pieces)
+        kept = concatenated(self._pieces)
         finite = np.isfinite(kept.points).all(axis=1)
         self.non_finite += int((~finite).sum())
         kept = _selected(kept, np.flatnonzero(finite)) if not finite.all() else kept
         if self.side is not None and len(kept.points):
-            kept = self._one_each(kept)
+            kept = self._first_in_each_voxel(kept)
         while len(kept.points) and (self.side is None or len(kept.points) > self.most):
             kept = self._coarser(kept)
         self._pieces = [replace(kept, faces=kept.faces[:0])]
 
     def _coarser(self, kept: Contents) -> Contents:
-        """Double the side, or choose the first one, and drop what shares a cube then."""
+        """Double the side, or choose the first one, and keep one point in each voxel."""
         if self.side is None:
             self._first, self.side = kept.points[0].copy(), 0.0
         else:
             self.side *= 2
-        return self._one_each(kept)
+        return self._first_in_each_voxel(kept)
 
-    def _one_each(self, kept: Contents) -> Contents:
-        keys = self._keys(kept.points)
+    def _first_in_each_voxel(self, kept: Contents) -> Contents:
+        keys = self._voxel_keys(kept.points)
+        # np.unique returns the first row of each key, and sorting the rows keeps the order of the points.
         _, rows = np.unique(keys, return_index=True)
         return kept if len(rows) == len(keys) else _selected(kept, np.sort(rows))
 
-    def _keys(self, points: Float) -> Int:
-        """The number of each point's cube, of shape (N,); doubles the side where the numbers are too large."""
+    def _voxel_keys(self, points: Float) -> Int:
+        """A key for each point's voxel, of shape (N,); the side grows where the grid would be too large for 64 bits."""
         assert self.side is not None
         assert self._first is not None
+        # Voxels from the first point in each direction: three numbers of 21 bits fit into one key.
+        reach_voxels = 1 << 20
+        # The grid reaches at least this share of the largest coordinate, so that a quotient of the two never overflows.
+        least_share = 2.0**-40
         # Sides are powers of two, so that dividing by them loses nothing.
-        reach = float(np.maximum(np.abs(points / 2 - self._first / 2), _DIGITS * np.abs(points)).max())
-        least = 2.0 ** np.floor(np.log2(max(reach, np.finfo(np.float64).tiny / _DIGITS)) + 2) / _REACH
+        reach = float(np.maximum(np.abs(points / 2 - self._first / 2), least_share * np.abs(points)).max())
+        least = 2.0 ** np.floor(np.log2(max(reach, np.finfo(np.float64).tiny / least_share)) + 2) / reach_voxels
         self.side = max(self.side, float(least))
         corner = np.floor(points / self.side - self._first / self.side)
-        x, y, z = corner.astype(np.int64).T + _REACH
+        # Numbers from 0 to 2^21 - 1, so that keys order and compare as one integer.
+        x, y, z = corner.astype(np.int64).T + reach_voxels
         keys: Int = (x << 42) | (y << 21) | z
         return keys
 
@@ -115,38 +114,41 @@ def _selected(contents: Contents, rows: Int) -> Contents:
     )
 
 
-LARGE = 1 << 24
-"""Size of a file in bytes from which it is read by chunks."""
-
-ROWS = 1 << 20
-"""Points in a chunk: their arrays take some ten megabytes, and libraries work at full speed."""
-
-CHUNKED: dict[str, Callable[[Path, int], Iterator[Contents]]] = {
-    ".las": las_chunks,
-    ".laz": las_chunks,
-    ".ptx": ptx_chunks,
-    ".ply": ply_chunks,
-    **dict.fromkeys((".xyz", ".pts", ".txt", ".csv"), xyz_chunks),
-}
-
-SETTLED: dict[str, Callable[[Contents], Contents]] = {".las": settled, ".laz": settled}
-"""What is done when all points of a file are known."""
-
-
-# Large files by chunks, where their format allows it: LAS, LAZ, PTX, binary PLY without faces, and tables in text.
-#
-# To add a format, write a function from a file and a number of rows to chunks, and a line in `CHUNKED`.
-
-
-def chunks(path: Path, extension: str) -> Iterator[Contents]:
-    """Yield the contents of a file by chunks; small files, and formats that have to be read as a whole, in one.
+def read_chunks(path: Path, extension: str, *, parameters: IOParameters = IOParameters()) -> Iterator[Contents]:
+    """Yield the contents of a file by chunks; small files, and formats that must be read as a whole, in one.
 
     Raises
     ------
     InputError
-        As the format's reader does; not before the first chunk is asked for.
+        As the format's reader does; not before the first chunk is requested.
     """
-    if extension in CHUNKED and path.stat().st_size >= LARGE:
-        yield from CHUNKED[extension](path, ROWS)
+    read_by_chunks = chunk_reader(extension)
+    if read_by_chunks is not None and path.stat().st_size >= parameters.chunked_file_bytes:
+        yield from read_by_chunks(path, parameters.chunk_points)
     elif read := reader_of(extension):
         yield read(path)
+
+
+def chunk_reader(extension: str) -> Callable[[Path, int], Iterator[Contents]] | None:
+    """Return a function that yields a file's contents by chunks of at most so many points; None where there is none.
+
+    Files of several formats can be read so: LAS, LAZ, PTX, binary PLY without faces, and tables in text.
+    """
+    match extension:
+        case ".las" | ".laz":
+            return las_chunks
+        case ".ptx":
+            return ptx_chunks
+        case ".ply":
+            return ply_chunks
+        case ".xyz" | ".pts" | ".txt" | ".csv":
+            return xyz_chunks
+    return None
+
+
+def drop_unused(contents: Contents, extensions: Iterable[str]) -> Contents:
+    """Return all contents of files of some formats without attributes that were never filled in.
+
+    A chunk of a LAS file cannot say which attributes are unused; only all of its points can.
+    """
+    return drop_unused_attributes(contents) if {".las", ".laz"} & set(extensions) else contents

@@ -1,4 +1,4 @@
-"""How long a run will take and how much memory it will need, by a model of measured runs.
+"""Estimates the time and memory of a run from a model that was fitted to measured runs.
 
 Processor seconds of one thread, measured for clouds of 500 to 35,000 points, three qualities and three resolutions:
 
@@ -6,10 +6,10 @@ Processor seconds of one thread, measured for clouds of 500 to 35,000 points, th
     mesh   50 s (cells / 256)^2 (0.51 + 0.49 features / 600)
     start  3 s, and 1 s for each 100,000 points that are read
 
-Two idle cores take half of the sum: 24 s were measured where the model says 34, at 2,009 points, 54 for 41 at 7,189,
-42 for 44 at 10,044 and 76 for 84 at 85,127. Shapes differ, so that an estimate is right to within a factor of about
-one and a half on such a machine. The peak of resident memory was 0.75 to 0.95 GB in the fit of one thread, and
-0.5 GB + 0.89 GB (cells / 512)^2 in the mesh; the points themselves are small beside that until there are millions.
+Two idle cores take half of the sum. Measured against estimated: 24 s against 34 at 2,009 points, 54 against 41 at
+7,189, 42 against 44 at 10,044, and 76 against 84 at 85,127. Shapes differ, so that an estimate is right to within a
+factor of about 1.5 on such a machine. The peak of resident memory was 0.75 to 0.95 GB in the fit with one thread, and
+0.5 GB + 0.89 GB (cells / 512)^2 in the mesh; the points themselves matter only from millions on.
 """
 
 from __future__ import annotations
@@ -19,21 +19,12 @@ from typing import Any
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.options import Options
-
-_FIT_SECONDS, _FIT_POINTS, _FIT_POWER = 6.8, 500, 0.545
-_MESH_SECONDS, _MESH_CELLS = 50.0, 256
-_FEATURES = 600
-_START_SECONDS, _POINTS_A_SECOND = 3.0, 100_000
-_CORES_SHARE = 0.5
-"""Of the processor seconds that pass on two idle cores; more of them help little."""
-
-_FIT_MB, _MESH_BASE_MB, _MESH_MB, _MESH_MEMORY_CELLS = 950, 505, 886, 512
-_BYTES_A_POINT = 600
+from gnrecon.report.report_parameters import CostModel
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a run is expected to take.
+    """Expected time and memory of a run.
 
     Parameters
     ----------
@@ -54,26 +45,31 @@ class Estimate:
         return f"It would take about {time} on two idle cores, and {self.memory_mb / 1000:.1f} GB of memory."
 
 
-def estimate(read: int, points: int, bounds: Float, options: Options) -> Estimate | None:
+def estimate(
+    read: int, points: int, bounds: Float, options: Options, *, model: CostModel = CostModel()
+) -> Estimate | None:
     """Return what a run is expected to take, or None where no such run was measured.
 
-    That is so for one network instead of global field and detail, on a GPU, and where the mesh's cells are not known
-    before (a greatest error). What is asked for besides, such as refinement or uncertainty, comes on top.
+    None is returned for one network instead of the default fit, for a GPU, and with ``max_error``, where the number of
+    cells is not known in advance. Refinement, uncertainty and regularisers take additional time.
 
     Parameters
     ----------
-    read, points : that were read, and that will be fitted
+    read, points : number of points that were read, and that will be fitted
     bounds : box of the field, of shape (2, 3), in file units
     options : Options
+    model : measured times and memory
     """
     fit = options.fit()
     if not fit.adaptive or not options.device.startswith("cpu") or options.max_error is not None:
         return None
-    cells, detail = options.mesh().cells(bounds), fit.features / _FEATURES
-    fitting = _FIT_SECONDS * (points / _FIT_POINTS) ** _FIT_POWER * (0.72 + 0.28 * detail**2)
-    meshing = _MESH_SECONDS * (cells / _MESH_CELLS) ** 2 * (0.51 + 0.49 * detail)
-    seconds = _CORES_SHARE * (_START_SECONDS + read / _POINTS_A_SECOND + fitting + meshing)
-    memory = max(_FIT_MB, _MESH_BASE_MB + _MESH_MB * (cells / _MESH_MEMORY_CELLS) ** 2) + read * _BYTES_A_POINT / 1e6
+    cells, detail = options.mesh().cells(bounds), fit.features / model.detail_features
+    starting = model.start_seconds + read / model.read_points_per_second
+    fitting = model.fit_seconds * (points / model.fit_points) ** model.fit_exponent * (0.72 + 0.28 * detail**2)
+    meshing = model.mesh_seconds * (cells / model.mesh_cells) ** 2 * (0.51 + 0.49 * detail)
+    seconds = model.two_core_share * (starting + fitting + meshing)
+    mesh_memory = model.mesh_memory_mb + model.mesh_cells_memory_mb * (cells / model.mesh_memory_cells) ** 2
+    memory = max(model.fit_memory_mb, mesh_memory) + read * model.read_point_bytes / 1e6
     return Estimate(round(seconds, 1), round(memory))
 
 

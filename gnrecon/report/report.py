@@ -1,6 +1,6 @@
-"""What a run says of itself: stages with their times and peak memory, its resources, and the versions that made it.
+"""Records the stages of a run with their times and peak memory, its resources, and the versions of the libraries.
 
-The JSON schema in this folder gives the meaning and unit of each number.
+`report.schema.json` in this folder, in JSON Schema 2020-12, gives the meaning and unit of each field of a report.
 """
 
 from __future__ import annotations
@@ -22,11 +22,9 @@ from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)
 
-_NAMED = ("numpy", "scipy", "torch", "open3d", "scikit-image", "manifold3d", "trimesh")
-
 
 class Stages:
-    """A record of stages, in order, and of what all of them together took.
+    """A record of stages, in order, and of the resources that all of them took.
 
     Parameters
     ----------
@@ -40,7 +38,7 @@ class Stages:
         self._sampled = False
         self._start, self._cpu_start = time.perf_counter(), time.process_time()
         if self._on_cuda:
-            torch.cuda.current_device()  # makes torch's context, without which there is nothing to reset
+            torch.cuda.current_device()  # creates torch's CUDA context, which the next line needs
             torch.cuda.reset_peak_memory_stats(device)
 
     @contextmanager
@@ -66,7 +64,7 @@ class Stages:
         return list(self._done)
 
     def resources(self) -> dict[str, Any]:
-        """Return what the run has taken until now, as plain values."""
+        """Return what the run has taken so far, as plain values."""
         cuda_peak = round(torch.cuda.max_memory_allocated(self._device) / 1e6, 1) if self._on_cuda else None
         return {
             "seconds": round(time.perf_counter() - self._start, 3),
@@ -81,7 +79,7 @@ class Stages:
 
 
 def plain(value: Any) -> Any:
-    """Return nested values as JSON can hold them: tuples as lists, and None for a number that is not finite."""
+    """Return nested values for JSON: tuples as lists, and None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -94,19 +92,13 @@ def plain(value: Any) -> Any:
 def versions() -> dict[str, str]:
     """Return the versions of gnrecon, Python and the libraries that shape the result."""
     found = {"gnrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
-    for name in _NAMED:
+    for name in ("numpy", "scipy", "torch", "open3d", "scikit-image", "manifold3d", "trimesh"):
         found[name] = metadata.version(name)
     return found
 
 
 SCHEMA_VERSION = "1.0"
-
-
-# The JSON schema of the report: what each field means, and in which unit.
-#
-# It is data of the package, `report.schema.json`, in the dialect of JSON Schema's draft 2020-12. Reports name the
-# version that they follow: the first number grows when a field goes or changes its meaning, the second when one is
-# added.
+"""Of the report: the first number grows when a field goes or changes its meaning, the second when one is added."""
 
 
 def schema_text() -> str:

@@ -1,4 +1,4 @@
-"""Starts a benchmark by its name; without a name, lists them."""
+"""Starts a benchmark by its name; without a name, lists the benchmarks."""
 
 from __future__ import annotations
 
@@ -12,32 +12,30 @@ from gnrecon.runtime.errors import ExitCode, GnreconError
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A module with a function ``main(arguments) -> exit code``, and what it measures, in a line."""
+    """A module with a function ``main(arguments) -> exit code``, and a line about what it measures."""
 
     module: str
     description: str
 
 
 BENCHMARKS = {
-    "paper": Benchmark("benchmarks.paper", "the paper's two shapes, gnrecon beside screened Poisson"),
-    "accuracy": Benchmark("benchmarks.accuracy.main", "gnrecon beside its peers on clean, noisy and sparse scans"),
-    "uncertainty": Benchmark("benchmarks.uncertainty.main", "sigma beside the true error, on known shapes"),
-    "engine": Benchmark("benchmarks.engine.main", "Gauss-Newton beside the paper's algorithm written plainly"),
-    "learn": Benchmark("benchmarks.learn.main", "shape learning by three optimisers, and one step's time"),
-    "transport": Benchmark("benchmarks.transport", "what the paper's neglected terms of moving surfaces change"),
-    "blocks": Benchmark(
-        "benchmarks.blocks.main", "scans of up to two million points, fitted by blocks: cost and seams"
-    ),
-    "ingest": Benchmark("benchmarks.ingest.main", "reading of 20 million points, in every format that is streamed"),
-    "orient": Benchmark("benchmarks.orient.main", "estimated normals, and their meshes, beside open3d's"),
-    "refine": Benchmark("benchmarks.refine.main", "remeshing and fewer faces, beside the libraries' own"),
-    "batch": Benchmark("benchmarks.batch.main", "many scans, some broken, killed and continued; and throughput"),
-    "export": Benchmark("benchmarks.export.main", "extraction at growing resolutions, beside the whole grid"),
+    "paper": Benchmark("accuracy.paper_shapes", "the paper's two shapes, gnrecon compared with screened Poisson"),
+    "accuracy": Benchmark("accuracy.many_scans", "gnrecon compared with its peers on clean, noisy and sparse scans"),
+    "uncertainty": Benchmark("uncertainty", "sigma compared with the true error, on known shapes"),
+    "engine": Benchmark("engine.measurements", "Gauss-Newton compared with a plain version of the paper's algorithm"),
+    "learn": Benchmark("shape_learning", "shape learning by three optimisers, and one step's time"),
+    "transport": Benchmark("transport_terms", "the effect of the terms of moving surfaces that the paper neglects"),
+    "blocks": Benchmark("scaling", "scans of up to two million points, fitted by blocks: cost and seams"),
+    "ingest": Benchmark("streamed_reading", "reading of 20 million points, in every format that is streamed"),
+    "orient": Benchmark("accuracy.orientation", "estimated normals, and their meshes, compared with open3d's"),
+    "refine": Benchmark("remeshing", "remeshing and decimation, compared with pymeshlab and manifold3d"),
+    "batch": Benchmark("batch_recovery", "many scans, some broken, killed and continued; and throughput"),
+    "export": Benchmark("extraction", "extraction at growing resolutions, compared with the whole grid"),
 }
 
 
 def listing() -> str:
-    """Return the benchmarks, one a line."""
+    """Return the benchmarks, one per line."""
     width = max(len(name) for name in BENCHMARKS)
     lines = [f"  {name:{width}}  {benchmark.description}" for name, benchmark in BENCHMARKS.items()]
     return "\n".join(["usage: bench NAME [options]     (bench NAME --help shows the options)", "", *lines])
@@ -53,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
         print(f"bench: there is no benchmark {name!r}; expected one of {', '.join(BENCHMARKS)}.", file=sys.stderr)
         return ExitCode.USAGE
     try:
-        return int(import_module(BENCHMARKS[name].module).main(rest))
+        return int(import_module(f"benchmarks.{BENCHMARKS[name].module}").main(rest))
     except GnreconError as error:
         print(f"bench: {error}", file=sys.stderr)
         return error.exit_code

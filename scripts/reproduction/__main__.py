@@ -1,7 +1,7 @@
-"""Runs the paper's experiments that are not finished yet, then draws all figures and writes the table.
+"""Runs the paper's experiments that are not finished, then draws all figures and writes the table.
 
 ``./scripts/reproduce [--data FOLDER] [--budget SECONDS] [--only PROBLEM ...] -o FOLDER``. Each problem is learned by
-Gauss-Newton, L-BFGS and Adam for the budget. What is finished stays: a second call goes on where the first one ended.
+Gauss-Newton, L-BFGS and Adam for the budget. Finished experiments are kept: a second call continues the first.
 """
 
 from __future__ import annotations
@@ -11,18 +11,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.engine.plot import require_matplotlib
+from benchmarks.harness.command_line import require_matplotlib
 
 from gnrecon.cli.learn_problem import LearnOptions
 from gnrecon.runtime.errors import ExitCode, GnreconError
 from gnrecon.runtime.files import write_text
-from reproduction.experiments import PROBLEMS, Experiment, experiments, interrupted
+from reproduction.experiments import PROBLEMS, Experiment, as_csv, as_markdown, experiments, interrupted
 from reproduction.figures import draw_convergence, draw_surfaces
-from reproduction.table import as_csv, as_markdown
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Reproduce what the arguments name; return the exit code."""
+    """Run the experiments that the arguments name; return the exit code."""
     chosen = _parser().parse_args(arguments)
     chosen.output.mkdir(parents=True, exist_ok=True)
     done: list[Experiment] = []
@@ -55,9 +54,7 @@ def _draw(done: Sequence[Experiment], folder: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="reproduce", description=__doc__)
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="for everything that is made"
-    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="for all results")
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="of bun_zipper.ply and rocker-arm.off")
     parser.add_argument("--budget", type=float, default=600.0, metavar="SECONDS", help="of each run; by default 600")
     parser.add_argument("--steps", type=int, help="most steps of each run")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from benchmarks.sheet import PANEL, Row, draw_row, write_sheet
+from benchmarks.harness.contact_sheet import Row, draw_row, write_sheet
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh
@@ -16,20 +16,11 @@ from gnrecon.rendering import render
 from reproduction.experiments import Experiment
 
 NAMES = {"gn": "Gauss-Newton", "lbfgs": "L-BFGS", "adam": "Adam"}
-CURVATURES = {"cone": "gauss_curvature"}
-"""Of which curvature a surface is coloured; of the others it is the mean one."""
-
-SHOWN = 98.0
-"""Percentile of the absolute curvature at which the colours end."""
-
-VIEW = (35.0, 25.0)
 UP = {"bunny": "y", "bunny-sparse": "y", "rockerarm": "y"}
-"""Azimuth and elevation of the pictures, and the upward axis where it is not z."""
-
-SIZES = (700, 560), PANEL
-"""Width and height of a surface's own picture and of its panel in that of all, in pixels."""
+"""Upward axis of the pictures where it is not z."""
 
 LOW, MIDDLE, HIGH = (33, 102, 172), (247, 247, 247), (178, 24, 43)
+"""sRGB colours of the curvature scale: a diverging scale of blue, white and red (ColorBrewer RdBu)."""
 
 
 def draw_convergence(done: Sequence[Experiment], path: Path) -> None:
@@ -60,25 +51,40 @@ def _curve(axes: Any, figures: dict[str, Any], quantity: str, label: str) -> Non
     axes.grid(alpha=0.3)
 
 
-def draw_surfaces(done: Sequence[Experiment], folder: Path) -> None:
+def draw_surfaces(
+    done: Sequence[Experiment],
+    folder: Path,
+    *,
+    size: tuple[int, int] = (700, 560),
+    panel: tuple[int, int] = (460, 400),
+    view: tuple[float, float] = (35.0, 25.0),
+    percentile: float = 98.0,
+) -> None:
     """Write a PNG file of each learned surface, coloured by its curvature, and ``surfaces.png`` of all of them.
 
-    Blue is below zero, red above. The colours of one problem's surfaces end at the same curvature, the median of what
-    each would end at by itself, so that they can be compared.
+    Blue is below zero, red above. Each surface's colours would end at a percentile of its absolute curvature; to be
+    comparable, all surfaces of one problem end at the median of these. The curvature is Gauss's for the cone, and the
+    mean curvature elsewhere.
+
+    Parameters
+    ----------
+    size, panel : width and height of a surface's own picture and of its panel in ``surfaces.png``, in pixels
+    view : azimuth and elevation in degrees
+    percentile : of the absolute curvature, for the end of the colours
     """
     rows = []
     for problem in dict.fromkeys(one.problem for one in done):
         runs = [one for one in done if one.problem == problem]
         meshes = [read_mesh(one.mesh) for one in runs]
-        curvature = CURVATURES.get(problem, "mean_curvature")
+        curvature = "gauss_curvature" if problem == "cone" else "mean_curvature"
         values = [np.asarray(mesh.attributes[curvature], dtype=np.float64) for mesh in meshes]
-        most = float(np.median([np.nanpercentile(np.abs(value), SHOWN) for value in values]))
+        most = float(np.median([np.nanpercentile(np.abs(value), percentile) for value in values]))
         shown = [coloured(mesh, value, most) for mesh, value in zip(meshes, values, strict=True)]
         for one, mesh in zip(runs, shown, strict=True):
-            render(mesh, one.mesh.with_suffix(".png"), size=SIZES[0], views=[VIEW], up=UP.get(problem, "z"))
+            render(mesh, one.mesh.with_suffix(".png"), size=size, views=[view], up=UP.get(problem, "z"))
         titles = [f"{problem}, {NAMES[one.optimiser]}" for one in runs]
         titles[0] += f"; full colour at {most:.0e}"
-        rows.append(draw_row(Row(dict(zip(titles, shown, strict=True)), UP.get(problem, "z"), VIEW), SIZES[1]))
+        rows.append(draw_row(Row(dict(zip(titles, shown, strict=True)), UP.get(problem, "z"), view), panel))
     write_sheet(rows, folder / "surfaces.png")
 
 

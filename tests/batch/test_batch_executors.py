@@ -1,4 +1,4 @@
-"""The batch on a Dask cluster: a worker that is killed costs nothing, and nothing is done twice."""
+"""How jobs are run: as many at a time as a machine takes, and on a Dask cluster that may lose a worker."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ import psutil
 import pytest
 from fake_work import job, notes
 
-from gnrecon.batch.executors import FileRemoved, run_on_cluster
-from gnrecon.batch.job import JobOutcome, Status, running_folder
+from gnrecon.batch import executors
+from gnrecon.batch.executors import FileRemoved, fitting_jobs, run_on_cluster
+from gnrecon.batch.job import Job, JobOutcome, Limits, Status, running_folder
+from gnrecon.options import Options
 from gnrecon.runtime.dask_scheduler import dask_client
 from gnrecon.runtime.errors import UsageError
 
@@ -87,3 +89,26 @@ def test_a_sign_that_is_late_is_no_end(tmp_path: Path) -> None:
     assert not stop.is_set()
     (tmp_path / "sign").unlink()
     assert stop.is_set()
+
+
+def a_job(folder: Path, limit: float | None = None, **options: object) -> Job:
+    values = Options.of(**{"threads": 1, **options}).as_dict()
+    return fake_work.job(folder, "scan", "good", Limits(memory_mb=limit), options=values)
+
+
+def test_as_many_jobs_as_cores_and_memory_allow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "available_cores", lambda: 8)
+    monkeypatch.setattr(executors, "available_memory_mb", lambda: 100_000.0)
+    assert fitting_jobs([a_job(tmp_path)] * 20, threads=1) == 8
+    assert fitting_jobs([a_job(tmp_path)] * 20, threads=3) == 2
+    assert fitting_jobs([a_job(tmp_path)] * 20, threads=16) == 1
+    assert fitting_jobs([a_job(tmp_path)] * 3, threads=1) == 3
+    assert fitting_jobs([a_job(tmp_path, limit=30_000.0)] * 20, threads=1) == 3
+    assert fitting_jobs([a_job(tmp_path), a_job(tmp_path, resolution=2048)] * 20, threads=1) == 6
+    monkeypatch.setattr(executors, "available_memory_mb", lambda: 100.0)
+    assert fitting_jobs([a_job(tmp_path)] * 20, threads=1) == 1
+
+
+def test_what_this_machine_has_is_positive() -> None:
+    assert executors.available_cores() >= 1
+    assert executors.available_memory_mb() > 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gnrecon.batch.job import Limits
-from gnrecon.batch.plan import plan
+from gnrecon.batch.plan import parse_megabytes, parse_seconds, plan
 from gnrecon.batch.request import Request
 from gnrecon.config import Settings, read_settings
 from gnrecon.runtime.errors import InputError, UsageError
@@ -80,3 +80,21 @@ def test_each_scan_has_a_work_folder_of_its_own(request_of: Request) -> None:
 
 def _with(request: Request, **values: object) -> Request:
     return replace(request, **values)  # type: ignore[arg-type]
+
+
+def test_times() -> None:
+    times = {"90": 90.0, "30s": 30.0, " 1.5 m ": 90.0, "2h": 7200.0, ".5d": 43200.0, "10MIN": 600.0}
+    for text, seconds in times.items():
+        assert parse_seconds(text) == seconds
+    for text in ("", "-3", "0", "soon", "3 weeks", "nan", "1e3"):
+        with pytest.raises(UsageError, match="is not a time such as"):
+            parse_seconds(text)
+
+
+def test_amounts_of_memory() -> None:
+    amounts = {"800MB": 800.0, "4 gb": 4000.0, "1GiB": 1073.741824, "512MiB": 536.870912}
+    for text, megabytes in amounts.items():
+        assert parse_megabytes(text) == pytest.approx(megabytes)
+    for text in ("", "4", "0GB", "-1GB", "4 apples"):
+        with pytest.raises(UsageError, match="is not an amount of memory such as"):
+            parse_megabytes(text)

@@ -24,7 +24,7 @@ from gnrecon.batch import executors, runner
 from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import JobOutcome, progress_file, running_folder
 from gnrecon.batch.request import Request
-from gnrecon.batch.runner import run_batch
+from gnrecon.batch.runner import locked_output_folder, run_batch
 from gnrecon.cli.app import main
 from gnrecon.config import Settings, read_settings
 from gnrecon.export import verify_file
@@ -284,3 +284,18 @@ def test_a_missing_folder_has_its_exit_code(tmp_path: Path, capfd: pytest.Captur
     assert command("batch", tmp_path / "missing", "-o", tmp_path / "meshes") == ExitCode.INPUT
     assert capfd.readouterr() == ("", f"gnrecon: There is no file or folder {tmp_path / 'missing'}.\n")
     assert not (tmp_path / "meshes").exists()
+
+
+def test_one_batch_at_a_time_works_in_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    with (
+        locked_output_folder(folder),
+        pytest.raises(UsageError, match="Another batch is running in"),
+        locked_output_folder(folder),
+    ):
+        pass
+    with locked_output_folder(folder):
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot be created"), locked_output_folder(tmp_path / "file"):
+        pass

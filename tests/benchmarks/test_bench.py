@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-from rich.console import Console
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.__main__ import main as bench
-from benchmarks.arrays import save_mesh, save_scan
-from benchmarks.cases import CASES, ROCKER_ARM, draw, load
-from benchmarks.comparison import Protocol, summarise
-from benchmarks.paper import main as paper
-from benchmarks.table import FIGURES, comparison_table, failures
-from benchmarks.trial import Job, run_trial
+from benchmarks.accuracy.comparison import Protocol
+from benchmarks.accuracy.paper_shapes import FIGURES, comparison_table, failures, summarise
+from benchmarks.accuracy.paper_shapes import main as paper
+from benchmarks.accuracy.problem import save_mesh, save_scan
+from benchmarks.accuracy.scans import PAPER_SCANS, ROCKER_ARM, draw_vertices, load_shape
+from benchmarks.accuracy.trial import Job, run_trial
+from PIL import Image
+from rich.console import Console
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
@@ -107,10 +103,10 @@ def test_wrong_options_are_refused(wrong: list[str], capsys: pytest.CaptureFixtu
 
 
 def test_scans_are_seeded_vertices_with_outward_normals_in_the_unit_frame(data: Path) -> None:
-    truth = load(ROCKER_ARM, data)
+    truth = load_shape(ROCKER_ARM, data)
     assert np.allclose(truth.vertices.mean(axis=0), 0, atol=1e-6)
     assert np.isclose(np.linalg.norm(truth.vertices, axis=1).max(), 1)
-    points, normals = draw(truth, 0.2, seed=5)
+    points, normals = draw_vertices(truth, 0.2, seed=5)
     assert len(points) == 420
     assert len(np.unique(points, axis=0)) == 420
     # On a torus, the normal leads from the nearest point of the middle circle to the point.
@@ -118,15 +114,15 @@ def test_scans_are_seeded_vertices_with_outward_normals_in_the_unit_frame(data: 
     middle = radius * points * [1, 1, 0] / np.hypot(points[:, 0], points[:, 1])[:, None]
     outward = (points - middle) / np.linalg.norm(points - middle, axis=1, keepdims=True)
     assert np.einsum("ij,ij->i", normals, outward).min() > 0.999
-    assert np.array_equal(points, draw(truth, 0.2, seed=5)[0])
-    assert not np.array_equal(points, draw(truth, 0.2, seed=6)[0])
+    assert np.array_equal(points, draw_vertices(truth, 0.2, seed=5)[0])
+    assert not np.array_equal(points, draw_vertices(truth, 0.2, seed=6)[0])
 
 
 def test_vertices_without_faces_count_but_are_never_chosen() -> None:
     whole = torus()
     loose = Mesh(np.concatenate([whole.vertices, np.zeros((900, 3))]), whole.faces)
-    assert len(draw(loose, 0.2, seed=0)[0]) == 600
-    points, normals = draw(loose, 1.0, seed=0)
+    assert len(draw_vertices(loose, 0.2, seed=0)[0]) == 600
+    points, normals = draw_vertices(loose, 1.0, seed=0)
     assert np.array_equal(points, whole.vertices)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1)
 
@@ -134,7 +130,7 @@ def test_vertices_without_faces_count_but_are_never_chosen() -> None:
 def test_the_papers_counts() -> None:
     counts = {"rockerarm-20": (10_044, 2_009), "rockerarm-5": (10_044, 502), "bunny-20": (35_947, 7_189)}
     for name, (vertices, points) in counts.items():
-        assert round(CASES[name].fraction * vertices) == points
+        assert round(PAPER_SCANS[name].fraction * vertices) == points
 
 
 def test_summary_takes_medians_over_seeds_and_poissons_best_depth() -> None:
@@ -170,7 +166,7 @@ def test_a_failure_stands_in_the_table_and_spoils_only_its_setting() -> None:
 def test_a_trial_that_fails_gives_the_sentence(tmp_path: Path) -> None:
     mesh = torus()
     save_mesh(mesh, tmp_path / "truth.npz")
-    save_scan(*draw(mesh, 0.1, seed=0), tmp_path / "scan.npz")
+    save_scan(*draw_vertices(mesh, 0.1, seed=0), tmp_path / "scan.npz")
     files = str(tmp_path / "scan.npz"), str(tmp_path / "truth.npz")
     result = run_trial(Job("gnrecon", *files, threads=1, samples=10, settings={"width": 3}), tmp_path / "trial")
     assert list(result) == ["error"]

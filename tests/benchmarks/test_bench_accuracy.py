@@ -3,39 +3,28 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.__main__ import main as bench
+from benchmarks.accuracy.analytic_solids import SOLIDS
+from benchmarks.accuracy.cases import CASES, GROUPS, HARD, chosen_cases
+from benchmarks.accuracy.comparison import Protocol
+from benchmarks.accuracy.many_scans import main
+from benchmarks.accuracy.methods import METHODS, OURS, PEERS, oriented
+from benchmarks.accuracy.problem import Problem, load_scan, load_truth, save_mesh, save_scan, save_truth
+from benchmarks.accuracy.scans import AnalyticScan, tilted, unit
+from benchmarks.accuracy.summary import Standing, accuracy_table, best_peer, failures, standing, summarise
+from benchmarks.accuracy.trial import Job, between_samples, run_trial
+from benchmarks.harness.measurement import run_isolated
 from PIL import Image
 from rich.console import Console
 
-from gnrecon.geometry.arrays import Float
-
-# The benchmarks are scripts beside the package, as ./scripts/bench puts them on the path.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from benchmarks.__main__ import main as bench
-from benchmarks.accuracy.cases import CASES, GROUPS, HARD
-from benchmarks.accuracy.main import main
-from benchmarks.accuracy.scans import AnalyticScan, tilted, unit
-from benchmarks.accuracy.solids import SOLIDS
-from benchmarks.accuracy.summary import Standing, best_peer, standing, summarise
-from benchmarks.accuracy.table import accuracy_table, failures
-from benchmarks.alone import run_program
-from benchmarks.arrays import load_scan, load_truth, save_mesh, save_scan, save_truth
-from benchmarks.comparison import Protocol
-from benchmarks.groups import chosen_cases
-from benchmarks.methods import METHODS, OURS, PEERS
-from benchmarks.peers import oriented
-from benchmarks.problem import Problem
-from benchmarks.samples_apart import between_samples
-from benchmarks.trial import Job, run_trial
-
 from gnrecon.export import require_sound, verify
 from gnrecon.export.metrics import Surface
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import UsageError
@@ -171,8 +160,8 @@ def test_the_files_truths_have_their_genus_and_bare_scans_no_normals(shared_data
     assert bare.scan.normals is None
     assert given.scan.normals is not None
     assert isinstance(given.truth, PointCloud)
-    assert (given.radius, given.factor, given.samples_apart) == (None, 1.0, 0)
-    assert CASES["anchor"].problem(shared_data, 0).samples_apart == 1_000_000
+    assert (given.radius, given.factor, given.surface_samples) == (None, 1.0, 0)
+    assert CASES["anchor"].problem(shared_data, 0).surface_samples == 1_000_000
 
 
 @pytest.mark.parametrize("name", PEERS)
@@ -233,7 +222,7 @@ def test_an_empty_mesh_and_a_run_without_end_are_sentences(tmp_path: Path) -> No
     save_mesh(tetrahedron(), tmp_path / "t.npz")
     job = Job("ball pivoting", str(tmp_path / "s.npz"), str(tmp_path / "t.npz"), threads=1, samples=10)
     assert run_trial(job, tmp_path / "trial") == {"error": "The mesh is empty."}
-    late = run_program("benchmarks.trial", {}, 1, tmp_path / "late", limit=0.01)
+    late = run_isolated("benchmarks.accuracy.trial:measure_trial", {}, tmp_path / "late", limit_seconds=0.01)
     assert late == {"error": "It had not ended after 0.01 seconds."}
 
 

@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 from benchmarks.__main__ import main as bench
-from benchmarks.batch import scans
-from benchmarks.batch.main import sound, table
-from benchmarks.batch.scans import BROKEN, CONFIG, make_scans
-from benchmarks.batch.witness import Witness
+from benchmarks.batch_accidents import BROKEN, CONFIG, BatchWatcher, make_scans
+from benchmarks.batch_recovery import sound, table
 
 from gnrecon.batch.job import progress_file, running_folder
 from gnrecon.batch.scan_search import ScanSearch, find_scans
@@ -24,12 +22,11 @@ GOOD = {"exit_code": 8, "meshes": 4, "causes": BROKEN, "twice": [], "same_bytes"
 SPEED = {"scans": 4, "ratio": 2.0, "cpu_ratio": 3.0, "overhead_seconds": 0.1}
 
 
-def test_its_scans_are_good_and_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scans, "HOG_POINTS", 1000)
-    good = make_scans(tmp_path / "scans", 4)
+def test_its_scans_are_good_and_broken(tmp_path: Path) -> None:
+    good = make_scans(tmp_path / "scans", 4, points=350, hog_points=1000)
     found = {path.scan.stem: path.scan for path in find_scans([str(tmp_path / "scans")], [], ScanSearch())}
     assert set(found) == {*good, *BROKEN}
-    assert {len(read_cloud(found[name])) for name in good} == {scans.POINTS}
+    assert {len(read_cloud(found[name])) for name in good} == {350}
     assert len({found[name].read_bytes() for name in good}) == len(good)
     for name in ("torn", "void", "letter"):
         with pytest.raises(InputError):
@@ -44,21 +41,21 @@ def test_its_configuration_is_one(tmp_path: Path) -> None:
     assert settings.of(Path("hangs.ply"))["timeout"] == "20s"
 
 
-def test_its_witness_sees_records_and_brings_accidents(tmp_path: Path) -> None:
+def test_its_watcher_sees_records_and_brings_accidents(tmp_path: Path) -> None:
     records, folder = tmp_path / ".gnrecon" / "records", running_folder(tmp_path) / "killed-x1"
     records.mkdir(parents=True)
     folder.mkdir(parents=True)
-    with Witness(tmp_path) as witness:
+    with BatchWatcher(tmp_path) as watcher:
         victim = subprocess.Popen(["sleep", "60"])
         for name in ("once", "twice"):
             (records / f"{name}.json").touch()
-        witness.look()
+        watcher.look()
         (records / "twice.json").write_text("again")
-        witness.look()
+        watcher.look()
         progress_file(folder).write_text(json.dumps({"pid": victim.pid}))
         assert victim.wait(30) == -signal.SIGSEGV
-    assert witness.finished() == ["once", "twice"]
-    assert witness.twice() == ["twice"]
+    assert watcher.finished() == ["once", "twice"]
+    assert watcher.twice() == ["twice"]
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from benchmarks.blocks.main import main as blocks
-from benchmarks.blocks.scan import Ball
+from benchmarks.scaling import main as blocks
+from benchmarks.scaling_run import Ball
 
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
 

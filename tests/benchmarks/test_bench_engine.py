@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -12,27 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from benchmarks.engine.cost_growth import OPERATIONS, CostSettings, exponent, measure_cost, width_for
+from benchmarks.engine.large_steps import KernelSetting, MillionSetting, explicit_step, measure_million, our_step
+from benchmarks.engine.measurements import MEASUREMENTS, NEEDS_DATA, Plan, merged
+from benchmarks.engine.measurements import main as engine
+from benchmarks.engine.our_fit import OnRecord, our_fit, solved_start, weights_at
+from benchmarks.engine.paper_loss import Sample, data_loss, eikonal_error, posed, sphere
+from benchmarks.engine.plain_baseline import Baseline, pretrained
+from benchmarks.engine.presentation import draw, tables
+from benchmarks.engine.step_time import Frozen, dense_steps, freeze, measure_solvers, measure_step
+from benchmarks.engine.time_to_loss import Goal, History, compare, measure_quality, run_baseline, run_ours
+from benchmarks.harness.measurement import Clock, run_isolated
+from PIL import Image
 from rich.console import Console
 from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from benchmarks.engine import kernel, million, ours
-from benchmarks.engine.baseline import DAMPING, Baseline, pretrained
-from benchmarks.engine.clock import Clock
-from benchmarks.engine.cost import OPERATIONS, WIDTHS, exponent, measure_cost, width_for
-from benchmarks.engine.loss import Sample, data_loss, eikonal_error, posed
-from benchmarks.engine.main import main as engine
-from benchmarks.engine.measurements import MEASUREMENTS, NEEDS_DATA, Plan, merged
-from benchmarks.engine.plot import draw
-from benchmarks.engine.process import run_alone
-from benchmarks.engine.quality import Goal, History, compare, measure_quality, run_baseline, run_ours
-from benchmarks.engine.scans import sphere
-from benchmarks.engine.solvers import dense_steps, measure_solvers
-from benchmarks.engine.start import solved_start
-from benchmarks.engine.step import Frozen, freeze, measure_step
-from benchmarks.engine.tables import tables
-from PIL import Image
 
 from gnrecon.field import Siren
 from gnrecon.least_squares import SOLVERS, Cholesky, identity
@@ -42,11 +34,9 @@ NET = (8, 8)
 GOAL = Goal("rockerarm-100", 1e-2, 1e-3)
 SMALL = partial(
     Plan,
-    kernel=kernel.Setting((8, 8), points=30, volume=20),
-    million=million.Setting((8, 8), points=60, volume=20, damping=10.0, keep_bytes=0),
-    points=(100, 300),
-    parameters=(100, 300),
-    matmul=64,
+    kernel=KernelSetting((8, 8), points=30, volume=20),
+    million=MillionSetting((8, 8), points=60, volume=20, damping=10.0, keep_bytes=0),
+    cost=CostSettings((100, 300), (100, 300), fixed_points=50, matmul=64),
     our_seconds=0.2,
     cost_seconds=5.0,
 )
@@ -85,7 +75,7 @@ def test_the_baselines_jacobian_is_ours(sample: Sample, chunk: int | None) -> No
 
 def test_the_baselines_direction_is_the_dense_step(sample: Sample) -> None:
     theta = random_theta(1)
-    exact = Cholesky().linearise(*posed(Siren(NET), theta, sample).linearise(theta), identity).solve(DAMPING)
+    exact = Cholesky().linearise(*posed(Siren(NET), theta, sample).linearise(theta), identity).solve(Baseline.damping)
     torch.testing.assert_close(-Baseline(NET, sample).direction(theta), exact.direction, rtol=1e-5, atol=1e-7)
 
 
@@ -166,7 +156,7 @@ def test_our_run_ends_at_the_last_loss_and_its_losses_are_of_all_points(sample: 
     losses = [data_loss(Siren(NET), theta, sample) for theta in thetas]
     least = int(np.argmin(losses))
 
-    def fit(points: Tensor, normals: Tensor, seconds: float, on_record: ours.OnRecord) -> None:
+    def fit(points: Tensor, normals: Tensor, seconds: float, on_record: OnRecord) -> None:
         del points, normals, seconds
         for number, theta in enumerate(thetas):
             on_record(float(number), theta)
@@ -175,7 +165,9 @@ def test_our_run_ends_at_the_last_loss_and_its_losses_are_of_all_points(sample: 
 
 
 def test_our_fit_lowers_the_loss(sample: Sample) -> None:
-    result = measure_quality(GOAL, sample, ours.WIDTHS, ours.ours, pretrained(ours.WIDTHS, 1), (1.0, 1e-6))
+    result = measure_quality(
+        GOAL, sample, (32, 32, 32), partial(our_fit, widths=(32, 32, 32)), pretrained((32, 32, 32), 1), (1.0, 1e-6)
+    )
     assert result["ours"]["losses"][-1] < 0.5 * result["ours"]["losses"][0]
     assert result["ours"]["seconds"] == sorted(result["ours"]["seconds"])
     assert result["is_lower_bound"]
@@ -183,7 +175,7 @@ def test_our_fit_lowers_the_loss(sample: Sample) -> None:
 
 
 def test_the_eikonal_weight_falls_to_its_least_and_the_datas_do_not() -> None:
-    weights = [ours.weights_at(number) for number in range(1, 60)]
+    weights = [weights_at(number) for number in range(1, 60)]
     assert {of_data for of_data, _, _ in weights} == {of_normals for _, of_normals, _ in weights} == {1.0}
     of_volume = [volume for _, _, volume in weights]
     assert of_volume[0] < 1e-2
@@ -205,26 +197,26 @@ def test_a_clock_does_not_count_its_pauses() -> None:
 
 
 def test_both_kernel_forms_make_the_same_step() -> None:
-    problem = kernel.Setting((8, 8), points=30, volume=20).problem()
+    problem = KernelSetting((8, 8), points=30, volume=20).problem()
     exact = Cholesky().linearise(*problem.linearise(problem.free()), identity).solve(1e-3).direction
-    for form in (kernel.explicit_step, kernel.our_step):
+    for form in (explicit_step, our_step):
         torch.testing.assert_close(form(problem, 1e-3), exact, rtol=1e-6, atol=1e-9)
 
 
 def test_the_large_step_lowers_the_loss_in_memory_of_its_own(tmp_path: Path) -> None:
     held = np.ones(60_000_000)
-    setting = million.Setting((8, 8), points=60, volume=20, damping=10.0, keep_bytes=0)
-    result = million.measure_million(setting, tmp_path)
+    setting = MillionSetting((8, 8), points=60, volume=20, damping=10.0, keep_bytes=0)
+    result = measure_million(setting, tmp_path)
     assert result["losses"][1] < result["losses"][0]
     assert result["rows"] == 140
     assert 0 < result["libraries_memory_mb"] <= result["peak_memory_mb"]
     assert result["peak_memory_mb"] - result["libraries_memory_mb"] < held.nbytes / 1e6
     assert result["within_8_gb"] == (result["peak_memory_mb"] <= 8000)
-    assert million.Setting().rows == 200_000
+    assert MillionSetting().rows == 200_000
 
 
 def test_a_failed_process_is_a_sentence(tmp_path: Path) -> None:
-    assert "no_such" in run_alone("benchmarks.engine.kernel", "no_such", tmp_path / "a")["error"]
+    assert "no_such" in run_isolated("benchmarks.engine.large_steps:no_such", {}, tmp_path / "a")["error"]
 
 
 @pytest.mark.parametrize(("target", "tolerance"), [(1000, 0.1), (31_623, 0.02), (1_000_000, 0.01)])
@@ -238,18 +230,18 @@ def test_an_exponent_is_a_slope_of_what_took_long_enough() -> None:
     assert exponent([1, 10], [1e-9, 0.1]) is None
 
 
-def test_growth_has_every_size_and_ends_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.engine.cost.FIXED_POINTS", 50)
-    cost = measure_cost(30.0, (100, 200), (100, 300), matmul=64)
+def test_growth_has_every_size_and_ends_with_its_time() -> None:
+    settings = CostSettings((100, 200), (100, 300), fixed_points=50, matmul=64)
+    cost = measure_cost(30.0, settings)
     for series in (cost["by_points"], cost["by_parameters"]):
         assert series.keys() == OPERATIONS.keys()
         assert all(len(growth["measured"]) == 2 for growth in series.values())
     entry = cost["by_points"]["gram"]["measured"][0]
     flops = entry["rows"] * entry["parameters"] * (entry["parameters"] + 1)
-    assert (entry["rows"], entry["parameters"]) == (250, Siren(WIDTHS).layout.count)
+    assert (entry["rows"], entry["parameters"]) == (250, Siren(settings.widths).layout.count)
     rate = 1e9 * cost["matmul_gflops"]
     assert entry["share_of_matmul"] == pytest.approx(flops / entry["operation_seconds"] / rate)
-    assert not measure_cost(0.0, (100,), (), matmul=64)["by_points"]["gram"]["measured"]
+    assert not measure_cost(0.0, CostSettings((100,), (), matmul=64))["by_points"]["gram"]["measured"]
 
 
 def test_every_solver_is_compared_with_the_dense_step(frozen: Frozen) -> None:
@@ -266,10 +258,7 @@ def test_reports_are_merged_in_depth() -> None:
     assert merged({"a": {"x": 1}, "b": 1}, {"a": {"y": 2}, "c": 3}) == {"a": {"x": 1, "y": 2}, "b": 1, "c": 3}
 
 
-def test_without_data_the_rest_is_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("benchmarks.engine.cost.FIXED_POINTS", 50)
+def test_without_data_the_rest_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "engine.json"
     assert engine(["--data", str(tmp_path), "--json", str(file), "--repeat", "1"], SMALL) == 0
     report = json.loads(file.read_text())
@@ -289,7 +278,6 @@ def test_without_data_the_rest_is_measured(
 def test_steps_and_times_stand_at_the_top(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bounds = {"rockerarm-100": True, "bunny-20": False}
     stand_ins: dict[str, Any] = {
-        "WIDTHS": NET,
         "scan": lambda case, _: sphere({"bunny-20": 40, "bunny-100": 60}.get(case, 20), 20),
         "pretrained": partial(pretrained, iterations=1),
         "freeze": partial(freeze, steps=1),
@@ -298,7 +286,7 @@ def test_steps_and_times_stand_at_the_top(tmp_path: Path, monkeypatch: pytest.Mo
     }
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(f"benchmarks.engine.measurements.{name}", stand_in)
-    plan = SMALL(tmp_path, tmp_path, 1, 0.1)
+    plan = SMALL(tmp_path, tmp_path, 1, 0.1, widths=NET)
     found = merged(MEASUREMENTS["step"](plan), MEASUREMENTS["quality"](plan))
     for name, points in (("bunny_20", 40), ("bunny_100", 60)):
         assert found[f"step_ratio_{name}"] == found["step"][name]["ratio"]

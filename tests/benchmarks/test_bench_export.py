@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "export"))
 
 from analytic_fields import Field, shells, sphere
-from benchmarks.export.extraction import Counting
-from benchmarks.export.main import main as export
-from benchmarks.export.main import sentences
-from benchmarks.export.whole_grid import compare, same_surface
+from benchmarks.extraction import main as export
+from benchmarks.extraction import sentences
+from benchmarks.extraction_run import Counting, compare, same_surface
 
 from gnrecon.export import extract
 from gnrecon.field import Siren

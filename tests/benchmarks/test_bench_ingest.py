@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from benchmarks.ingest.main import main as ingest
-from benchmarks.ingest.scans import WRITERS
+from benchmarks.streamed_reading import WRITERS
+from benchmarks.streamed_reading import main as ingest
 
 from gnrecon.io import read_cloud
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError

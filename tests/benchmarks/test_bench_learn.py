@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benchmarks import shape_learning
 from benchmarks.__main__ import main as bench
-from benchmarks.learn import main as learn_bench
-from benchmarks.learn import step as step_bench
-from benchmarks.learn.nested import nested_step, papers_step
-from benchmarks.learn.step import closed_step
+from benchmarks.shape_learning import closed_step, nested_step, papers_step
 
 from gnrecon.field import Network
 from gnrecon.least_squares import Cholesky
@@ -38,11 +36,8 @@ def test_nested_differentiation_takes_the_same_step() -> None:
         assert float((closed - nested).norm()) < 1e-6 * float(nested.norm())
 
 
-def test_both_ways_are_timed_on_the_same_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(step_bench, "STEPS", 2)
-    monkeypatch.setattr(step_bench, "OURS", 1)
-    monkeypatch.setattr(step_bench, "NESTED", 1)
-    figures = step_bench.step_figures(0)
+def test_both_ways_are_timed_on_the_same_step() -> None:
+    figures = shape_learning.step_figures(0, steps=2, our_repetitions=1, nested_repetitions=1)
     for which in ("first", "later"):
         step = figures[which]
         assert step["parameters"] == 1217
@@ -67,7 +62,7 @@ def test_the_figures_are_written(
         "papers_speedup": 40.0,
         "error": 1e-2,
     }
-    monkeypatch.setattr(learn_bench, "step_figures", lambda seed: {"first": step, "later": step, "seed": seed})
+    monkeypatch.setattr(shape_learning, "step_figures", lambda seed: {"first": step, "later": step, "seed": seed})
     path = tmp_path / "figures.json"
     words = ["--problems", "cone", "--optimisers", "gn", "--budget", "0.01", "--json", str(path)]
     assert bench(["learn", *words]) == ExitCode.OK

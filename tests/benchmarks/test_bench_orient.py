@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
+from benchmarks.accuracy.comparison import Protocol
+from benchmarks.accuracy.orientation import CASES, main, meshes_table, sides, true_normals
+from benchmarks.accuracy.problem import Problem
 from benchmarks.accuracy.scans import AnalyticScan
-from benchmarks.comparison import Protocol
-from benchmarks.orient.cases import CASES
-from benchmarks.orient.main import main, meshes_table
-from benchmarks.orient.sides import sides, true_normals
-from benchmarks.problem import Problem
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import ExitCode, UsageError

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.__main__ import main as bench
-from benchmarks.refine import main as refine_bench
-from benchmarks.refine.shapes import SHAPES
+from benchmarks import remeshing
+from benchmarks.remeshing import SHAPES
 
 from gnrecon.export import extract, verify
 from gnrecon.runtime.errors import ExitCode
@@ -29,9 +28,8 @@ def test_its_fields_are_distances(name: str, rng: np.random.Generator) -> None:
 def test_figures_of_a_shape_with_edges(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(refine_bench, "SHAPES", {"cylinder": SHAPES["cylinder"]})
-    monkeypatch.setattr(refine_bench, "CELLS", 32)
-    assert bench(["refine", "--json", str(tmp_path / "figures.json")]) == ExitCode.OK
+    monkeypatch.setattr(remeshing, "SHAPES", {"cylinder": SHAPES["cylinder"]})
+    assert remeshing.main(["--json", str(tmp_path / "figures.json")], cells=32) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "cylinder" in shown
     figures = {one["method"]: one for one in json.loads((tmp_path / "figures.json").read_text())["figures"]}

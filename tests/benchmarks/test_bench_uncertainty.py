@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.uncertainty import CASES, COLUMNS, Case, ColorScale, draw, errors, main
 from PIL import Image
-
-# The benchmarks are scripts beside the package, as ./scripts/bench puts them on the path.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from benchmarks.uncertainty.main import COLUMNS, main
-from benchmarks.uncertainty.picture import HIGHEST, LOWEST, colors
-from benchmarks.uncertainty.scans import CASES, Case, draw, errors
 
 from gnrecon.geometry.point_cloud import Frame
 
@@ -55,7 +48,9 @@ def test_errors_are_distances_along_the_normal() -> None:
 
 
 def test_colours_run_from_dark_to_bright_and_stop_at_the_ends() -> None:
-    shown = colors(np.array([0.0, LOWEST, np.sqrt(LOWEST * HIGHEST), HIGHEST, 1.0])).astype(int).sum(axis=1)
+    scale = ColorScale()
+    low, high = scale.lowest, scale.highest
+    shown = scale.colors(np.array([0.0, low, np.sqrt(low * high), high, 1.0])).astype(int).sum(axis=1)
     assert shown[0] == shown[1] < shown[2] < shown[3] == shown[4]
 
 
@@ -75,8 +70,9 @@ def test_a_small_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         trial["far"] * trial["within_far"] + (1 - trial["far"]) * trial["within_near"]
     )
     shown = capsys.readouterr().out
-    for key in ("rank", "median_sigma"):
-        assert COLUMNS[key][1].format(trial[key]) in shown
+    for column in COLUMNS:
+        if column.key in ("rank", "median_sigma"):
+            assert column.cell(trial) in shown
     with Image.open(picture) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     first, *coloured = np.split(pixels[40:430], 3, axis=1)

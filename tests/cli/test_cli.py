@@ -232,7 +232,7 @@ def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path) -
     scan = write_scan(tmp_path / "far.ply", points + place, normals)
     done = gnrecon(scan, "-o", out / "far.stl", "--report", out / "report.json", *FAST_WORDS)
     assert done.returncode == 0, done.stderr
-    assert "relative to the origin 500000 4000000 100, which its header names" in done.stderr
+    assert "relative to the origin 500000 4000000 100. The file's header states it" in done.stderr
     assert json.loads((out / "report.json").read_text())["origin"] == [500_000, 4_000_000, 100]
     assert (out / "far.stl").read_bytes().startswith(b"STL, origin 500000 4000000 100 ")
     facts = verify_file(out / "far.stl")

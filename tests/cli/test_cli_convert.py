@@ -64,7 +64,7 @@ def test_a_mesh_to_ply_and_back_loses_nothing(tmp_path: Path, command: CommandLi
         (
             "stl",
             [
-                "relative to the origin 500000 4500000 100, which",
+                "relative to the origin 500000 4500000 100. The file",
                 "Coordinates are rounded",
                 "no place for intensity, colors",
                 "Normals are not kept",
@@ -209,6 +209,6 @@ def test_a_file_that_comes_back_otherwise_is_not_kept(
     write = WRITERS[".obj"]
     monkeypatch.setitem(WRITERS, ".obj", lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path))
     write_mesh(ball(), tmp_path / "a.ply")
-    sentence = "1279 of 1280 faces came back"
+    sentence = "1279 of 1280 faces could be read back"
     command.refuses(ExitCode.OUTPUT, sentence, "convert", tmp_path / "a.ply", tmp_path / "b.obj")
     assert names(tmp_path) == ["a.ply"]

@@ -114,11 +114,11 @@ def test_a_device_that_is_not_there_is_refused(model: Path, tmp_path: Path, comm
     if not torch.cuda.is_available():
         done = command("mesh", model, "-o", tmp_path / "a.ply", "--device", "cuda")
         assert done.returncode == ExitCode.USAGE
-        assert "torch sees no CUDA GPU" in done.stderr
+        assert "torch finds no CUDA GPU" in done.stderr
     assert not (tmp_path / "a.ply").exists()
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA GPU")
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA GPU")
 def test_a_gpu_makes_the_same_surface(model: Path, tmp_path: Path, command: CommandLine) -> None:
     for device in ("cpu", "cuda"):
         words = ("mesh", model, "-o", tmp_path / f"{device}.ply", "--resolution", 48, "--device", device)

@@ -11,7 +11,7 @@ import torch
 from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
-from gnrecon.pipeline import limited
+from gnrecon.runtime.compute_limits import limited
 
 
 def detail(rng: np.random.Generator, cubes: int = 5, features: int = 7) -> Detail:

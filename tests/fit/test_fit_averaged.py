@@ -13,7 +13,7 @@ from gnrecon.fit.denoising import LocalData, _best, _candidates, choose_local_da
 from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.model_selection import FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import DenoisingParameters
-from gnrecon.fit.shape_priors.bilateral_filter import Averaging
+from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.geometry.point_cloud import Frame, Samples
 
 FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
@@ -50,7 +50,7 @@ def test_a_noisy_cube_is_averaged_and_its_fit_says_so() -> None:
 
 def test_faces_that_meet_are_told_from_bends() -> None:
     def edges(samples: Samples) -> bool:
-        return has_edges(*_candidates(DenoisingParameters())[0].of(samples.points, samples.normals))
+        return has_edges(*_candidates(DenoisingParameters())[0].apply(samples.points, samples.normals))
 
     rng = np.random.default_rng(2)
     assert edges(cube(1500, 0.0, rng))
@@ -64,7 +64,7 @@ def test_faces_that_meet_are_told_from_bends() -> None:
     assert not edges(Samples(x, np.stack([0 * side, 0 * side, side], axis=1), FRAME))
 
 
-def chosen(gains: dict[Averaging, float], edges: bool) -> Averaging | None:
+def chosen(gains: dict[BilateralFilter, float], edges: bool) -> BilateralFilter | None:
     """Return the averaging whose left-out points are told better, by gains of a scatter of one hundredth."""
     scatter = 0.01 * np.tile([1.0, -1.0], 50)[:, None]
     hyperparameters = Hyperparameters(0.1, 0.01, 0.1)

@@ -1,11 +1,12 @@
-"""The winding number by a tree of dipoles, beside the plain sum over all points."""
+"""The winding number by a tree of dipoles, compared with the plain sum over all points."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from gnrecon.fit.blocks.tree import FEW, Dipoles
+from gnrecon.fit.blocks.block_parameters import BlockParameters
+from gnrecon.fit.blocks.tree import DipoleTree
 from gnrecon.geometry.signed_distance import Density, winding_number
 
 COUNT = 6000
@@ -23,7 +24,7 @@ def two_balls() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_it_is_the_plain_sum_clear_of_the_points() -> None:
     points, normals, disks = two_balls()
-    tree = Dipoles.of(points, normals, disks)
+    tree = DipoleTree.of(points, normals, disks)
     rng = np.random.default_rng(1)
     centers = rng.uniform([-1.2, -1.2, -1.2], [2.0, 1.2, 1.2], (40, 3))
     inside = 0
@@ -40,18 +41,18 @@ def test_it_is_the_plain_sum_clear_of_the_points() -> None:
 
 def test_every_point_counts_once_and_few_terms_are_left() -> None:
     points, normals, disks = two_balls()
-    tree = Dipoles.of(points, normals, disks)
-    assert len(tree.levels[0].radii) <= FEW
+    tree = DipoleTree.of(points, normals, disks)
+    assert len(tree.levels[0].radii) <= BlockParameters.root_cubes
     for center in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 5.0, 5.0]):
-        places, moments, radii = tree.near(np.array(center), 0.05)
+        places, moments, radii = tree.dipoles_for(np.array(center), 0.05)
         assert (radii**2).sum() == pytest.approx((disks**2).sum())
         assert moments.sum(axis=0) == pytest.approx((normals * (disks**2 / 4)[:, None]).sum(axis=0), abs=1e-9)
         assert len(places) < COUNT / 5
 
 
 def test_arrays_bring_it_back() -> None:
-    tree = Dipoles.of(*two_balls())
+    tree = DipoleTree.of(*two_balls())
     arrays = tree.arrays()
-    again = Dipoles.of_arrays(arrays.__getitem__, len(tree.levels))
+    again = DipoleTree.of_arrays(arrays.__getitem__, len(tree.levels))
     x = np.array([[0.1, 0.2, 0.0], [3.0, 0.0, 0.0]])
     assert again.winding_number(x, x[0], 0.0).tolist() == tree.winding_number(x, x[0], 0.0).tolist()

@@ -13,7 +13,7 @@ from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import two_level as adaptive
 from gnrecon.fit.parameters import PenaltyFitParameters
 from gnrecon.fit.shape_priors import sharp_shape as sharp
-from gnrecon.fit.shape_priors.hole_completion import Continued
+from gnrecon.fit.shape_priors.hole_completion import HoleCompletion
 from gnrecon.fit.surface_penalties import FreeSpace, SurfaceSamples, _connected
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.signed_distance import Density
@@ -79,9 +79,9 @@ def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> No
 
     assert off() < 2e-3  # its side goes on
     developable = off(prior="developable")
-    monkeypatch.setattr(sharp, "continued", lambda *_: Continued.none())
-    monkeypatch.setattr(adaptive, "continued", lambda *_: Continued.none())
-    monkeypatch.setattr(sharp, "spread", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
+    monkeypatch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
+    monkeypatch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
+    monkeypatch.setattr(sharp, "resample_primitives", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
     smooth = off()
     assert smooth > 0.01
     assert developable < 0.4 * smooth
@@ -139,6 +139,5 @@ def test_a_sheet_knows_what_is_far() -> None:
     x = np.array([[0, 0, 1.2], [0, 0, 0.7], [0, 0, -1.3]])
     told = sheet.volume_distances(x, np.full(3, 9.0), np.array([0.1, -0.1, 0.1]), density)
     assert told == pytest.approx([0.2, -0.3, 9.0], abs=0.02)
-    assert SurfaceSamples(samples.points, np.zeros(600)).volume_distances(
-        x, np.full(3, 9.0), x[:, 2], density
-    ) == pytest.approx(9.0)
+    covered = SurfaceSamples(samples.points, np.zeros(600))
+    assert covered.volume_distances(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(9.0)

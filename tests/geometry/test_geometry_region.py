@@ -18,7 +18,7 @@ from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.geometry.units import parse_plane
 from gnrecon.io import cropped, read_scans
 from gnrecon.io.contents import Contents
-from gnrecon.io.streaming import Gatherer
+from gnrecon.io.streaming import VoxelThinning
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
 
@@ -61,8 +61,8 @@ def test_cropping_is_counted_and_attributes_follow() -> None:
     np.testing.assert_array_equal(inside.attributes["label"], above)
     np.testing.assert_array_equal(inside.normals, points[above])
     assert (reading.points, reading.kept, reading.cropped) == (500, len(above), 500 - len(above))
-    assert reading.remarks() == [f"Dropped {500 - len(above)} of 500 points outside of the wanted region."]
-    with pytest.raises(UsageError, match="None of the 500 points lies in the region that is wanted"):
+    assert reading.remarks() == [f"Dropped {500 - len(above)} of 500 points outside of the region."]
+    with pytest.raises(UsageError, match="None of the 500 points lies in the region; gnrecon info prints"):
         cropped(PointCloud(points + 9), Region((BOX,)))
 
 
@@ -70,14 +70,14 @@ def test_cropping_is_counted_and_attributes_follow() -> None:
 def test_large_scans_are_thinned_to_what_is_wanted_of_them(most: int) -> None:
     points = sphere(4000, np.random.default_rng(0))[0]
     small = points[:, 2] >= 0.95
-    gatherer = Gatherer(most, Region((((-1, -1, 0.95), (1, 1, 1)),)))
+    thinning = VoxelThinning(most, Region((((-1, -1, 0.95), (1, 1, 1)),)))
     for start in range(0, 4000, 300):
-        gatherer.add(Contents(points[start : start + 300]))
-    found = gatherer.gathered().points
-    assert (gatherer.seen, gatherer.cropped) == (4000, 4000 - small.sum())
+        thinning.add(Contents(points[start : start + 300]))
+    found = thinning.result().points
+    assert (thinning.seen, thinning.cropped) == (4000, 4000 - small.sum())
     assert 45 < small.sum() < 150
     if small.sum() <= most:
-        assert gatherer.side is None
+        assert thinning.side is None
         np.testing.assert_array_equal(found, points[small])
 
 
@@ -91,7 +91,7 @@ def test_the_command_line_crops(tmp_path: Path) -> None:
     kept = (points[:, 0] >= -0.5) & (points[:, 0] <= 0.75) & (points[:, 1] >= -0.8)
     reading = json.loads((tmp_path / "report.json").read_text())["reading"]
     assert (reading["points"], reading["kept"], reading["cropped"]) == (1500, kept.sum(), 1500 - kept.sum())
-    assert f"Dropped {1500 - kept.sum():,} of 1,500 points outside of the wanted region." in done.stderr
+    assert f"Dropped {1500 - kept.sum():,} of 1,500 points outside of the region." in done.stderr
     cloud, _ = read_scans([scan], region=Options(crop="99.5,99,99,102,102,102").region())
     np.testing.assert_array_equal(cloud.points, (points + 100)[points[:, 0] >= -0.5])
 

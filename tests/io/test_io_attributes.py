@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io import as_cloud, holds, read_cloud, read_mesh, to_open3d, to_trimesh, write_mesh
+from gnrecon.io import as_cloud, read_cloud, read_mesh, supports_attribute, to_open3d, to_trimesh, write_mesh
 from gnrecon.runtime.errors import InputError
 
 COLOURED = [".ply", ".obj", ".off", ".glb", ".3mf"]
@@ -112,7 +112,7 @@ def test_what_is_lost_is_said(suffix: str, sentence: str, mesh: Mesh, tmp_path: 
     count = np.arange(len(mesh.vertices))
     full = mesh.with_attributes({"heat": count / 2, "label": count})
     assert write_mesh(full, tmp_path / f"m{suffix}") == [sentence]
-    assert not holds(tmp_path / f"m{suffix}", "heat", count)
+    assert not supports_attribute(tmp_path / f"m{suffix}", "heat", count)
     assert not set(read_mesh(tmp_path / f"m{suffix}").attributes) - {"colors"}
 
 
@@ -276,7 +276,7 @@ def test_3mf_objects_are_put_together_as_the_model_says(tmp_path: Path) -> None:
     ("components", "item", "sentence"),
     [
         ('<component objectid="2"/>', 2, "contains itself"),
-        ("", 4, "'4', which is not there"),
+        ("", 4, "'4', which does not exist"),
         ("", 2, "builds no mesh"),
         ('<component objectid="1" transform="1 2"/>', 2, "malformed"),
     ],
@@ -295,7 +295,7 @@ def test_damaged_3mf_archives_are_refused(tmp_path: Path, mesh: Mesh) -> None:
     archive(tmp_path / "bare.3mf", PARTS, relations=False)
     archive(tmp_path / "torn.3mf", PARTS[:300])
     for name in ("cut", "text", "bare", "torn"):
-        with pytest.raises(InputError, match="no well-formed 3MF archive") as caught:
+        with pytest.raises(InputError, match="not a well-formed 3MF archive") as caught:
             read_mesh(tmp_path / f"{name}.3mf")
         assert "\n" not in str(caught.value)
     (tmp_path / "zipped.ply").write_bytes(whole.read_bytes())

@@ -10,7 +10,7 @@ import pytest
 from gnrecon.export import require_sound, verify_file
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh, write_mesh, written_origin
-from gnrecon.io.origin import header, in_words, origin_in
+from gnrecon.io.origin import format_origin, parse_origin, stl_header
 
 UTM = np.array([512_345.678, 4_123_456.789, 123.4])
 
@@ -44,7 +44,7 @@ def test_a_far_solid_is_one_in_its_file_too(tmp_path: Path, radius: float) -> No
     assert np.abs(back.corners - mesh.corners).max() < 1e-6 * radius + 1e-9
     origin = written_origin(mesh, tmp_path / "far.stl")
     assert origin is not None
-    assert f"relative to the origin {in_words(origin)}," in sentence
+    assert f"relative to the origin {format_origin(origin)}." in sentence
     assert np.abs(origin - UTM).max() <= 2 * np.sqrt(3) * radius
 
 
@@ -74,13 +74,13 @@ def test_where_float32_suffices_the_coordinates_are_the_scans_own(tmp_path: Path
     "origin", [[0.0, -0.0, 5.0], [-1.23456789012345e300, 1.2345678901234e-300, -9.87654321098765e-300], [0.1, 1e15, -3]]
 )
 def test_headers_hold_any_origin(origin: list[float]) -> None:
-    text = header(np.array(origin))
+    text = stl_header(np.array(origin))
     assert len(text) == 80
-    np.testing.assert_array_equal(origin_in(text), np.array(origin))
+    np.testing.assert_array_equal(parse_origin(text), np.array(origin))
 
 
 @pytest.mark.parametrize(
     "text", [b"", b"binary STL", b"STL, origin", b"STL, origin 1 2", b"STL, origin 1 two 3", b"STL, origin nan 0 1"]
 )
 def test_other_headers_name_none(text: bytes) -> None:
-    np.testing.assert_array_equal(origin_in(text.ljust(80)), np.zeros(3))
+    np.testing.assert_array_equal(parse_origin(text.ljust(80)), np.zeros(3))

@@ -10,9 +10,9 @@ def test_every_reason_has_its_bar() -> None:
     bars = {bar.fact.label: bar for bar in ingest({"ingest": counts})}
     assert list(bars) == [
         "read",
-        "copies, of a scan that is there twice",
+        "in a repeated copy of the scan",
         "in isolated clusters",
-        "held out to check the fit",
+        "held out for validation",
         "fitted",
     ]
     assert bars["in isolated clusters"].width == 0.05
@@ -23,6 +23,6 @@ def test_every_reason_has_its_bar() -> None:
 def test_what_troubles_a_scan_is_told() -> None:
     layers = {"share": 0.5, "offset": 0.25}
     told = remarks({"ingest": {"normals": "given", "clusters_found": 7}, "scan": {"layers": layers}})
-    assert told[:2] == ["Normals: given.", "Left 7 points alone that lie in isolated clusters."]
+    assert told[:2] == ["Normals: given.", "Kept 7 points in isolated clusters."]
     assert "At 50% of the points there are two layers, about 0.25 file units apart" in told[2]
     assert remarks({"scan": {"layers": None}}) == remarks({"scan": None}) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from gnrecon.export import verify
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.report.html import page_text, write_page
+from gnrecon.report.html.viewer import model as packed_model
 from gnrecon.runtime.errors import MeshError, OutputError
 
 ALL_MODES = ["plain", "colors", "error", "sigma", "distance", "mean_curvature", "gauss_curvature", "intensity"]
@@ -138,8 +140,7 @@ def test_an_open_surface_is_called_one() -> None:
 
 
 def test_heavy_meshes_and_clouds_are_drawn_lightly_and_said_to_be(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gnrecon.report.html.viewer.MOST_FACES", 1000)
-    monkeypatch.setattr("gnrecon.report.html.viewer.MOST_POINTS", 500)
+    monkeypatch.setattr("gnrecon.report.html.page.model", partial(packed_model, most_faces=1000, most_points=500))
     text = page_text(report(mesh), mesh, scan(mesh))
     model = scene(text)
     assert 500 < model["faces"] <= 1000 < model["all_faces"] == len(mesh.faces)

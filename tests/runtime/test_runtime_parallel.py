@@ -19,7 +19,8 @@ import torch
 from scan_files import box, torus
 
 from gnrecon.optim import Record
-from gnrecon.pipeline import Progress, Reconstruction, limited, reconstruct
+from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.runtime.compute_limits import limited
 from gnrecon.runtime.parallel import map_in_threads
 
 REPOSITORY = Path(__file__).resolve().parents[2]

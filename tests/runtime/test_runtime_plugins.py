@@ -64,8 +64,16 @@ BROKEN_READERS = {
     "value": ("read = 3", "is 'int', which cannot be called", UsageError),
     "raises": ("def read(path):\n    raise ValueError('bad\\nheader')", "failed (ValueError: bad header)", InputError),
     "exits": ("def read(path):\n    raise SystemExit(0)", "failed (SystemExit: 0)", InputError),
-    "nothing": ("def read(path):\n    return None", "returned what is no cloud: Expected points", InputError),
-    "text": ("def read(path):\n    return 'points'", "returned what is no cloud: Expected points", InputError),
+    "nothing": (
+        "def read(path):\n    return None",
+        "returned something that is not a cloud: Expected points",
+        InputError,
+    ),
+    "text": (
+        "def read(path):\n    return 'points'",
+        "returned something that is not a cloud: Expected points",
+        InputError,
+    ),
     "flat": ("def read(path):\n    return [[1, 2], [3, 4]]", "points of shape (N, 3) or (N, 6)", InputError),
     "empty": (
         "def read(path):\n    return [[0, 0, 0]][:0] or __import__('numpy').zeros((0, 3))",

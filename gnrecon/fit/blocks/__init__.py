@@ -1,1 +1,1 @@
-"""The local fields of a large scan, solved by blocks of an octree: in processes, resumable, or on a cluster."""
+"""Local fields of large scans, solved by blocks of an octree: in processes or on a cluster, and resumable."""

@@ -1,9 +1,9 @@
-"""One block of a large fit: its cubes, each solved from the points around it alone.
+"""Solves one block of a large fit: its cubes, each from the points around it only.
 
-A block is a task: it is named by its work folder and its number, reads what it needs from there, and leaves its result
-there. So it can be solved in any process that sees the folder, in any order, and again after it was lost. A cube's
-chance is its own (its key seeds it), and it sees the same points and far field in whichever block it is: how cubes are
-dealt out to blocks, and blocks to processes, changes no digit of the result.
+A block is a task: it is identified by its work folder and number, reads its data from there, and writes its result
+there. So it can be solved in any process that sees the folder, in any order, and again after it was lost. Each cube has
+a random generator of its own, seeded with its key, and uses the same points and far field in whichever block it is: how
+cubes are assigned to blocks, and blocks to processes, changes no digit of the result. Entry: `solve_block`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
-from gnrecon.fit.blocks.store import Arrays, Work
-from gnrecon.fit.blocks.tree import Codes, Dipoles, morton
+from gnrecon.fit.blocks.store import Arrays, WorkFolder
+from gnrecon.fit.blocks.tree import Codes, DipoleTree, morton_codes
 from gnrecon.fit.local_fields import cube_length
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
 from gnrecon.fit.model_selection import FieldResiduals, Volume
@@ -27,37 +27,34 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding
 
-CHANCE = 3
-"""Tells the cubes' chance from that of the rest of the fit, which has the same seed."""
-
 
 def solve_block(folder: str | Path, number: int, device: str = "cpu") -> None:
-    """Solve the cubes of a block and keep what was found in its work folder.
+    """Solve the cubes of a block and save the result in its work folder.
 
     Raises
     ------
     InputError
-        When the folder holds no work.
+        When the folder is no work folder.
     """
-    work = Work(Path(folder))
-    work.keep(number, Blocks.of(work, device).solve(number))
+    work = WorkFolder(Path(folder))
+    work.save(number, BlockSolver.of(work, device).solve(number))
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """What the blocks of a work folder are solved from, mapped from its files.
+class BlockSolver:
+    """The data of a work folder, mapped from its files, from which any of its blocks is solved.
 
     Parameters
     ----------
-    leftover : of all points, ordered by the Morton codes of their cells
-    disks : array of shape (N,), radius of the disk that each point stands for
+    leftover : residuals of the global field at all points, ordered by the Morton codes of their cells
+    disks : array of shape (N,), radius of the disk that each point represents
     radius : their median
-    cells, first : arrays of shapes (C,) and (C + 1,), codes of the occupied cells, and where the points of each begin
+    cells, first : arrays of shapes (C,) and (C + 1,), codes of the occupied cells, and first point of each
     keys : array of shape (B, 3), of the cubes, block after block
-    ends : array of shape (K + 1,), where the cubes of each block begin
+    ends : array of shape (K + 1,), first cube of each block
     dipoles : of all points
     network, theta, box : the global field in unit coordinates
-    partition, features, belief, seed, device : as in `detail`
+    partition, features, belief, seed, device : as in `gnrecon.fit.local_fields`
     """
 
     residuals: FieldResiduals
@@ -67,7 +64,7 @@ class Blocks:
     first: Int
     keys: Int
     ends: Int
-    dipoles: Dipoles
+    dipoles: DipoleTree
     network: Siren
     theta: torch.Tensor
     box: Box
@@ -78,7 +75,7 @@ class Blocks:
     device: str
 
     @classmethod
-    def of(cls, work: Work, device: str) -> Blocks:
+    def of(cls, work: WorkFolder, device: str) -> BlockSolver:
         """Map the arrays of a work folder."""
         facts, array = work.facts, work.array
         residuals = FieldResiduals(array("points"), array("normals"), array("value"), array("gradient"))
@@ -93,7 +90,7 @@ class Blocks:
             first=array("first"),
             keys=array("keys"),
             ends=array("ends"),
-            dipoles=Dipoles.of_arrays(array, facts["levels"]),
+            dipoles=DipoleTree.of_arrays(array, facts["levels"]),
             network=Siren(tuple(facts["widths"])),
             theta=theta,
             box=Box(*array("box")),
@@ -105,10 +102,10 @@ class Blocks:
         )
 
     def solve(self, number: int) -> Arrays:
-        """Return the cubes of a block that hold enough data: their rows among all, lengths and amplitudes."""
+        """Return the cubes of a block that hold enough points: their rows among all cubes, lengths and amplitudes."""
         kept, lengths, amplitudes = [], [], [np.zeros((0, len(self.features)))]
         for cube in range(self.ends[number], self.ends[number + 1]):
-            solved = self._cube(self.keys[cube])
+            solved = self._solve_cube(self.keys[cube])
             if solved is not None:
                 kept.append(cube)
                 lengths.append(solved[0])
@@ -119,38 +116,39 @@ class Blocks:
             "amplitudes": np.concatenate(amplitudes),
         }
 
-    def _cube(self, key: Int) -> tuple[float, Float] | None:
+    def _solve_cube(self, key: Int) -> tuple[float, Float] | None:
         """Return the length and amplitudes of a cube, or None where it holds too few points."""
-        center, around = self.partition.center(key), self._around(key)
+        center, nearby = self.partition.center(key), self._nearby_points(key)
         reach = self.partition.reach + LocalFieldParameters.data_margin_disk_radii * self.radius
-        rows = around[(np.abs(self.residuals.points[around] - center) <= reach).all(axis=1)]
+        rows = nearby[(np.abs(self.residuals.points[nearby] - center) <= reach).all(axis=1)]
         if len(rows) < LocalFieldParameters.least_points:
             return None
         length = cube_length(self.hyperparameters, self.disks[rows], self.radius)
-        patch = self.residuals.patch(rows, center, self._volume(key, center, around), self.device)
+        patch = self.residuals.patch(rows, center, self._free_space(key, center, nearby), self.device)
         system = PatchSystem(patch, self.features, length, patch.size)
         amplitudes = system.solve_with_bounds(self.hyperparameters.position, self.hyperparameters.angle)
         return length, amplitudes.cpu().numpy()
 
-    def _around(self, key: Int) -> Int:
-        """Return the rows of the points in a cell and its neighbours, in order; they hold all of the cube's data."""
+    def _nearby_points(self, key: Int) -> Int:
+        """Return the rows of the points in a cell and its neighbours, in order: all points of the cube."""
         keys = key + neighbour_offsets()
-        codes = np.sort(morton(keys[(keys >= 0).all(axis=1)]))
+        codes = np.sort(morton_codes(keys[(keys >= 0).all(axis=1)]))
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
-        stretches = [np.arange(self.first[cell], self.first[cell + 1]) for cell in at]
-        return np.concatenate([np.zeros(0, dtype=np.int64), *stretches])
+        runs = [np.arange(self.first[cell], self.first[cell + 1]) for cell in at]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *runs])
 
-    def _volume(self, key: Int, center: Float, around: Int) -> Volume:
-        """Return samples of the cube clear of the data, with the bounds that the coarse distance sets there."""
-        rng = np.random.default_rng([self.seed, CHANCE, *(int(number) + 1 for number in key)])
+    def _free_space(self, key: Int, center: Float, nearby: Int) -> Volume:
+        """Return samples of the cube away from the points, with the bounds that the coarse distance sets there."""
+        # The 3 separates the cubes' random streams from others of the fit with the same seed.
+        rng = np.random.default_rng([self.seed, 3, *(int(number) + 1 for number in key)])
         x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (LocalFieldParameters.volume_samples, 3))
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
-        distance, nearest = cKDTree(self.residuals.points[around]).query(x)
-        disks = self.disks[around][nearest]
+        distance, nearest = cKDTree(self.residuals.points[nearby]).query(x)
+        disks = self.disks[nearby][nearest]
         clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
-        has = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, has, signed, is_sign_certain(winding), distance)
+        value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
+        return Volume.around(x, value, signed, is_sign_certain(winding), distance)

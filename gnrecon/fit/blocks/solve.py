@@ -1,10 +1,11 @@
-"""Detail for a large scan: the same cubes, dealt out to blocks that are solved side by side and can be taken up again.
+"""Local fields of a large scan: the cubes are divided into blocks, which are solved in parallel and can be resumed.
 
-The points are put in the order of an octree's cells into a work folder; each block of cubes (`octree`) then reads those
-around it from there (`block`), in processes of their own (`workers`). Neither the number of processes nor how many
-points make a block changes the result. Beside the points themselves, memory holds what one block of each process needs.
-What signs free space is the winding number of all points by a tree of dipoles (`dipoles`): a few thousand of them, as
-they serve for smaller scans, would leave it doubtful within many spacings of a large one.
+The points are written to a work folder (`store`) in the order of an octree's cells (`tree`). Each block of cubes reads
+the points around it from there (`block`), in a process of its own or on a cluster (`workers`). Neither the number of
+processes nor the size of the blocks changes the result. Besides the points, memory holds the data of one block for each
+process. The sign of free space is that of the winding number of all points, by a tree of dipoles (`tree`): a subset of
+a few thousand points, as for smaller scans, would leave it uncertain within many spacings of a large one.
+Entry: `fit_large`.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ import torch
 
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
-from gnrecon.fit.blocks.store import Work
-from gnrecon.fit.blocks.tree import Dipoles, morton, octree_blocks
-from gnrecon.fit.blocks.workers import solve_blocks, solve_scheduled
+from gnrecon.fit.blocks.block_parameters import BlockParameters
+from gnrecon.fit.blocks.store import WorkFolder
+from gnrecon.fit.blocks.tree import DipoleTree, morton_codes, octree_blocks
+from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.local_solve import Hyperparameters
@@ -33,15 +35,6 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
-
-LARGE = 200_000
-"""Points from which a scan is fitted by blocks."""
-
-BLOCK_POINTS = 20_000
-"""Most points of a block, but for single cubes with more: some seconds of work."""
-
-ROWS = 100_000
-"""Points whose cubes are looked up at once."""
 
 
 def fit_large(
@@ -53,26 +46,26 @@ def fit_large(
     folder: str | Path | None = None,
     advance: ProgressCallback = ignore_progress,
     scheduler: str | None = None,
-    block_points: int = BLOCK_POINTS,
+    block_points: int = BlockParameters.block_points,
 ) -> Detail:
-    """Return what to add to a global field.
+    """Return the local fields to add to a global field.
 
     Parameters
     ----------
     sdf : the global field, in the samples' frame
     samples : all of them
-    held : mask of shape (N,), of samples that the global field has not seen
+    held : mask of shape (N,), of samples that the global field was not fitted to
     options : of which features, seed and device are used
     rng : draws the features
-    folder : where the work is kept, so that the same fit takes it up again; by default a temporary one
-    advance : told of the share that is done
-    scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks; by default processes do
-    block_points : most points of a block
+    folder : where the work is saved, so that the same fit can resume; by default a temporary one
+    advance : called with the share that is done
+    scheduler : address of a Dask scheduler whose workers see the folder; by default local processes solve the blocks
+    block_points : points of a block at most
 
     Raises
     ------
     UsageError
-        When the folder holds anything else, or no scheduler answers.
+        When the folder holds other files, or no scheduler answers.
     FitError, MemoryLimitError
         When a block cannot be solved.
     """
@@ -82,34 +75,34 @@ def fit_large(
     advance(chosen)
     like = torch.zeros(0, dtype=torch.float64, device=options.device)
     features = Features.draw(options.features, rng, like)
-    # Off the data by a part of a cell that no regular scan shares, as in `detail`.
+    # Offset by a part of a cell that no regular scan shares, as in `gnrecon.fit.local_fields`.
     edge = LocalFieldParameters.cube_edge_lengths
     partition = Partition(
         residuals.points.min(axis=0) - 0.137 * edge * hyperparameters.length, edge * hyperparameters.length
     )
-    arrays, facts = _tasks(sdf, residuals, hyperparameters, features, partition, block_points)
-    with _folder(folder) as place:
-        work = Work.begin(place, arrays, facts | {"seed": options.seed})
+    arrays, facts = _task_data(sdf, residuals, hyperparameters, features, partition, block_points)
+    with _work_folder(folder) as path:
+        work = WorkFolder.open(path, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
-        missing = [number for number in range(count) if not work.done(number)]
+        missing = [number for number in range(count) if not work.is_solved(number)]
         if scheduler is not None and missing:
-            solve_scheduled(work, missing, scheduler, subrange(advance, chosen, 1.0))
+            solve_on_cluster(work, missing, scheduler, subrange(advance, chosen, 1.0))
         else:
-            # As many as torch has threads, which is what was asked for, or the machine's cores.
+            # As many processes as torch has threads: the option, or by default the cores.
             solve_blocks(work, missing, torch.get_num_threads(), options.device, subrange(advance, chosen, 1.0))
-        return _gathered(work, count, arrays["keys"], partition, features, hyperparameters)
+        return _assembled(work, count, arrays["keys"], partition, features, hyperparameters)
 
 
 @contextmanager
-def _folder(asked: str | Path | None) -> Iterator[Path]:
-    if asked is not None:
-        yield Path(asked)
+def _work_folder(folder: str | Path | None) -> Iterator[Path]:
+    if folder is not None:
+        yield Path(folder)
         return
     with tempfile.TemporaryDirectory(prefix="gnrecon-") as temporary:
         yield Path(temporary)
 
 
-def _tasks(
+def _task_data(
     sdf: NeuralSDF,
     residuals: FieldResiduals,
     hyperparameters: Hyperparameters,
@@ -117,13 +110,15 @@ def _tasks(
     partition: Partition,
     block_points: int,
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """Return the arrays and the plain values from which all blocks are solved."""
+    """Return the arrays and the plain values from which all blocks are solved, see `BlockSolver`."""
     density = residuals.density
-    codes = morton(_cells(partition, residuals.points))
+    codes = morton_codes(_cells(partition, residuals.points))
     order = np.argsort(codes, kind="stable")
     cells, first = np.unique(codes[order], return_index=True)
-    keys, ends = _blocks(_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points)
-    dipoles = Dipoles.of(residuals.points, residuals.normals, density.disks)
+    keys, ends = _divided(
+        _occupied_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points
+    )
+    dipoles = DipoleTree.of(residuals.points, residuals.normals, density.disks)
     arrays = {
         "points": residuals.points[order],
         "normals": residuals.normals[order],
@@ -159,32 +154,32 @@ def _cells(partition: Partition, points: Float) -> Int:
     return np.floor((points - partition.origin) / partition.cell).astype(np.int64)
 
 
-def _cubes(partition: Partition, points: Float) -> Int:
-    """Return the keys, of shape (B, 3), of all cubes that hold points; by parts, for a point is in several cubes."""
-    stretches = slices(len(points), ROWS)
-    return np.unique(np.concatenate([partition.members(points[rows])[0] for rows in stretches]), axis=0)
+def _occupied_cubes(partition: Partition, points: Float, *, lookup_points: int = BlockParameters.lookup_points) -> Int:
+    """Return the keys, of shape (B, 3), of all cubes that hold points, from `lookup_points` of these at a time."""
+    runs = slices(len(points), lookup_points)
+    return np.unique(np.concatenate([partition.members(points[rows])[0] for rows in runs]), axis=0)
 
 
-def _blocks(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) -> tuple[Int, Int]:
-    """Return the cubes in the order of their blocks, of shape (B, 3), and where each block begins, with the end.
+def _divided(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) -> tuple[Int, Int]:
+    """Return the cubes in the order of their blocks, of shape (B, 3), and the first of each block, with the end.
 
-    A cube counts the points of its own cell.
+    A cube counts the points of its own cell, not those of its overlap.
     """
-    codes = morton(keys + 1)
+    codes = morton_codes(keys + 1)
     order = np.argsort(codes, kind="stable")
     keys, codes = keys[order], codes[order]
-    own = morton(np.maximum(keys, 0))
+    own = morton_codes(np.maximum(keys, 0))
     at = np.minimum(np.searchsorted(cells, own), len(cells) - 1)
     held = (cells[at] == own) & (keys >= 0).all(axis=1)
     counts = np.where(held, first[at + 1] - first[at], 0)
     return keys, np.array([0, *(block.stop for block in octree_blocks(codes, counts, most))])
 
 
-def _gathered(
-    work: Work, count: int, keys: Int, partition: Partition, features: Features, hyperparameters: Hyperparameters
+def _assembled(
+    work: WorkFolder, count: int, keys: Int, partition: Partition, features: Features, hyperparameters: Hyperparameters
 ) -> Detail:
-    """Return the detail of all blocks, its cubes in the order of their keys."""
-    solved = [work.solved(number) for number in range(count)]
+    """Return the local fields of all blocks, in the order of their keys."""
+    solved = [work.load(number) for number in range(count)]
     cubes, lengths, amplitudes = (
         np.concatenate([block[name] for block in solved]) for name in ("cubes", "lengths", "amplitudes")
     )

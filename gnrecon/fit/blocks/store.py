@@ -1,8 +1,9 @@
-"""The work folder of a large fit: all that its blocks are solved from, and what has been solved of them.
+"""The work folder of a large fit: the data of its blocks, and the blocks that have been solved.
 
-Arrays lie in files of their own, so that every process maps them and reads only the stretches that its blocks need.
-The manifest comes last, with a fingerprint of everything that decides the result; a block's file comes by its name only
-when it is complete. So a run that was killed at any moment can be taken up again by the same run, and by no other.
+Each array has its own file, so that every process maps it and reads only the rows that its blocks need. The manifest is
+written last, with a fingerprint of everything that determines the result; a block's file gets its name only when it is
+complete. So a run that was killed at any moment can be resumed by the same run, and by no other.
+Entry: `WorkFolder.open`.
 """
 
 from __future__ import annotations
@@ -25,31 +26,30 @@ from gnrecon.version import __version__
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
-MANIFEST, FORMAT = "manifest.json", "gnrecon-work-1"
-_OWN = re.compile(r"(manifest\.json|\w+\.npy|block-\d+\.npz|\.[\w.-]+)")
-"""What a work folder may hold, what a killed run left half written included."""
+FORMAT = "gnrecon-work-1"
+"""Of the manifest; a change of the arrays or their meaning needs another."""
 
 
 @dataclass(frozen=True)
-class Work:
+class WorkFolder:
     """A folder with a manifest."""
 
     folder: Path
 
     @classmethod
-    def begin(cls, folder: str | Path, arrays: Arrays, facts: Mapping[str, Any]) -> Work:
-        """Set a folder up, or take it up again where it holds the same work already.
+    def open(cls, folder: str | Path, arrays: Arrays, facts: Mapping[str, Any]) -> WorkFolder:
+        """Create a work folder, or open it again if it holds the same work already.
 
         Parameters
         ----------
-        folder : is made where it is missing
-        arrays : by names of letters and digits
-        facts : plain values that decide the result, beside the arrays
+        folder : created if it is missing
+        arrays : by names, of letters and digits
+        facts : plain values that determine the result, besides the arrays
 
         Raises
         ------
         UsageError
-            When the folder holds the work of another run, or what is no work at all.
+            When the folder holds the work of another run, or other files.
         OutputError
             When it cannot be written.
         """
@@ -57,17 +57,22 @@ class Work:
         try:
             work.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"The work folder {folder} cannot be made: {error.strerror or error}.") from error
+            raise OutputError(f"The work folder {folder} cannot be created: {error.strerror or error}.") from error
         require_work_folder(folder)
         if work._belongs_to(print_):
             return work
         for name, values in arrays.items():
             with atomic_write(work.folder / f"{name}.npy", overwrite=True) as temporary:
                 np.save(temporary, values)
-        with atomic_write(work.folder / MANIFEST) as temporary:
+        with atomic_write(work.manifest_path) as temporary:
             manifest = {"format": FORMAT, "gnrecon": __version__, "fingerprint": print_, "facts": dict(facts)}
             temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         return work
+
+    @property
+    def manifest_path(self) -> Path:
+        """Where the manifest is."""
+        return self.folder / "manifest.json"
 
     def _belongs_to(self, print_: str) -> bool:
         """Whether the folder holds the work of a fingerprint; False where it holds none yet.
@@ -77,7 +82,7 @@ class Work:
         UsageError
             Where it holds that of another fingerprint.
         """
-        if not (self.folder / MANIFEST).exists():
+        if not (self.manifest_path).exists():
             return False
         if self.manifest.get("fingerprint") != print_:
             raise UsageError(
@@ -88,43 +93,43 @@ class Work:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """What the manifest says.
+        """The manifest.
 
         Raises
         ------
         InputError
             When there is none, or it is damaged.
         """
-        path = self.folder / MANIFEST
+        path = self.manifest_path
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InputError(f"{path} cannot be read: {error}.") from error
         if not isinstance(found, dict) or found.get("format") != FORMAT:
-            raise InputError(f"{path} is not the manifest of a work folder of the format {FORMAT!r}.")
+            raise InputError(f"{path} is not a manifest of the format {FORMAT!r}.")
         return found
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The plain values that the work began with."""
+        """The plain values that the folder was created with."""
         facts: dict[str, Any] = self.manifest["facts"]
         return facts
 
     def array(self, name: str) -> npt.NDArray[Any]:
-        """Return an array of the work, mapped from its file and not read before it is needed."""
+        """Return an array of the work, mapped from its file, so that only the rows in use are read."""
         return np.asarray(np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False))
 
-    def done(self, block: int) -> bool:
+    def is_solved(self, block: int) -> bool:
         """Whether a block has been solved."""
         return self._block(block).exists()
 
-    def keep(self, block: int, solved: Arrays) -> None:
-        """Keep what was solved of a block."""
+    def save(self, block: int, solved: Arrays) -> None:
+        """Save the result of a block."""
         with atomic_write(self._block(block), overwrite=True) as temporary:
             np.savez(temporary, **solved)  # type: ignore[arg-type]  # its stubs take the arrays for `allow_pickle`
 
-    def solved(self, block: int) -> dict[str, npt.NDArray[Any]]:
-        """Return what was solved of a block.
+    def load(self, block: int) -> dict[str, npt.NDArray[Any]]:
+        """Return the result of a block.
 
         Raises
         ------
@@ -142,24 +147,26 @@ class Work:
 
 
 def require_work_folder(folder: str | Path) -> None:
-    """Refuse a folder that holds anything but work; one that is not there yet is fine.
+    """Refuse a folder that holds other files than those of a work folder; a missing one is accepted.
 
     Raises
     ------
     UsageError
-        With the name of what it holds.
+        With the name of such a file.
     """
     if not Path(folder).exists():
         return
     if not Path(folder).is_dir():
-        raise UsageError(f"{folder} is no folder, so that no work can be kept in it.")
-    foreign = sorted(path.name for path in Path(folder).iterdir() if not _OWN.fullmatch(path.name))
+        raise UsageError(f"{folder} is not a folder; name a new or an empty one.")
+    # Hidden files are those that a killed run left half written.
+    own = re.compile(r"(manifest\.json|\w+\.npy|block-\d+\.npz|\.[\w.-]+)")
+    foreign = sorted(path.name for path in Path(folder).iterdir() if not own.fullmatch(path.name))
     if foreign:
-        raise UsageError(f"{folder} is no work folder: it holds {foreign[0]!r}; name a new or an empty folder.")
+        raise UsageError(f"{folder} is not a work folder: it holds {foreign[0]!r}; name a new or an empty folder.")
 
 
 def fingerprint(arrays: Arrays, facts: Mapping[str, Any]) -> str:
-    """Return what tells this work from any other, as hexadecimal digits."""
+    """Return a hash, in hexadecimal digits, of everything that determines the result."""
     digest = hashlib.sha256(json.dumps([FORMAT, __version__, facts], sort_keys=True).encode())
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name])

@@ -1,8 +1,9 @@
-"""Blocks solved side by side, in processes of their own, each with one thread.
+"""Solves blocks in parallel: in local processes with one thread each, or on the workers of a Dask cluster.
 
-The processes are plain programs that are given block numbers by a pipe (`worker`), so that nothing of the caller's own
-program is imported again, and a library that calls for a large fit needs no guard against that. A process that dies
-ends the fit with a sentence; what was solved until then stays in the work folder.
+The local processes are plain programs that read block numbers from a pipe (`worker`), so that the caller's program is
+not imported again and needs no ``__main__`` guard. If a process dies, the fit fails with an error; the blocks solved
+until then stay in the work folder. On a cluster, Dask gives the blocks of a lost worker to others; a block that is
+solved twice, because its worker was only thought lost, does no harm, as its result is one file.
 """
 
 from __future__ import annotations
@@ -17,29 +18,29 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gnrecon.fit.blocks.block import solve_block
-from gnrecon.fit.blocks.store import Work
+from gnrecon.fit.blocks.block_parameters import BlockParameters
+from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.blocks.worker import DONE
 from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import FitError, MemoryLimitError
 from gnrecon.runtime.parallel import torch_threads
 from gnrecon.runtime.progress import ProgressCallback
 
-NEED = 1.2e9
-"""Bytes that a process needs at most, with Python and torch; no more processes are started than have room."""
-
 Process = subprocess.Popen[str]
 
 
-def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str, advance: ProgressCallback) -> None:
-    """Solve blocks of a work folder, in this process where one is enough, or where a GPU is shared.
+def solve_blocks(
+    work: WorkFolder, blocks: Sequence[int], processes: int, device: str, advance: ProgressCallback
+) -> None:
+    """Solve blocks of a work folder, in this process if one is enough, or on a GPU, which processes would share.
 
     Parameters
     ----------
-    work : Work
+    work : WorkFolder
     blocks : their numbers
-    processes : most that may work at a time
+    processes : that may run at a time
     device : a torch device
-    advance : told of the share of the blocks that is done
+    advance : called with the share of the blocks that is done
 
     Raises
     ------
@@ -48,9 +49,9 @@ def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str,
     MemoryLimitError
         When a process was killed, as the system does where memory runs out.
     """
-    processes = min(processes, len(blocks), _room())
+    processes = min(processes, len(blocks), _affordable_processes())
     if processes > 1 and device == "cpu":
-        _solve_beside(work.folder, blocks, processes, advance)
+        _solve_in_processes(work.folder, blocks, processes, advance)
         return
     with torch_threads(1):
         for number, block in enumerate(blocks, 1):
@@ -58,36 +59,36 @@ def solve_blocks(work: Work, blocks: Sequence[int], processes: int, device: str,
             advance(number / len(blocks))
 
 
-def _room() -> int:
-    """How many processes the free memory has room for; at least one."""
+def _affordable_processes(*, worker_bytes: float = BlockParameters.worker_bytes) -> int:
+    """Return how many processes of `worker_bytes` fit into free memory; at least one."""
     import psutil
 
-    return max(1, int(psutil.virtual_memory().available / NEED))
+    return max(1, int(psutil.virtual_memory().available / worker_bytes))
 
 
-def _solve_beside(folder: Path, blocks: Sequence[int], processes: int, advance: ProgressCallback) -> None:
-    waiting, done = iter(blocks), 0
+def _solve_in_processes(folder: Path, blocks: Sequence[int], processes: int, advance: ProgressCallback) -> None:
+    waiting, solved = iter(blocks), 0
     with _started(folder, processes) as workers, selectors.DefaultSelector() as answers:
         for worker in workers:
             assert worker.stdout is not None
             answers.register(worker.stdout, selectors.EVENT_READ, worker)
-            _give(worker, next(waiting))
-        while done < len(blocks):
+            _send(worker, next(waiting))
+        while solved < len(blocks):
             for key, _ in answers.select():
                 _require_done(key.data)
-                done += 1
-                advance(done / len(blocks))
+                solved += 1
+                advance(solved / len(blocks))
                 block = next(waiting, None)
                 if block is not None:
-                    _give(key.data, block)
+                    _send(key.data, block)
 
 
 @contextmanager
 def _started(folder: Path, count: int) -> Iterator[list[Process]]:
-    """Start processes, and see to it that none outlives the block."""
+    """Start processes, and kill those that are left at the end."""
     import gnrecon
 
-    # The same package as here, from wherever it was imported, and one thread also in libraries beside torch.
+    # The same package as here, from wherever it was imported, and one thread also in other libraries than torch.
     package = str(Path(str(gnrecon.__file__)).parents[1])
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
@@ -107,7 +108,7 @@ def _started(folder: Path, count: int) -> Iterator[list[Process]]:
             worker.communicate()
 
 
-def _give(worker: Process, block: int) -> None:
+def _send(worker: Process, block: int) -> None:
     assert worker.stdin is not None
     try:
         print(block, file=worker.stdin, flush=True)
@@ -116,7 +117,7 @@ def _give(worker: Process, block: int) -> None:
 
 
 def _require_done(worker: Process) -> None:
-    """Read the answer of a process; anything but that it is done ends the fit."""
+    """Read the answer of a process, and raise any error."""
     assert worker.stdout is not None
     answer = worker.stdout.readline().strip()
     if answer == DONE:
@@ -126,33 +127,31 @@ def _require_done(worker: Process) -> None:
     status = worker.wait()
     if status < 0:
         raise MemoryLimitError(
-            f"A process that solved blocks was killed by signal {-status}, most likely for want of memory; use fewer "
-            f"threads (--threads) or points (--max-points)."
+            f"A process that solved blocks was killed by signal {-status}, probably because memory ran out; "
+            f"use fewer threads (--threads) or points (--max-points)."
         )
     raise FitError(f"A process that solved blocks ended with status {status}.")
 
 
-RETRIES = 2
-"""How often a block is begun again that raised an error, as where a network file system shows files late."""
+def solve_on_cluster(
+    work: WorkFolder,
+    blocks: Sequence[int],
+    address: str,
+    advance: ProgressCallback,
+    *,
+    retries: int = BlockParameters.task_retries,
+) -> None:
+    """Solve blocks of a work folder on a Dask cluster, as many at a time as its workers have threads.
 
-
-# Blocks solved by the workers of a Dask cluster, which see the work folder by the same path.
-#
-# Dask gives the blocks of a lost worker to others. What a block leaves is its file in the work folder, so that one that
-# is solved twice, as by a worker that was only thought lost, does no harm.
-
-
-def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: ProgressCallback) -> None:
-    """Solve blocks of a work folder on a cluster, as many at a time as its workers have threads.
-
-    Whatever ends this function early, such as Ctrl-C, calls back the blocks that are still waiting.
+    Waiting blocks are cancelled when this function ends early, as by Ctrl-C.
 
     Parameters
     ----------
-    work : in a folder that all workers see
+    work : in a folder that all workers see by the same path
     blocks : their numbers
     address : of the scheduler, such as ``tcp://host:8786``
-    advance : told of the share of the blocks that is done
+    advance : called with the share of the blocks that is done
+    retries : of a block that raised an error
 
     Raises
     ------
@@ -164,7 +163,7 @@ def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: Pr
     folder, run = str(work.folder.absolute()), secrets.token_hex(4)
     with dask_client(address) as client, client.as_current():
         futures = [
-            client.submit(on_worker, folder, block, key=f"gnrecon-block-{run}-{block}", retries=RETRIES)
+            client.submit(solve_on_worker, folder, block, key=f"gnrecon-block-{run}-{block}", retries=retries)
             for block in blocks
         ]
         try:
@@ -178,7 +177,7 @@ def solve_scheduled(work: Work, blocks: Sequence[int], address: str, advance: Pr
             raise
 
 
-def on_worker(folder: str, block: int) -> None:
-    """Solve a block on a worker, with one thread, because sums by several differ in their last digits."""
+def solve_on_worker(folder: str, block: int) -> None:
+    """Solve a block on a worker, with one thread: sums of several threads differ in their last digits."""
     with torch_threads(1):
         solve_block(folder, block)

@@ -1,1 +1,1 @@
-"""What a shape of planes, cylinders and spheres lets one know where points are noisy, few or missing."""
+"""Priors for machine parts, made of planes, cylinders and spheres: snapping, resampling, edge and hole completion."""

@@ -1,82 +1,35 @@
-"""Faces continued across holes: what was not seen of a made thing goes on as what was seen beside it.
+"""Hole completion: planes and cylinders of a machine part are extended across the holes of its scan until they meet.
 
-A smooth field closes a hole as a film would. Where the hole takes an edge, a corner, or most of a bore, that is far
-from the thing: its planes and round cylinders (`primitives`) go on until they meet. Which parts of them are surface is
-told by a minimal cut (`min_cut`) of a lattice about the hole, between what the points beside it say of their two sides.
-Where the cut runs along none of them, nothing is said, and the hole is closed smoothly as before.
+A smooth field closes a hole like a membrane. Where an edge, a corner, or most of a bore is missing, that is far from
+the part. A minimal cut (`min_cut`) of a lattice around the hole, between the cells that nearby points show to be inside
+and outside, decides which parts of the extended primitives are surface. Where the cut follows none of them, no samples
+are added, and the hole is closed smoothly.
 
-A hole is where the winding number is near one half although no point is near.
+A hole is where the winding number is near one half although no point is near. Entry: `complete_holes`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from gnrecon.fit.shape_priors.edge_completion import Faces
+from gnrecon.fit.shape_priors.edge_completion import EdgeCompletion
 from gnrecon.fit.shape_priors.min_cut import minimal_inside, shifted
-from gnrecon.fit.shape_priors.primitives import Seen, Surface, Wanted, agreed, feet, planar_share, surfaces
+from gnrecon.fit.shape_priors.primitive_detection import DetectedPrimitive, detect_primitives, planar_share
+from gnrecon.fit.shape_priors.primitives import Primitive, is_inlier, project
+from gnrecon.fit.shape_priors.prior_parameters import HoleCompletionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Box, CoarseDistance, Density
 from gnrecon.geometry.statistics import widest_gap
 
-MOST_POINTS, CLOSER = 6000, 15_000
-"""Points that are looked at for holes, and for surfaces; holes that so many do not show are small."""
-
-PASSES, FEW = 3, 0.05
-"""How often holes are looked for, as what was continued shows where other surfaces go on; and the share that a pass
-must add for another."""
-
-FEWEST, MADE = 50, 0.2
-"""Points below which nothing is said, and the least share of them on planes where a shape is a made one: 0.4 to 1 on
-machine parts, 0.1 at most on statues and castings of free form."""
-
-STEP, MOST_CELLS, MARGIN = 2.0, 500_000, 0.1
-"""Cell of the lattice in which holes are looked for, in radii of a disk, about how many cells it has at most, and how
-far it reaches beyond the points."""
-
-FAR, DOUBTFUL = 3.0, 0.3
-"""How far the points are from a hole, in radii of a disk, and its winding number from one half."""
-
-LEAST_CELLS, MOST_HOLES, WIDEST = 12, 16, 1.2
-"""Least cells of a hole, most holes, and how wide one is at most: what is wider is a side that nobody scanned."""
-
-CELLS, FINEST, ROOM = 26, 0.8, 4.0
-"""Cells along a hole's longest side, their least size and the room beside the hole, in radii of a disk."""
-
-BESIDE, SIDES, CLEAR = 2.5, 3, 0.3
-"""How near points tell of sides, how many of them must agree, and how far off their planes, in radii of a disk."""
-
-CERTAIN = 0.02
-"""Winding numbers that differ no more from 0 or 1 are sure, away from the points."""
-
-AROUND, TOUCH, TOUCHING, REACH = 12.0, 6.0, 6, 3.0
-"""How near a hole surfaces are looked for, and how near some of their points are, in radii of a disk; how many; and how
-far a surface goes on, in its own widths."""
-
-OFF, NOISE = (0.3, 0.8), 2.5
-"""Least and most height of a surface's points over it, in radii of a disk; between, so many times their roughness."""
-
-SHUT = 20
-"""Known cells that a cut may shut away at most, by chance."""
-
-WIDTH = 3.5
-"""Width of a surface, in standard deviations of its points along the lesser of its two directions."""
-
-UNSEEN = 2.0
-"""How far from all points a sample is, in radii of a disk."""
-
-SPACING, MOST_ALONG = 2.0, 24
-"""Distance of samples, in radii of a scanned point's disk: as dense as those; and most of them along a cell's side."""
-
 
 @dataclass(frozen=True)
-class Continued:
-    """Samples, of shape (M, 3), and unit normals of the surfaces that were continued, and across how many holes."""
+class HoleCompletion:
+    """Samples, of shape (M, 3), and unit normals of the primitives extended across holes, and the number of holes."""
 
     points: Float
     normals: Float
@@ -86,246 +39,268 @@ class Continued:
         return len(self.points)
 
     @classmethod
-    def none(cls) -> Continued:
+    def none(cls) -> HoleCompletion:
         """Return no samples."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), 0)
 
-    def joined(self, points: Float, normals: Float) -> tuple[Float, Float]:
-        """Return points and normals, of shape (N, 3), and after them the samples, of shape (N + M, 3)."""
+    def appended_to(self, points: Float, normals: Float) -> tuple[Float, Float]:
+        """Return points and normals, of shape (N, 3), followed by the samples, of shape (N + M, 3)."""
         return np.concatenate([points, self.points]), np.concatenate([normals, self.normals])
 
 
-def continued(points: Float, normals: Float, exact: bool = True) -> Continued:
-    """Return samples of the planes and cylinders that go on across the holes of a scan.
+def complete_holes(
+    points: Float,
+    normals: Float,
+    exact: bool = True,
+    parameters: HoleCompletionParameters = HoleCompletionParameters(),
+) -> HoleCompletion:
+    """Return samples of the planes and cylinders that extend across the holes of a scan.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
-    exact : whether normals may be believed where points are few; estimated ones may not
+    exact : whether normals are reliable where points are sparse; estimated ones are not
+    parameters : of the completion
     """
-    # By chance of its own, so that what follows draws the same whether there are holes or not.
+    # A generator of its own, so that later draws are the same whether there are holes or not.
     rng = np.random.default_rng(0)
-    across = Continued.none()
-    for _ in range(PASSES):
-        more = _once(*across.joined(points, normals), exact, rng)
-        enough = len(more) <= FEW * len(across)
-        across = Continued(*across.joined(more.points, more.normals), max(across.holes, more.holes))
-        if enough:
+    total = HoleCompletion.none()
+    for _ in range(parameters.passes):
+        more = _one_pass(*total.appended_to(points, normals), exact, rng, parameters)
+        finished = len(more) <= parameters.min_gain_share * len(total)
+        total = HoleCompletion(*total.appended_to(more.points, more.normals), max(total.holes, more.holes))
+        if finished:
             break
-    return across
+    return total
 
 
-def _once(points: Float, normals: Float, exact: bool, rng: np.random.Generator) -> Continued:
-    """Return the same of one pass."""
-    if len(points) < FEWEST:
-        return Continued.none()
+def _one_pass(
+    points: Float, normals: Float, exact: bool, rng: np.random.Generator, parameters: HoleCompletionParameters
+) -> HoleCompletion:
+    """Return the samples of one pass; the parameters are those of `complete_holes`."""
+    if len(points) < parameters.min_points:
+        return HoleCompletion.none()
     drawn = rng.permutation(len(points))
-    rows, closer = np.sort(drawn[:MOST_POINTS]), np.sort(drawn[:CLOSER])
-    scan = _Scan.of(points[rows], normals[rows], points[closer], normals[closer], exact, rng)
-    spacing = SPACING * scan.density.radius * np.sqrt(len(rows) / len(points))
+    rows, dense = np.sort(drawn[: parameters.hole_points]), np.sort(drawn[: parameters.surface_points])
+    density = Density(points[rows])
+    coarse = CoarseDistance(points[rows], normals[rows], rng, density)
+    scan = _HoleScan(points[rows], normals[rows], points[dense], normals[dense], density, coarse, exact, parameters)
+    spacing = parameters.sample_spacing_radii * density.radius * np.sqrt(len(rows) / len(points))
     holes = scan.holes()
-    if not holes or not scan.made(rng):
-        return Continued.none()
-    found = [some for places in holes if len((some := scan.across(places, spacing, rng))[0])]
+    if not holes or not scan.is_machine_part(rng):
+        return HoleCompletion.none()
+    found = [some for cells in holes if len((some := scan.samples_across(cells, spacing, rng))[0])]
     if not found:
-        return Continued.none()
-    samples, theirs = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    kept = ~mouths(samples, theirs, points, normals)
-    return Continued(samples[kept], theirs[kept], len(found))
+        return HoleCompletion.none()
+    samples, sample_normals = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    kept = ~in_bore_opening(samples, sample_normals, points, normals)
+    return HoleCompletion(samples[kept], sample_normals[kept], len(found))
 
 
 @dataclass(frozen=True)
-class _Scan:
-    """Oriented points, of shape (N, 3), as they tell of holes, and more that tell of surfaces, of shape (K, 3)."""
-
-    points: Float
-    normals: Float
-    closer: Float
-    their_normals: Float
-    density: Density
-    coarse: CoarseDistance
-    exact: bool
-
-    @cached_property
-    def roughness(self) -> float:
-        """Noise of the positions of those that tell of surfaces, in radii of their disks."""
-        return Faces(self.closer, self.their_normals).roughness
-
-    @classmethod
-    def of(
-        cls,
-        points: Float,
-        normals: Float,
-        closer: Float,
-        their_normals: Float,
-        exact: bool,
-        rng: np.random.Generator,
-    ) -> _Scan:
-        density = Density(points)
-        coarse = CoarseDistance(points, normals, rng, density)
-        return cls(points, normals, closer, their_normals, density, coarse, exact)
-
-    def made(self, rng: np.random.Generator) -> bool:
-        """Return whether the shape is one of planes at large, and not of a few that a grown one has by chance."""
-        radius = self.density.radius
-        return planar_share(self.points, self.normals, radius, self._off(radius), rng) > MADE
-
-    def _off(self, radius: float) -> float:
-        """Return how far off a surface its points lie at most, as disks of a radius tell."""
-        return radius * float(np.clip(NOISE * self.roughness, *OFF))
-
-    def holes(self) -> list[Float]:
-        """Return places within each hole, of shape (K, 3), the largest hole first."""
-        box = Box.around(self.points, MARGIN)
-        # Where most points crowd, their disks would ask for a lattice without end.
-        least = float(np.prod(box.upper - box.lower) / MOST_CELLS) ** (1 / 3)
-        lattice = _lattice(box.lower, box.upper, max(STEP * self.density.radius, least))
-        places = lattice.reshape(-1, 3)
-        known, _, _ = self.coarse.size(places, FAR)
-        doubtful = np.zeros(len(places), dtype=bool)
-        doubtful[known] = np.abs(self.coarse.winding_number(places[known]) - 0.5) < DOUBTFUL
-        number, count = ndimage.label(doubtful.reshape(lattice.shape[:3]), structure=np.ones((3, 3, 3)))
-        found = [lattice[number == one] for one in range(1, count + 1)]
-        found = [some for some in found if len(some) >= LEAST_CELLS and np.ptp(some, axis=0).max() <= WIDEST]
-        return sorted(found, key=len, reverse=True)[:MOST_HOLES]
-
-    def across(self, places: Float, spacing: float, rng: np.random.Generator) -> tuple[Float, Float]:
-        """Return samples and normals, both of shape (M, 3), of the surfaces that go on across a hole."""
-        radius, hole = self.density.radius, cKDTree(places)
-        distance = hole.query(self.closer)[0] / radius
-        around = distance < AROUND
-        disk = radius * float(np.sqrt(len(self.points) / len(self.closer)))
-        asked = distance[around] < TOUCH
-        faces = self._surfaces(around, asked, disk, rng)
-        faces = [face for face in faces if (hole.query(face.points)[0] < TOUCH * radius).sum() >= TOUCHING]
-        if not faces:
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        lower, upper = places.min(axis=0) - ROOM * radius, places.max(axis=0) + ROOM * radius
-        size = max(float((upper - lower).max()) / CELLS, FINEST * radius)
-        lattice = _lattice(lower, upper, size)
-        cells = lattice.reshape(-1, 3)
-        signed = np.stack([face.surface.at(cells) for face in faces], axis=1)
-        believed = np.stack([_reached(face, cells, radius) for face in faces], axis=1)
-        shape = lattice.shape[:3]
-        known = self._known(cells, shape).reshape(shape)
-        inside = minimal_inside(known, signed.reshape(*shape, -1), believed.reshape(*shape, -1))
-        if _shut_away(inside, known < 0) or _shut_away(~inside, known > 0):
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        samples, normals = _along(inside, lattice, size, signed, believed, [face.surface for face in faces], spacing)
-        far = self.density.tree.query(samples)[0] > UNSEEN * radius
-        far &= hole.query(samples)[0] < ROOM * radius
-        return samples[far], normals[far]
-
-    def _surfaces(self, around: Mask, asked: Mask, disk: float, rng: np.random.Generator) -> list[Seen]:
-        """Return the surfaces of some points, and then those of what is left that have fewer points than others.
-
-        Parameters
-        ----------
-        around : mask of shape (K,), of the points
-        asked : mask of shape (around,), of those that propose
-        disk : radius of what a point stands for
-        rng : draws proposals
-        """
-        points, normals, off = self.closer[around], self.their_normals[around], self._off(disk)
-        faces = surfaces(points, normals, asked, disk, off, rng)
-        if not self.exact:
-            return faces
-        left = np.ones(len(points), dtype=bool)
-        for face in faces:
-            left &= ~agreed(face.surface, points, normals, off)
-        # A face that was seen from the side.
-        rest = points[left], normals[left], asked[left]
-        return faces + surfaces(*rest, disk, off, rng.spawn(1)[0], Wanted(sparse=True))
-
-    def _known(self, cells: Float, shape: tuple[int, ...]) -> Int:
-        """Return 1 for cells, of shape (Q, 3), that are inside beyond doubt, -1 for those outside, and 0 elsewhere."""
-        radius = self.density.radius
-        distance, near = self.density.tree.query(cells, list(range(1, SIDES + 1)))
-        height = np.einsum("qkd,qkd->qk", cells[:, None] - self.points[near], self.normals[near])
-        sided = np.abs(np.sign(height).sum(axis=1)) == SIDES
-        beside = (distance[:, 0] < BESIDE * radius) & sided & (np.abs(height).min(axis=1) > CLEAR * radius)
-        winding = self.coarse.winding_number(cells)
-        sure = (distance[:, 0] >= BESIDE * radius) & (np.abs(winding - 0.5) > 0.5 - CERTAIN)
-        border = np.ones(shape, dtype=bool)
-        border[1:-1, 1:-1, 1:-1] = False
-        side = np.where(winding > 0.5, 1, -1)
-        known: Int = np.where(beside, -np.sign(height[:, 0]), np.where(sure | border.ravel(), side, 0)).astype(int)
-        return known
-
-
-def _shut_away(sides: Mask, known: Mask) -> bool:
-    """Return whether cells known to be off `sides` are shut away by these, as they cannot be from a scanner.
+class _HoleScan:
+    """A scan with holes.
 
     Parameters
     ----------
-    sides, known : masks of shape (a, b, c)
+    points, normals : arrays of shape (N, 3), in which holes are looked for
+    dense_points, dense_normals : arrays of shape (K, 3), in which primitives are looked for
+    density, coarse : of the former
+    exact, parameters : as in `complete_holes`
+    """
+
+    points: Float
+    normals: Float
+    dense_points: Float
+    dense_normals: Float
+    density: Density
+    coarse: CoarseDistance
+    exact: bool
+    parameters: HoleCompletionParameters
+
+    @cached_property
+    def roughness(self) -> float:
+        """Noise of the dense points' positions, in radii of their disks."""
+        return EdgeCompletion(self.dense_points, self.dense_normals).roughness
+
+    def is_machine_part(self, rng: np.random.Generator) -> bool:
+        """Return whether a large share of the points lies on planes, more than on a free-form shape by chance."""
+        radius, p = self.density.radius, self.parameters
+        share = planar_share(self.points, self.normals, radius, self._max_height(radius), rng, p.detection)
+        return share > p.min_planar_share
+
+    def _max_height(self, radius: float) -> float:
+        """Return the largest height of a primitive's points over it, where points stand for disks of a radius."""
+        p = self.parameters
+        return radius * float(np.clip(p.height_roughness * self.roughness, p.min_height_radii, p.max_height_radii))
+
+    def holes(self) -> list[Float]:
+        """Return lattice cells in each hole, of shape (K, 3), the largest hole first."""
+        p, box = self.parameters, Box.around(self.points, self.parameters.margin_units)
+        # Where most points crowd in a small place, disks are tiny: the number of cells is bounded.
+        least = float(np.prod(box.upper - box.lower) / p.max_lattice_cells) ** (1 / 3)
+        lattice = _lattice(box.lower, box.upper, max(p.lattice_step_radii * self.density.radius, least))
+        cells = lattice.reshape(-1, 3)
+        far, _, _ = self.coarse.size(cells, p.hole_distance_radii)
+        open_ = np.zeros(len(cells), dtype=bool)
+        open_[far] = np.abs(self.coarse.winding_number(cells[far]) - 0.5) < p.max_winding_offset
+        number, count = ndimage.label(open_.reshape(lattice.shape[:3]), structure=np.ones((3, 3, 3)))
+        found = [lattice[number == one] for one in range(1, count + 1)]
+        found = [h for h in found if len(h) >= p.min_hole_cells and np.ptp(h, axis=0).max() <= p.max_hole_units]
+        return sorted(found, key=len, reverse=True)[: p.max_holes]
+
+    def samples_across(self, hole_cells: Float, spacing: float, rng: np.random.Generator) -> tuple[Float, Float]:
+        """Return samples and normals, both of shape (M, 3), of the primitives that extend across a hole."""
+        radius, p, hole = self.density.radius, self.parameters, cKDTree(hole_cells)
+        faces = self._faces_around(hole, rng)
+        if not faces:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        lower, upper = hole_cells.min(axis=0) - p.room_radii * radius, hole_cells.max(axis=0) + p.room_radii * radius
+        size = max(float((upper - lower).max()) / p.cut_cells, p.min_cell_radii * radius)
+        lattice = _lattice(lower, upper, size)
+        cells = lattice.reshape(-1, 3)
+        signed = np.stack([face.surface.signed_distance(cells) for face in faces], axis=1)
+        valid = np.stack([self._within_extension(face, cells) for face in faces], axis=1)
+        shape = lattice.shape[:3]
+        known = self._known_sides(cells, shape).reshape(shape)
+        inside = minimal_inside(known, signed.reshape(*shape, -1), valid.reshape(*shape, -1))
+        if encloses(inside, known < 0) or encloses(~inside, known > 0):
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        # At least one sample a cell, and a bounded number.
+        share = min(max(1, round(size / spacing)), p.max_samples_per_cell)
+        primitives = [face.surface for face in faces]
+        samples, normals = _samples_on_cut(inside, lattice, size, signed, valid, primitives, spacing, share)
+        far = self.density.tree.query(samples)[0] > p.unseen_radii * radius
+        far &= hole.query(samples)[0] < p.room_radii * radius
+        return samples[far], normals[far]
+
+    def _faces_around(self, hole: cKDTree, rng: np.random.Generator) -> list[DetectedPrimitive]:
+        """Return the primitives of which some points are near the cells of a hole.
+
+        Where normals are exact, the points that are left are searched again for faces sampled less densely.
+        """
+        radius, p = self.density.radius, self.parameters
+        distance = hole.query(self.dense_points)[0] / radius
+        around = distance < p.search_radii
+        disk = radius * float(np.sqrt(len(self.points) / len(self.dense_points)))
+        proposing = distance[around] < p.touch_radii
+        points, normals, height = self.dense_points[around], self.dense_normals[around], self._max_height(disk)
+        faces = detect_primitives(points, normals, proposing, disk, height, rng, p.detection)
+        if self.exact:
+            left = np.ones(len(points), dtype=bool)
+            for face in faces:
+                left &= ~is_inlier(face.surface, points, normals, height)
+            rest, sparse = (points[left], normals[left], proposing[left]), replace(p.detection, sparse=True)
+            faces = faces + detect_primitives(*rest, disk, height, rng.spawn(1)[0], sparse)
+        touching = [(hole.query(face.points)[0] < p.touch_radii * radius).sum() for face in faces]
+        return [face for face, count in zip(faces, touching, strict=True) if count >= p.min_touching_points]
+
+    def _within_extension(self, face: DetectedPrimitive, cells: Float) -> Mask:
+        """Return which cells, of shape (Q, 3), are near enough to a primitive's points for it to extend there."""
+        p = self.parameters
+        narrow = np.sqrt(np.linalg.eigvalsh(np.cov(face.points.T))[1].clip(0.0))
+        reach = max(
+            p.extension_widths * p.width_deviations * float(narrow), p.hole_distance_radii * self.density.radius
+        )
+        reached: Mask = cKDTree(face.points).query(cells)[0] < reach
+        return reached
+
+    def _known_sides(self, cells: Float, shape: tuple[int, ...]) -> Int:
+        """Return 1 for cells, of shape (Q, 3), that are certainly inside, -1 for those outside, and 0 elsewhere."""
+        radius, p = self.density.radius, self.parameters
+        distance, near = self.density.tree.query(cells, list(range(1, p.side_points + 1)))
+        height = np.einsum("qkd,qkd->qk", cells[:, None] - self.points[near], self.normals[near])
+        agreeing = np.abs(np.sign(height).sum(axis=1)) == p.side_points
+        close = distance[:, 0] < p.side_reach_radii * radius
+        by_points = close & agreeing & (np.abs(height).min(axis=1) > p.min_side_radii * radius)
+        winding = self.coarse.winding_number(cells)
+        by_winding = ~close & (np.abs(winding - 0.5) > 0.5 - p.max_winding_error)
+        border = np.ones(shape, dtype=bool)
+        border[1:-1, 1:-1, 1:-1] = False
+        side = np.where(winding > 0.5, 1, -1)
+        known: Int = np.where(by_points, -np.sign(height[:, 0]), np.where(by_winding | border.ravel(), side, 0)).astype(
+            int
+        )
+        return known
+
+
+def encloses(sides: Mask, known: Mask, *, max_cells: int = 20) -> bool:
+    """Return whether a cut's side encloses cells known to be on the other, which no scanner could have reached.
+
+    Parameters
+    ----------
+    sides, known : masks of shape (a, b, c), of the cells on a side, and of those known to be off it
+    max_cells : known cells that may be enclosed by chance
     """
     number, _ = ndimage.label(~sides)
     border = np.ones(sides.shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False
     held = np.bincount(number[known & ~sides])
     held[np.unique(number[border & ~sides])] = 0
-    return bool(held[1:].max(initial=0) >= SHUT)
+    return bool(held[1:].max(initial=0) >= max_cells)
 
 
-def _reached(face: Seen, cells: Float, radius: float) -> Mask:
-    """Return the cells, of shape (Q, 3), that are no farther from where a surface was seen than it is believed in."""
-    spread = np.sqrt(np.linalg.eigvalsh(np.cov(face.points.T))[1].clip(0.0))
-    reach = max(REACH * WIDTH * float(spread), FAR * radius)
-    reached: Mask = cKDTree(face.points).query(cells)[0] < reach
-    return reached
-
-
-def _along(
+def _samples_on_cut(
     inside: Mask,
     lattice: Float,
     size: float,
     signed: Float,
-    believed: Mask,
-    faces: list[Surface],
+    valid: Mask,
+    primitives: list[Primitive],
     spacing: float,
+    share: int,
 ) -> tuple[Float, Float]:
-    """Return samples, and normals, of surfaces where a cut runs along them.
+    """Return samples, and normals, of primitives where a cut follows them.
 
     Parameters
     ----------
     inside : mask of shape (a, b, c), the cut
     lattice : array of shape (a, b, c, 3), the cells' centres, `size` apart
-    signed, believed : arrays of shape (Q, faces), as of `minimal_inside`
-    faces : the surfaces
-    spacing : how far apart the samples are
+    signed, valid : arrays of shape (Q, primitives), as of `minimal_inside`
+    primitives : that the cut may follow
+    spacing : how far apart the samples are at least
+    share : samples along a cell's side before that
     """
-    cells, inner_cells = lattice.reshape(-1, 3), inside.ravel()
-    numbers = np.arange(len(cells)).reshape(inside.shape)
-    start, end, spread = [], [], []
-    share = min(max(1, round(size / spacing)), MOST_ALONG)
-    fine = (np.arange(share) + 0.5) / share - 0.5
-    for axis in range(3):
-        one, other = shifted(numbers, tuple(int(axis == k) for k in range(3)))
-        across = np.zeros((share, share, 3))
-        across[..., (axis + 1) % 3], across[..., (axis + 2) % 3] = size * fine[:, None], size * fine[None]
-        for inner, outer in ((one, other), (other, one)):
-            cut = inner_cells[inner] & ~inner_cells[outer]
-            start.append(inner[cut])
-            end.append(outer[cut])
-            spread.append(np.repeat(across.reshape(1, -1, 3), int(cut.sum()), axis=0))
-    inner, outer, beside = np.concatenate(start), np.concatenate(end), np.concatenate(spread)
+    cells = lattice.reshape(-1, 3)
+    inner, outer, offset = _cut_faces(inside, size, (np.arange(share) + 0.5) / share - 0.5)
     points, normals = [], []
-    for number, face in enumerate(faces):
-        on = (signed[inner, number] < 0) & (signed[outer, number] >= 0) & believed[inner, number]
-        some = ((cells[inner[on]] + cells[outer[on]])[:, None] / 2 + beside[on]).reshape(-1, 3)
-        some = feet(face, some)
-        turned = face.normal(some)
-        # Beyond an edge the cut goes on along another face: there both sides of this one are outside, or both inside.
-        below, above = (_sides(inside, lattice, size, some + by * size * turned) for by in (-1, 1))
-        some, turned = some[below & ~above], turned[below & ~above]
-        _, first = np.unique(np.floor(some / spacing), axis=0, return_index=True)
-        points.append(some[first])
-        normals.append(turned[first])
+    for number, primitive in enumerate(primitives):
+        on = (signed[inner, number] < 0) & (signed[outer, number] >= 0) & valid[inner, number]
+        x = ((cells[inner[on]] + cells[outer[on]])[:, None] / 2 + offset[on]).reshape(-1, 3)
+        x = project(primitive, x)
+        normal = primitive.normal(x)
+        # Beyond an edge the cut follows another primitive: both sides of this one are outside there, or both inside.
+        below, above = (_is_inside(inside, lattice, size, x + by * size * normal) for by in (-1, 1))
+        x, normal = x[below & ~above], normal[below & ~above]
+        _, first = np.unique(np.floor(x / spacing), axis=0, return_index=True)
+        points.append(x[first])
+        normals.append(normal[first])
     return np.concatenate(points), np.concatenate(normals)
 
 
-def _sides(inside: Mask, lattice: Float, size: float, x: Float) -> Mask:
+def _cut_faces(inside: Mask, size: float, fine: Float) -> tuple[Int, Int, Float]:
+    """Return the pairs of neighbouring cells that a cut separates, and samples of the square between them.
+
+    Returns
+    -------
+    inner, outer : arrays of shape (pairs,), numbers of the cells
+    offset : array of shape (pairs, S, 3), relative to the middle of both; `fine` are coordinates, in cells
+    """
+    numbers, is_inner = np.arange(inside.size).reshape(inside.shape), inside.ravel()
+    start, end, offset = [], [], []
+    for axis in range(3):
+        one, other = shifted(numbers, tuple(int(axis == k) for k in range(3)))
+        square = np.zeros((len(fine), len(fine), 3))
+        square[..., (axis + 1) % 3], square[..., (axis + 2) % 3] = size * fine[:, None], size * fine[None]
+        for inner, outer in ((one, other), (other, one)):
+            cut = is_inner[inner] & ~is_inner[outer]
+            start.append(inner[cut])
+            end.append(outer[cut])
+            offset.append(np.repeat(square.reshape(1, -1, 3), int(cut.sum()), axis=0))
+    return np.concatenate(start), np.concatenate(end), np.concatenate(offset)
+
+
+def _is_inside(inside: Mask, lattice: Float, size: float, x: Float) -> Mask:
     """Return whether the cells nearest to x, of shape (Q, 3), are inside."""
     at = np.rint((x - lattice[0, 0, 0]) / size).astype(int).clip(0, np.array(inside.shape) - 1)
     sides: Mask = inside[at[:, 0], at[:, 1], at[:, 2]]
@@ -338,50 +313,55 @@ def _lattice(lower: Float, upper: Float, size: float) -> Float:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-WITHIN = 1.5
-"""How far points are looked for around a sample, in distances of the nearest one."""
-
-ACROSS = 0.5
-"""Most cosine of a wall's normal and the face's."""
-
-OPEN = np.radians(150.0)
-"""Widest angle about a sample into which no wall may be, of a mouth."""
-
-MOUTH = 1.6
-"""How far from such a sample others of the same face lie in the mouth, too, in distances of the nearest point."""
-
-ALIKE = 0.95
-"""Least cosine of the normals of samples of one face."""
+# Bore openings. A face that ends at a bore has a hole there, which looks like an unscanned part of the face. Points of
+# the bore's wall, just behind the face, have normals that point to the middle of the hole from all around it: if the
+# face were closed there, they would be inside the part.
 
 
-# Samples of a face that was continued across the mouth of a bore, by what was seen of the bore's wall.
-#
-# A face that ends at a bore has a hole there, which looks like a part of the face that nobody saw. But points just
-# behind the face, on the bore's wall, look to the middle of the hole from all around it, where the thing would be solid
-# if the face went on.
-
-
-def mouths(samples: Float, normals: Float, points: Float, their_normals: Float) -> Mask:
-    """Return which samples lie in the mouths of bores, of shape (M,).
+def in_bore_opening(
+    samples: Float,
+    normals: Float,
+    points: Float,
+    point_normals: Float,
+    *,
+    search_distances: float = 1.5,
+    group_distances: float = 1.6,
+    min_group_cosine: float = 0.95,
+) -> Mask:
+    """Return which samples lie in the openings of bores, of shape (M,).
 
     Parameters
     ----------
-    samples, normals : arrays of shape (M, 3), of faces that were continued
-    points, their_normals : arrays of shape (N, 3), of the scan
+    samples, normals : arrays of shape (M, 3), of extended faces
+    points, point_normals : arrays of shape (N, 3), of the scan
+    search_distances : how far around a sample wall points are looked for, in distances of its nearest point
+    group_distances : how far from such a sample others of its face are in the opening too, in the same distances
+    min_group_cosine : of the angle between the normals of one face
     """
     found = np.zeros(len(samples), dtype=bool)
     if not len(samples):
         return found
     tree, others = cKDTree(points), cKDTree(samples)
     away = tree.query(samples)[0]
-    for row, near in enumerate(tree.query_ball_point(samples, WITHIN * away)):
-        if not found[row] and _walled(points[near] - samples[row], their_normals[near], normals[row]):
-            same = np.array(others.query_ball_point(samples[row], MOUTH * away[row]))
-            found[same[normals[same] @ normals[row] > ALIKE]] = True
+    for row, near in enumerate(tree.query_ball_point(samples, search_distances * away)):
+        if not found[row] and _is_walled(points[near] - samples[row], point_normals[near], normals[row]):
+            same = np.array(others.query_ball_point(samples[row], group_distances * away[row]))
+            found[same[normals[same] @ normals[row] > min_group_cosine]] = True
     return found
 
 
-def _walled(places: Float, normals: Float, axis: Float) -> bool:
-    """Return whether walls, behind the origin along an axis, look to it from all around it."""
-    wall = (np.abs(normals @ axis) < ACROSS) & (places @ axis < 0) & (np.einsum("nd,nd->n", normals, places) < 0)
-    return bool(widest_gap(places[wall], axis) < OPEN)
+def _is_walled(
+    offsets: Float, normals: Float, axis: Float, *, max_wall_cosine: float = 0.5, max_gap_degrees: float = 150.0
+) -> bool:
+    """Return whether walls behind the origin, along an axis, face it from all around.
+
+    Parameters
+    ----------
+    offsets, normals : arrays of shape (N, 3), of points near the origin
+    axis : array of shape (3,), the face's normal
+    max_wall_cosine : of the angle between a wall's normal and the axis: walls may slope by 30 degrees
+    max_gap_degrees : widest angle around the axis without a wall
+    """
+    wall = np.abs(normals @ axis) < max_wall_cosine
+    wall &= (offsets @ axis < 0) & (np.einsum("nd,nd->n", normals, offsets) < 0)
+    return bool(widest_gap(offsets[wall], axis) < np.radians(max_gap_degrees))

@@ -1,10 +1,10 @@
-"""The inside of a lattice by a minimal cut: the least surface between what is known inside and what is known outside.
+"""Which cells of a lattice are inside, by a minimal cut between those known to be inside and outside.
 
-The area of the cut is measured by the pairs of neighbours that it parts, all 26 of them weighted by one over their
-distance. Where the cut runs along a surface that is believed in, from its inside to its outside, it costs less; so
-faces are continued to where they meet, although a chamfer would be smaller.
-Source: Boykov and Kolmogorov, Computing Geodesics and Minimal Surfaces via Graph Cuts (2003); that primitives make
-sides of a cut: Labatut, Pons and Keriven, Hierarchical Shape-Based Surface Reconstruction (2009).
+The area of the cut is the number of neighbouring pairs that it separates, all 26 of a cell, weighted by one over their
+distance. Where the cut follows a given surface, from its inside to its outside, it costs less. So faces are extended
+until they meet, although a chamfer would have less area.
+Sources: Boykov and Kolmogorov, Computing Geodesics and Minimal Surfaces via Graph Cuts (2003); primitives as sides of a
+cut: Labatut, Pons and Keriven, Hierarchical Shape-Based Surface Reconstruction (2009). Entry: `minimal_inside`.
 """
 
 from __future__ import annotations
@@ -17,23 +17,20 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from gnrecon.geometry.arrays import Float, Int, Mask
 
-ALONG = 0.1
-"""What an area along a believed surface costs, as a share of any other's."""
 
-UNITS = 1000
-"""Integer capacity of a pair one cell apart."""
-
-STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
-
-
-def minimal_inside(known: Int, signed: Float, believed: Mask) -> Mask:
+def minimal_inside(
+    known: Int, signed: Float, valid: Mask, *, surface_cost: float = 0.1, unit_capacity: int = 1000
+) -> Mask:
     """Return which cells of a lattice are inside, of shape (a, b, c).
 
     Parameters
     ----------
-    known : array of shape (a, b, c): 1 inside, -1 outside, 0 where the cut is to tell
+    known : array of shape (a, b, c): 1 inside, -1 outside, 0 where the cut decides
     signed : array of shape (a, b, c, surfaces), signed distances, negative inside
-    believed : mask of the same shape, where each surface is believed in
+    valid : mask of the same shape, where each surface may be followed
+    surface_cost : of a unit of area along a surface, over that of any other: small, so that surfaces are preferred
+        even where they have several times the area
+    unit_capacity : of a pair one cell apart; the flow solver takes integers, so that weights are rounded to 1/1000
     """
     free = known.ravel() == 0
     count = int(free.sum())
@@ -41,18 +38,19 @@ def minimal_inside(known: Int, signed: Float, believed: Mask) -> Mask:
     node = np.where(known.ravel() > 0, source, sink)
     node[free] = np.arange(count)
     cells = np.arange(known.size).reshape(known.shape)
-    within, told = signed.reshape(known.size, -1) < 0, believed.reshape(known.size, -1)
+    inner, followed = signed.reshape(known.size, -1) < 0, valid.reshape(known.size, -1)
     rows, cols, costs = [], [], []
-    for step in STEPS:
-        cost = UNITS / float(np.linalg.norm(step))
+    # Each of the 26 neighbours once: the 13 steps of one half space.
+    for step in (step for step in itertools.product((-1, 0, 1), repeat=3) if step > (0, 0, 0)):
+        cost = unit_capacity / float(np.linalg.norm(step))
         one, other = shifted(cells, step)
         touches = free[one] | free[other]
         for start, end in ((one[touches], other[touches]), (other[touches], one[touches])):
             # Cut where `start` is inside and `end` is outside.
-            along = (within[start] & ~within[end] & told[start]).any(axis=1)
+            along = (inner[start] & ~inner[end] & followed[start]).any(axis=1)
             rows.append(node[start])
             cols.append(node[end])
-            costs.append(np.where(along, ALONG * cost, cost))
+            costs.append(np.where(along, surface_cost * cost, cost))
     capacity = np.concatenate(costs).astype(np.int32)
     graph = coo_matrix((capacity, (np.concatenate(rows), np.concatenate(cols))), shape=(count + 2, count + 2)).tocsr()
     left = graph - maximum_flow(graph, source, sink).flow

@@ -1,1 +1,1 @@
-"""One module for each file format that is read or written; `gnrecon.io.format_registry` knows them by extension."""
+"""One module for each file format; `gnrecon.io.format_registry` lists them by extension."""

@@ -1,14 +1,17 @@
-"""GLB, binary glTF, by trimesh; glTF in text is turned into the same by `gltf.py`.
+"""glTF 2.0, binary (GLB) and in text, by trimesh (specification: https://registry.khronos.org/glTF).
 
 glTF stores float32. Positions are therefore stored relative to the middle of the mesh's bounding box, and the node's
-matrix, whose numbers are JSON text with all digits, carries the offset.
+matrix, whose numbers are JSON text with all digits, holds the offset.
 
-Colours of vertices are linear light in glTF, which 8 bits would make too coarse in the dark: they are written, and
-read, as the 16-bit numbers that the format also allows. trimesh knows 8 bits only, so it handles them as an attribute
-of another name, and the file's JSON is renamed behind it. All other attributes are float32, named with an underscore.
+Vertex colours are linear light in glTF, for which 8 bits are too coarse in dark tones, so they are written and read as
+16-bit numbers. trimesh supports only 8 bits, so it gets them as a custom attribute, ``_COLOR_0``, which is renamed to
+and from ``COLOR_0`` in the file's JSON. All other attributes are float32, and their names begin with an underscore.
 
-Of bare points trimesh gives the positions alone. They are shown to it as triangles therefore, of which one names the
-first point three times, by an accessor without a buffer, whose values are zero by the specification.
+trimesh reads only the positions of point clouds. They are therefore passed to it as a mesh of one triangle that uses
+the first point three times: its indices are an accessor without a buffer, whose values are zero by the specification.
+
+Text glTF has its JSON in a file of its own and its buffers inside it or in other files. It is read as the equivalent
+GLB: a GLB has one buffer, so all buffers are concatenated, and the views into them are moved.
 """
 
 from __future__ import annotations
@@ -24,31 +27,13 @@ import numpy as np
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, parsing
-from gnrecon.io.parse import beside
+from gnrecon.io.contents import Contents, guard_parser
+from gnrecon.io.parse import sibling_path
 from gnrecon.runtime.errors import InputError
 
-_COLOR, _HIDDEN = "COLOR_0", "_COLOR_0"
-"""The name of colours in glTF, and the one under which trimesh takes them for any attribute."""
 
-_JSON = b"JSON"
-
-_POINTS, _TRIANGLES, _UNSIGNED_BYTE = 0, 4, 5121
-
-_NO_TRIANGLE = [[0, 0, 0]]
-"""The faces of what are points only."""
-
-_UNREAD = {
-    b"TEXCOORD_0": "texture coordinates",
-    b"textures": "textures",
-    b"animations": "animations",
-    b"skins": "skins",
-}
-"""Words of the JSON that name what is left out."""
-
-
-def fits_glb(name: str, values: Values) -> bool:
-    """Whether glTF can hold an attribute: finite numbers of up to four columns that float32 tells apart."""
+def glb_supports(name: str, values: Values) -> bool:
+    """Whether glTF can store an attribute: finite numbers of up to four columns that float32 keeps apart."""
     if name == "colors":
         return True
     if values.dtype.kind not in "biuf" or values.ndim > 2 or (values.ndim == 2 and values.shape[1] > 4):
@@ -75,23 +60,24 @@ def read_glb_bytes(data: bytes) -> Contents:
     """Read the bytes of a GLB file, as `read_glb` does."""
     import trimesh
 
-    with parsing("GLB"):
-        file = trimesh.util.wrap_as_stream(_renamed(data))
+    with guard_parser("GLB"):
+        file = trimesh.util.wrap_as_stream(_readable_by_trimesh(data))
         scene = trimesh.load_scene(file, file_type="glb", process=False, skip_materials=True)
         return _collected(scene, _unread(data))
 
 
 def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
-    """All that a scene shows, in one."""
+    """All meshes and clouds of a scene, in one."""
     vertices, normals, faces, attributes, start = [], [], [], [], 0
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         part = scene.geometry[name]
         vertices.append(np.asarray(part.vertices) @ matrix[:3, :3].T + matrix[:3, 3])
         triangles = np.asarray(part.faces, np.int64)
-        triangles = triangles[:0] if np.array_equal(triangles, _NO_TRIANGLE) else triangles
-        # A mirroring matrix turns faces inside out, so their corners are reversed.
+        triangles = triangles[:0] if np.array_equal(triangles, [[0, 0, 0]]) else triangles
+        # A mirroring matrix would turn faces inside out, so their corners are reversed.
         faces.append((triangles if np.linalg.det(matrix[:3, :3]) > 0 else triangles[:, ::-1]) + start)
+        # Normals transform by the inverse transpose of the matrix, which for row vectors is a product with the inverse.
         normals.append(np.asarray(part.vertex_normals) @ np.linalg.inv(matrix[:3, :3]))
         attributes.append(part.vertex_attributes)
         start += len(part.vertices)
@@ -105,32 +91,40 @@ def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
 
 
 def _unread(data: bytes) -> tuple[str, ...]:
-    """Name what else the file's JSON speaks of."""
+    """Describe what else the file's JSON declares."""
+    names = {
+        b"TEXCOORD_0": "texture coordinates",
+        b"textures": "textures",
+        b"animations": "animations",
+        b"skins": "skins",
+    }
+    # A GLB begins with 12 bytes of header, then 4 for the length, 4 for the type, and the text of the JSON chunk.
     text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
-    return tuple(name for word, name in _UNREAD.items() if b'"' + word + b'"' in text)
+    return tuple(name for word, name in names.items() if b'"' + word + b'"' in text)
 
 
-def _renamed(data: bytes) -> bytes:
-    """The file with colours under the name of any attribute, and points as triangles: what trimesh gives in full."""
+def _readable_by_trimesh(data: bytes) -> bytes:
+    """The file with colours as a custom attribute, and points as triangles, so that trimesh reads both in full."""
     length = int.from_bytes(data[12:16], "little")
-    if data[16:20] != _JSON:
+    if data[16:20] != b"JSON":
         return data
     tree = json.loads(data[20 : 20 + length])
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
-            _rename(primitive["attributes"], _COLOR, _HIDDEN)
-            if primitive.get("mode") == _POINTS:
-                tree["accessors"].append({"componentType": _UNSIGNED_BYTE, "type": "SCALAR", "count": 3})
-                primitive.update(mode=_TRIANGLES, indices=len(tree["accessors"]) - 1)
-    return packed(tree, data[20 + length :])
+            _rename(primitive["attributes"], "COLOR_0", "_COLOR_0")
+            if primitive.get("mode") == 0:  # points; mode 4 is triangles, component type 5121 is unsigned bytes
+                tree["accessors"].append({"componentType": 5121, "type": "SCALAR", "count": 3})
+                primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
+    return pack_glb(tree, data[20 + length :])
 
 
-def packed(tree: dict[str, Any], rest: bytes) -> bytes:
-    """Return a GLB file of its JSON and of the chunks that follow it."""
+def pack_glb(tree: dict[str, Any], rest: bytes) -> bytes:
+    """Return the bytes of a GLB file with this JSON, followed by other chunks."""
     text = json.dumps(tree).encode()
+    # Chunks are padded to multiples of 4 bytes, JSON with blanks.
     text += b" " * (-len(text) % 4)
     size = (20 + len(text) + len(rest)).to_bytes(4, "little")
-    return b"glTF\x02\0\0\0" + size + len(text).to_bytes(4, "little") + _JSON + text + rest
+    return b"glTF\x02\0\0\0" + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
 
 
 def _rename(names: dict[str, Any], old: str, new: str) -> None:
@@ -145,13 +139,14 @@ def _attributes(parts: list[dict[str, Any]]) -> dict[str, Values]:
         values = [np.asarray(part[name]) for part in parts if name in part]
         if len(values) < len(parts) or any(one.shape[1:] != first.shape[1:] for one in values):
             continue
-        joined = np.concatenate(values)
-        if name == _HIDDEN:
-            full = 1.0 if joined.dtype.kind == "f" else float(np.iinfo(joined.dtype).max)
-            colors = to_srgb(joined / full)
+        column = np.concatenate(values)
+        if name == "_COLOR_0":
+            full = 1.0 if column.dtype.kind == "f" else float(np.iinfo(column.dtype).max)
+            colors = to_srgb(column / full)
+            # A fully opaque alpha channel carries no information.
             found["colors"] = colors if (colors[:, 3:] < 255).any() else colors[:, :3]
         else:
-            found[name.lstrip("_").lower()] = joined[:, 0] if joined.shape[1:] == (1,) else joined
+            found[name.lstrip("_").lower()] = column[:, 0] if column.shape[1:] == (1,) else column
     return found
 
 
@@ -167,7 +162,7 @@ def write_glb(mesh: Mesh, path: Path) -> None:
     }
     if "colors" in mesh.attributes:
         light = to_linear(with_alpha(as_bytes(mesh.attributes["colors"])))
-        attributes[_HIDDEN] = np.rint(light * np.iinfo(np.uint16).max).astype(np.uint16)
+        attributes["_COLOR_0"] = np.rint(light * np.iinfo(np.uint16).max).astype(np.uint16)
     part = trimesh.Trimesh(
         mesh.vertices - middle,
         mesh.faces,
@@ -178,23 +173,18 @@ def write_glb(mesh: Mesh, path: Path) -> None:
     )
     scene: Any = trimesh.Scene()
     scene.add_geometry(part, node_name="mesh", transform=matrix)
-    path.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=_finish))
+    path.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=_set_colors_and_material))
 
 
-def _finish(tree: dict[str, Any]) -> None:
-    """Name the colours as glTF does, and give the mesh a matt material: without one, viewers take it for metal."""
+def _set_colors_and_material(tree: dict[str, Any]) -> None:
+    """Give the colours their glTF name, and the mesh a matt material: without one, viewers draw it as metal."""
     primitive = tree["meshes"][0]["primitives"][0]
-    _rename(primitive["attributes"], _HIDDEN, _COLOR)
-    if _COLOR in primitive["attributes"]:
-        accessor = tree["accessors"][primitive["attributes"][_COLOR]]
+    _rename(primitive["attributes"], "_COLOR_0", "COLOR_0")
+    if "COLOR_0" in primitive["attributes"]:
+        accessor = tree["accessors"][primitive["attributes"]["COLOR_0"]]
         accessor["normalized"] = True
     tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
     primitive["material"] = 0
-
-
-# glTF with its JSON in a text file, and its buffers inside of that or in files beside it: read as the GLB of the same.
-#
-# A GLB has one buffer, so all buffers are put in a row, and the views into them are moved.
 
 
 def read_gltf(path: Path) -> Contents:
@@ -205,7 +195,7 @@ def read_gltf(path: Path) -> Contents:
     InputError
         When the file is malformed, holds no vertices, or a buffer is missing.
     """
-    with parsing("glTF"):
+    with guard_parser("glTF"):
         tree = json.loads(path.read_bytes())
         buffers = [_buffer(one["uri"], path.parent) for one in tree.get("buffers", [])]
         starts = [0]
@@ -214,7 +204,7 @@ def read_gltf(path: Path) -> Contents:
         for view in tree.get("bufferViews", []):
             view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
             view["buffer"] = 0
-        data = packed(_with_one_buffer(tree, starts[-1]), _chunk(buffers))
+        data = pack_glb(_with_one_buffer(tree, starts[-1]), _chunk(buffers))
     return read_glb_bytes(data)
 
 
@@ -231,7 +221,7 @@ def _buffer(uri: str, folder: Path) -> bytes:
     """The bytes of a data URI, or of a file in or below the scene's folder."""
     if uri.startswith("data:"):
         return binascii.a2b_base64(uri.partition(",")[2])
-    target = beside(folder, unquote(uri), "buffer")
+    target = sibling_path(folder, unquote(uri), "buffer")
     if not target.is_file():
-        raise InputError(f"the buffer {uri[:80]!r} is missing beside the file.")
+        raise InputError(f"the buffer {uri[:80]!r} is missing from the file's folder.")
     return target.read_bytes()

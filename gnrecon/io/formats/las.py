@@ -1,11 +1,11 @@
 """LAS and its compressed form LAZ, the lidar formats of the ASPRS, by laspy with lazrs.
 
 Coordinates are stored as integers with a scale and an offset for each axis (specification LAS 1.4 R15, 2.4); they come
-back as ``scale * integer + offset`` in float64, so that projected coordinates keep all their digits. A record has a
-fixed place for everything that an aerial survey may know; what is zero for all points was never filled in and is left
-out. Points that are marked as withheld are deleted ones, by the specification, and are not read.
+back as ``scale * integer + offset`` in float64, so that projected coordinates keep all their digits. A record has fixed
+fields for everything that an aerial survey may measure; fields that are zero for all points were never filled in and
+are dropped. Points marked as withheld are deleted ones, by the specification, and are not read.
 
-A file's header is compared with its size first: the library would else allocate, or loop over, whatever it is told.
+A file's header is first checked against its size, because the library would allocate whatever a damaged one declares.
 """
 
 from __future__ import annotations
@@ -21,38 +21,29 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Mask, Values
-from gnrecon.io.contents import Columns, Contents, from_columns, joined, parsing
+from gnrecon.io.contents import Columns, Contents, concatenated, from_columns, guard_parser
+from gnrecon.io.io_parameters import IOParameters
 from gnrecon.runtime.errors import InputError
 
-_LEAST_HEADER, _VLR, _EVLR = 227, 54, 60  # bytes, from the specification
-_COMPRESSED = 0xC0
-"""Bits of the point format by which compressed files are told."""
-
-_LEAST_POINT = 20
-"""Bytes of a point in the smallest format; the first one of each compressed chunk is stored so."""
-
-_MOST_BYTES = 1 << 28
-"""Of the records in a chunk: those of a damaged file may be any size."""
-
-_SKIPPED = ("X", "Y", "Z", "red", "green", "blue", "withheld", "synthetic", "key_point", "overlap")
-
-# The library reports short files on the log, which would print there; `_require_all` refuses them before.
+# The library logs short files, which would be printed; `_require_consistent_header` refuses them first.
 logging.getLogger("laspy").addHandler(logging.NullHandler())
 
 
 def read_las(path: Path) -> Contents:
-    """Read all points with what is filled in of their attributes: intensity, classification, colours, extra ones.
+    """Read all points with their attributes that are filled in: intensity, classification, colours, extra ones.
 
     Raises
     ------
     InputError
         When the file is malformed or shorter than its header says.
     """
-    return settled(joined(list(las_chunks(path, 1 << 20)) or [Contents(np.empty((0, 3)))]))
+    return drop_unused_attributes(
+        concatenated(list(las_chunks(path, IOParameters.chunk_points)) or [Contents(np.empty((0, 3)))])
+    )
 
 
-def las_chunks(path: Path, rows: int) -> Iterator[Contents]:
-    """Yield the points, at most `rows` at a time.
+def las_chunks(path: Path, rows: int, *, most_chunk_bytes: int = 1 << 28) -> Iterator[Contents]:
+    """Yield the points, at most `rows` at a time and in at most `most_chunk_bytes`: damaged records may have any size.
 
     Raises
     ------
@@ -61,17 +52,17 @@ def las_chunks(path: Path, rows: int) -> Iterator[Contents]:
     """
     import laspy
 
-    _require_all(path)
-    # The parallel decompressor takes the sizes that a damaged file states for granted, and ends the process.
+    _require_consistent_header(path)
+    # The parallel decompressor trusts the sizes in a damaged file and aborts the process.
     backend = laspy.LazBackend.Lazrs
     with (
         path.open("rb") as file,
-        parsing("LAS or LAZ"),
-        _no_more_than_it_holds(),
+        guard_parser("LAS or LAZ"),
+        _memory_error_as_damage(),
         laspy.open(file, closefd=False, laz_backend=backend) as reader,
     ):
         left = reader.header.point_count
-        rows = max(1, min(rows, _MOST_BYTES // max(reader.header.point_format.size, 1)))
+        rows = max(1, min(rows, most_chunk_bytes // max(reader.header.point_format.size, 1)))
         for chunk in reader.chunk_iterator(rows):
             left -= len(chunk)
             yield _contents(chunk)
@@ -80,18 +71,18 @@ def las_chunks(path: Path, rows: int) -> Iterator[Contents]:
 
 
 @contextmanager
-def _no_more_than_it_holds() -> Iterator[None]:
-    """Take want of memory for what it is here: chunks are small, so only damaged sizes can ask for so much."""
+def _memory_error_as_damage() -> Iterator[None]:
+    """Report a lack of memory as damage: chunks are small, so only damaged sizes can require so much."""
     try:
         yield
     except MemoryError:
         raise InputError("the header declares records that are larger than this machine's memory.") from None
 
 
-def settled(contents: Contents) -> Contents:
+def drop_unused_attributes(contents: Contents) -> Contents:
     """Return all contents of a file without attributes that are zero everywhere, and with colours on their own scale.
 
-    Colours have 16 bits by the specification. Where none exceeds 255, a program has put 8-bit ones into their places.
+    Colours have 16 bits by the specification. Where none exceeds 255, the program that wrote them has stored 8 bits.
     """
     filled = {name: values for name, values in contents.attributes.items() if (values != 0).any()}
     if "colors" in filled and filled["colors"].max() <= 255:
@@ -100,7 +91,9 @@ def settled(contents: Contents) -> Contents:
 
 
 def _contents(chunk: Any) -> Contents:
-    names = [name for name in chunk.point_format.dimension_names if name not in _SKIPPED]
+    # X, Y and Z are the unscaled integers, and the flags describe processing, not the surface.
+    skipped = {"X", "Y", "Z", "red", "green", "blue", "withheld", "synthetic", "key_point", "overlap"}
+    names = [name for name in chunk.point_format.dimension_names if name not in skipped]
     used = np.asarray(chunk.withheld) == 0
     columns: dict[str, Values] = {axis: np.asarray(getattr(chunk, axis))[used] for axis in "xyz"}
     columns |= {name: np.asarray(chunk[name])[used] for name in names}
@@ -121,43 +114,51 @@ def _colors(chunk: Any, used: Mask) -> Columns:
     return {"colors": np.column_stack([np.asarray(chunk[name])[used] for name in ("red", "green", "blue")])}
 
 
-def _require_all(path: Path) -> None:
-    """Refuse a header that is none, or that declares more than the file holds.
+def _require_consistent_header(
+    path: Path, *, least_header_bytes: int = 227, record_bytes: int = 54, extended_record_bytes: int = 60
+) -> None:
+    """Refuse a missing header, or one that declares more than the file holds; sizes are those of the specification.
 
     Raises
     ------
     InputError
-        With the sentence that says which.
+        With a sentence on what is wrong.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
+        # The header of LAS 1.4 has 375 bytes; that of older versions begins in the same way.
         head = file.read(375)
-    if len(head) < _LEAST_HEADER or not head.startswith(b"LASF"):
+    if len(head) < least_header_bytes or not head.startswith(b"LASF"):
         raise InputError("the file does not begin with the header of a LAS file.")
+    # At offset 94: header size, start of the points, number of records before them, point format, and the length and
+    # number of points. LAS 1.4 repeats the number with 64 bits, after the extended records, at offset 235.
     minor, (header_size, start, vlrs, kind, length, count) = head[25], struct.unpack_from("<HIIBHI", head, 94)
     if minor >= 4 and len(head) == 375:
         evlr_start, evlrs, count = struct.unpack_from("<QIQ", head, 235)
-        if evlrs and evlr_start + evlrs * _EVLR > size:
+        if evlrs and evlr_start + evlrs * extended_record_bytes > size:
             raise InputError("the header declares extended records that lie beyond the file's end.")
-    if header_size < _LEAST_HEADER or header_size + vlrs * _VLR > start or start > size:
+    if header_size < least_header_bytes or header_size + vlrs * record_bytes > start or start > size:
         raise InputError("the header's sizes contradict each other or the file's size.")
     held = (size - start) // max(length, 1)
-    if kind & _COMPRESSED:
+    if kind & 0xC0:  # bits that mark a compressed file
         _require_chunk_table(path, start, size)
     elif count > held:
         raise InputError(f"the header declares {count} points, but the file ends after {held}.")
 
 
-def _require_chunk_table(path: Path, start: int, size: int) -> None:
-    """Refuse a table of compressed chunks that lies outside of the file, or lists more of them than it can hold."""
+def _require_chunk_table(path: Path, start: int, size: int, *, least_point_bytes: int = 20) -> None:
+    """Refuse a table of compressed chunks that lies outside of the file, or lists more of them than it can hold.
+
+    The first point of each chunk is not compressed, and takes at least `least_point_bytes`, those of format 0.
+    """
     with path.open("rb") as file:
         file.seek(start)
         place = int.from_bytes(file.read(8), "little", signed=True)
-        if place == -1:  # written behind everything else, by a program that could not go back
+        if place == -1:  # the program could not seek, and wrote the position at the end of the file
             file.seek(size - 8)
             place = int.from_bytes(file.read(8), "little", signed=True)
         file.seek(max(place, 0))
         table = file.read(8)
     chunks = int.from_bytes(table[4:], "little")
-    if not start + 8 <= place <= size - 8 or len(table) < 8 or chunks * _LEAST_POINT > size:
+    if not start + 8 <= place <= size - 8 or len(table) < 8 or chunks * least_point_bytes > size:
         raise InputError("the table of compressed chunks contradicts the file's size.")

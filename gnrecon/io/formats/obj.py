@@ -1,7 +1,7 @@
 """OBJ, Wavefront's text format: positions, vertex normals and polygons.
 
-The file's own vertices are kept in their order. Readers made for rendering split a vertex wherever its texture or
-normal differs between faces, which opens closed surfaces; here a vertex gets the mean of its corners' normals.
+Vertices are kept as they are, in their order. Readers for rendering split a vertex wherever its texture or normal
+differs between faces, which opens closed surfaces; here a vertex gets the mean of its corners' normals.
 """
 
 from __future__ import annotations
@@ -13,21 +13,9 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, fan, no_faces, not_triangles
-from gnrecon.io.parse import format_rows, read_text, rows_of
+from gnrecon.io.contents import Contents, fan_triangles, no_faces, polygon_remarks
+from gnrecon.io.parse import format_rows, parse_rows, read_text
 from gnrecon.runtime.errors import InputError
-
-_UNREAD = {
-    "vt": "texture coordinates",
-    "usemtl": "materials",
-    "l": "lines",
-    "p": "points",
-    "curv": "free-form curves and surfaces",
-    "surf": "free-form curves and surfaces",
-    "o": "names of objects and groups",
-    "g": "names of objects and groups",
-}
-"""Kinds of lines that are left out, and what they hold."""
 
 
 def read_obj(path: Path) -> Contents:
@@ -36,30 +24,43 @@ def read_obj(path: Path) -> Contents:
     Raises
     ------
     InputError
-        When there is no vertex, a word is no number, or an index points nowhere.
+        When there is no vertex, a word is not a number, or an index is out of range.
     """
+    # A backslash at the end of a line continues it.
     lines = [line.strip() for line in read_text(path).replace("\\\n", " ").splitlines()]
-    vertices = rows_of([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "the 'v' lines")
-    normals = rows_of([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "the 'vn' lines")
+    vertices = parse_rows([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "the 'v' lines")
+    normals = parse_rows([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "the 'vn' lines")
     if not len(vertices):
         raise InputError("the file holds no vertex line ('v x y z').")
     colors = {"colors": vertices[:, 3:6]} if vertices.shape[1] >= 6 else {}
     points = np.ascontiguousarray(vertices[:, :3])
     counts, corners = _corners(lines)
     if not len(counts):
+        # Without faces nothing links normals to vertices; as many normals as vertices belong to them in order.
         given = normals[:, :3] if len(normals) == len(points) else None
         return Contents(points, given, no_faces(), colors, _unread(lines))
     corner_vertices = _indices([word.partition("/")[0] for word in corners], lines, counts, "v")
     if corner_vertices.max() >= len(points):
         raise InputError(f"a face names vertex {corner_vertices.max() + 1}, but there are {len(points)}.")
     given = _normals(corners, corner_vertices, normals, lines, counts, len(points))
-    return Contents(points, given, fan(counts, corner_vertices), colors, _unread(lines) + not_triangles(counts))
+    unread = _unread(lines) + polygon_remarks(counts)
+    return Contents(points, given, fan_triangles(counts, corner_vertices), colors, unread)
 
 
 def _unread(lines: list[str]) -> tuple[str, ...]:
-    """Name what other kinds of lines hold."""
-    kinds = {word for word in (line.partition(" ")[0] for line in lines) if word in _UNREAD}
-    return tuple(dict.fromkeys(name for word, name in _UNREAD.items() if word in kinds))
+    """Describe the lines that are not read."""
+    names = {
+        "vt": "texture coordinates",
+        "usemtl": "materials",
+        "l": "lines",
+        "p": "points",
+        "curv": "free-form curves and surfaces",
+        "surf": "free-form curves and surfaces",
+        "o": "names of objects and groups",
+        "g": "names of objects and groups",
+    }
+    kinds = {word for word in (line.partition(" ")[0] for line in lines) if word in names}
+    return tuple(dict.fromkeys(name for word, name in names.items() if word in kinds))
 
 
 def _corners(lines: list[str]) -> tuple[Int, list[str]]:
@@ -73,7 +74,7 @@ def _indices(words: list[str], lines: list[str], counts: Int, kind: str) -> Int:
     try:
         stated = np.array(list(map(int, words)), np.int64)
     except ValueError:
-        raise InputError("a face holds a corner that is no vertex index.") from None
+        raise InputError("a face holds a corner that is not a vertex index.") from None
     before = np.zeros(len(words), np.int64)
     if (stated < 0).any():
         seen = np.cumsum([line.startswith((f"{kind} ", f"{kind}\t")) for line in lines])
@@ -106,7 +107,7 @@ def _normals(
 def write_obj(mesh: Mesh, path: Path) -> None:
     """Write positions with all digits of float64, vertex normals where the mesh has them, and triangles.
 
-    Colours follow the positions as shares of full brightness, which is no part of the format but widely read.
+    Colours follow the positions as shares of full brightness, which is not part of the format but widely supported.
     """
     colors = mesh.attributes.get("colors")
     if colors is None:

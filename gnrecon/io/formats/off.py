@@ -10,11 +10,9 @@ import numpy as np
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, fan, no_faces, not_triangles
-from gnrecon.io.parse import format_rows, meaningful_lines, numbers, read_text, rows_of
+from gnrecon.io.contents import Contents, fan_triangles, no_faces, polygon_remarks
+from gnrecon.io.parse import content_lines, format_rows, parse_numbers, parse_rows, read_text
 from gnrecon.runtime.errors import InputError
-
-_KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF\b", re.IGNORECASE)
 
 
 def read_off(path: Path) -> Contents:
@@ -23,13 +21,14 @@ def read_off(path: Path) -> Contents:
     Raises
     ------
     InputError
-        When the keyword or the counts are missing, rows are missing or too short, or a word is no number.
+        When the keyword or the counts are missing, rows are missing or too short, or a word is not a number.
     """
-    lines = meaningful_lines(read_text(path))
-    keyword = _KEYWORD.match(lines[0]) if lines else None
+    lines = content_lines(read_text(path))
+    keyword = re.match(r"(ST)?(C)?(N)?OFF\b", lines[0], re.IGNORECASE) if lines else None
     if keyword is None or "BINARY" in lines[0].upper():
         raise InputError("expected a text file that begins with the word OFF.")
     rest = lines[0][keyword.end() :].split()
+    # Some files have the counts on the line of the keyword.
     words, lines = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
     if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
         raise InputError(f"expected the numbers of vertices and faces, but found {' '.join(words)[:60]!r}.")
@@ -40,7 +39,7 @@ def read_off(path: Path) -> Contents:
         )
     if not vertex_count:
         raise InputError("the header declares no vertices.")
-    table = rows_of(lines[:vertex_count], "the vertex rows")
+    table = parse_rows(lines[:vertex_count], "the vertex rows")
     has_normals, has_colors = bool(keyword[3]), bool(keyword[2])
     if has_normals and table.shape[1] < 6:
         raise InputError(f"NOFF vertices need 6 numbers each, but hold {table.shape[1]}.")
@@ -52,7 +51,7 @@ def read_off(path: Path) -> Contents:
 
 
 def _faces(lines: list[str]) -> tuple[Int, tuple[str, ...]]:
-    """Return the triangles of rows ``n i1 ... in [colour]``, and the names of what is not kept of them."""
+    """Return the triangles of rows ``n i1 ... in [colour]``, and descriptions of what is not kept."""
     if not lines:
         return no_faces(), ()
     counts, corners, colored = [], [], False
@@ -65,8 +64,8 @@ def _faces(lines: list[str]) -> tuple[Int, tuple[str, ...]]:
         corners += words[1 : count + 1]
         colored |= len(words) > count + 1
     sides = np.array(counts, np.int64)
-    unread = ("colours of faces",) * colored + not_triangles(sides)
-    return fan(sides, numbers(corners).astype(np.int64)), unread
+    unread = ("colours of faces",) * colored + polygon_remarks(sides)
+    return fan_triangles(sides, parse_numbers(corners).astype(np.int64)), unread
 
 
 def write_off(mesh: Mesh, path: Path) -> None:

@@ -1,9 +1,9 @@
 """PCD, the Point Cloud Library's format, by open3d's tensor reader.
 
-That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). But it reports failures by
-printing a warning and returning an empty cloud, and fills up what a short file lacks with zeros. So the amount of data
-is compared with the header before, and the number of points after. A header that contradicts itself ends the process
-there, so that it is refused here.
+That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). But on failure it prints a
+warning and returns an empty cloud, and it pads a short file with zeros. The amount of data is therefore compared with
+the header before reading, and the number of points afterwards. A contradictory header would abort the process, so it is
+refused here.
 """
 
 from __future__ import annotations
@@ -14,15 +14,10 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents, no_faces
-from gnrecon.io.parse import numbers
+from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
 Header = dict[str, list[str]]
-
-_NORMAL = ("normal_x", "normal_y", "normal_z")
-_SINGLE = ("x", "y", "z", "rgb", "rgba", *_NORMAL)
-_TYPES = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
-_KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
 def read_pcd(path: Path) -> Contents:
@@ -38,7 +33,7 @@ def read_pcd(path: Path) -> Contents:
     header, body = _split(path.read_bytes())
     declared = int(header["POINTS"][0])
     _require_consistent(header)
-    _require_all(header, body, declared)
+    _require_complete(header, body, declared)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, format="pcd")
     arrays: dict[str, Values] = {name: cloud.point[name].numpy() for name in cloud.point}
@@ -53,7 +48,7 @@ def read_pcd(path: Path) -> Contents:
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:
-    """Return the header's words by key, and the data behind it."""
+    """Return the header's words by key, and the data that follows it."""
     header: Header = {}
     start = 0
     while "DATA" not in header and start < len(data):
@@ -64,7 +59,8 @@ def _split(data: bytes) -> tuple[Header, bytes]:
                 raise InputError(f"the PCD header has two lines {words[0][:20]}.")
             header[words[0]] = words[1:]
         start = end
-    missing = [key for key in _KEYS if not header.get(key)]
+    required = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
+    missing = [key for key in required if not header.get(key)]
     if missing:
         raise InputError(f"the PCD header lacks {' and '.join(missing)}.")
     if not {"x", "y", "z"} <= set(header["FIELDS"]):
@@ -77,37 +73,41 @@ def _split(data: bytes) -> tuple[Header, bytes]:
 
 
 def _require_consistent(header: Header) -> None:
-    """Refuse fields of unlike numbers, of no known type, or whose parts are missing.
+    """Refuse fields that are not described completely, have an unknown type, or appear twice.
 
     Raises
     ------
     InputError
-        With the sentence that says which.
+        With a sentence on what is wrong.
     """
+    normal = ("normal_x", "normal_y", "normal_z")
+    types = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
     names = header["FIELDS"]
     counts = header.setdefault("COUNT", ["1"] * len(names))
     if not len(names) == len(header["SIZE"]) == len(header["TYPE"]) == len(counts):
         raise InputError("the PCD header does not give a size, a type and a count for each field.")
     for name, kind, size, count in zip(names, header["TYPE"], header["SIZE"], counts, strict=True):
-        single = name in _SINGLE and (count != "1" or (name in ("rgb", "rgba") and size != "4"))
-        if kind + size not in _TYPES or int(count) < 1 or single:
-            raise InputError(f"the PCD header describes the field {name[:20]!r} in a way that is unknown.")
-    if len(set(names)) < len(names) or len(set(names) & set(_NORMAL)) not in (0, 3):
-        raise InputError("the PCD header names a field twice, or some of the normals' three only.")
+        scalar = name in ("x", "y", "z", "rgb", "rgba", *normal)
+        malformed = scalar and (count != "1" or (name in ("rgb", "rgba") and size != "4"))
+        if kind + size not in types or int(count) < 1 or malformed:
+            raise InputError(f"the PCD header has an invalid description of the field {name[:20]!r}.")
+    if len(set(names)) < len(names) or len(set(names) & set(normal)) not in (0, 3):
+        raise InputError("the PCD header names a field twice, or only some of the three of normals.")
     if int(header["WIDTH"][0]) * int(header["HEIGHT"][0]) != int(header["POINTS"][0]):
         raise InputError("the PCD header's width and height do not give its number of points.")
 
 
-def _require_all(header: Header, body: bytes, points: int) -> None:
-    """Refuse data of another size than the header declares."""
+def _require_complete(header: Header, body: bytes, points: int) -> None:
+    """Refuse data that is shorter than the header declares."""
     counts = [int(word) for word in header["COUNT"]]
     row = sum(int(size) * count for size, count in zip(header["SIZE"], counts, strict=True))
     match header["DATA"][0]:
         case "ascii":
-            found = len(numbers(body.decode("ascii", errors="replace").split())) // max(sum(counts), 1)
+            found = len(parse_numbers(body.decode("ascii", errors="replace").split())) // max(sum(counts), 1)
         case "binary":
             found = len(body) // max(row, 1)
         case "binary_compressed":
+            # Compressed data begins with its own size and that of the unpacked data.
             packed, unpacked = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, 0)
             found = unpacked // max(row, 1) if packed <= len(body) - 8 else 0
         case other:

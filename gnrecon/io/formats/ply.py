@@ -1,9 +1,9 @@
 """PLY, the Stanford polygon format: ASCII and binary of either byte order, any scalar types, polygons of any size.
 
-A header names elements (vertex, face, ...) with their properties; rows of values follow. ASCII words are first turned
-into an array of float64, which is then walked exactly as a binary file whose every property is a double. One walker
-thus serves all three encodings. Common libraries either round doubles, drop scalar properties, reject polygons of
-differing size, or accept a file that ends too early; that is why the walker is written here.
+A header names elements (vertex, face, ...) with their properties; rows of values follow. ASCII numbers are first
+converted to an array of float64, which is then read like a binary file whose every property is a double, so that one
+parser serves all three encodings. The parser is written here because common libraries round doubles, drop scalar
+properties, reject polygons of differing size, or accept a truncated file.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 from gnrecon.geometry.arrays import Int, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, fan, from_columns, not_triangles
-from gnrecon.io.parse import numbers
+from gnrecon.io.contents import Contents, fan_triangles, from_columns, polygon_remarks
+from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
 
 @dataclass
 class _Rows:
-    """Values of one element: scalar columns of shape (count,), lists as (lengths, values in a row)."""
+    """Values of one element: scalar columns of shape (count,), lists as (lengths, concatenated values)."""
 
     scalars: dict[str, Values]
     lists: dict[str, tuple[Int, Int]]
@@ -37,30 +37,29 @@ def read_ply(path: Path) -> Contents:
     Raises
     ------
     InputError
-        When the header is malformed, the file ends before the declared rows, or a word is no number.
+        When the header is malformed, the file ends before the declared rows, or a word is not a number.
     """
     data = path.read_bytes()
-    encoding, elements, start = parse_header(data)
-    if encoding == "ascii":
-        buffer = numbers(data[start:].decode("ascii", errors="replace").split()).tobytes()
-    else:
-        buffer = data[start:]
+    order, elements, start = parse_header(data)
+    buffer = data[start:]
+    if not order:
+        buffer = parse_numbers(buffer.decode("ascii", errors="replace").split()).tobytes()
     rows: dict[str, _Rows] = {}
     offset = 0
     for element in elements:
-        rows[element.name], offset = _walk(buffer, offset, element, ORDERS[encoding])
+        rows[element.name], offset = _read_rows(buffer, offset, element, order)
         if "vertex" in rows and ("face" in rows or not any(later.name == "face" for later in elements)):
             break  # what follows (range grids, edges, materials) is not used
     if "vertex" not in rows:
         raise InputError("the PLY header declares no vertex element.")
     polygons = rows["face"].lists if "face" in rows else {}
     corners = polygons.get("vertex_indices", polygons.get("vertex_index"))
-    contents = from_columns(rows["vertex"].scalars, None if corners is None else fan(*corners))
-    return replace(contents, unread=_unread(elements) + (() if corners is None else not_triangles(corners[0])))
+    contents = from_columns(rows["vertex"].scalars, None if corners is None else fan_triangles(*corners))
+    return replace(contents, unread=_unread(elements) + (() if corners is None else polygon_remarks(corners[0])))
 
 
 def _unread(elements: list[Element]) -> tuple[str, ...]:
-    """Name all that the header declares and this reader leaves out."""
+    """Describe everything that the header declares and this reader drops."""
     found = [f"the element {one.name}" for one in elements if one.name not in ("vertex", "face") and one.count]
     for element in elements:
         names = {prop.name for prop in element.properties if element.name == "face" or prop.count_type}
@@ -69,21 +68,24 @@ def _unread(elements: list[Element]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _walk(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
-    """Return the element's rows and the offset behind them; `order` is empty for words turned into doubles."""
+def _read_rows(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
+    """Return the element's rows and the offset after them; `order` is empty for text converted to doubles."""
     lists = [prop for prop in element.properties if prop.count_type]
     if lists and element.count:
+        # Most files have lists of one length only. Then all rows have one record type, which numpy reads at once; a row
+        # of another length shows as a wrong count, and the rows are read one by one.
         lengths = _first_lengths(buffer, offset, element, order)
         layout = _layout(element, order, lengths)
         end = offset + element.count * layout.itemsize
         table = np.frombuffer(buffer[offset:end], layout) if end <= len(buffer) else None
         if table is None or any((table[f"#{prop.name}"] != lengths[prop.name]).any() for prop in lists):
-            return _walk_slowly(buffer, offset, element, order)
+            return _read_rows_one_by_one(buffer, offset, element, order)
     else:
         layout = _layout(element, order, {prop.name: 0 for prop in lists})
         end = offset + element.count * layout.itemsize
+        # Checked before reading, because a damaged header may declare any number of rows.
         if end > len(buffer):
-            raise too_short(element, (len(buffer) - offset) // layout.itemsize)
+            raise truncation_error(element, (len(buffer) - offset) // layout.itemsize)
         table = np.frombuffer(buffer[offset:end], layout)
     scalars = {p.name: _native(table[p.name], p, order) for p in element.properties if not p.count_type}
     found: dict[str, tuple[Int, Int]] = {
@@ -92,8 +94,8 @@ def _walk(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Ro
     return _Rows(scalars, found), end
 
 
-def _walk_slowly(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
-    """Walk row by row, for lists of differing lengths."""
+def _read_rows_one_by_one(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
+    """Read row by row, for lists of differing lengths."""
     scalars: dict[str, list[Values]] = {p.name: [] for p in element.properties if not p.count_type}
     counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
     items: dict[str, list[Values]] = {name: [] for name in counts}
@@ -109,8 +111,8 @@ def _walk_slowly(buffer: bytes, offset: int, element: Element, order: str) -> tu
                 counts[prop.name].append(length)
                 items[prop.name].append(np.frombuffer(buffer, kind, length, offset))
                 offset += length * kind.itemsize
-        except ValueError:  # numpy's word for a buffer that is too short
-            raise too_short(element, row) from None
+        except ValueError:  # numpy raises it for a buffer that is too short
+            raise truncation_error(element, row) from None
     by_name = {prop.name: prop for prop in element.properties}
     columns = {name: _native(np.array(values), by_name[name], order) for name, values in scalars.items()}
     lists: dict[str, tuple[Int, Int]] = {
@@ -129,7 +131,7 @@ def _length(buffer: bytes, offset: int, prop: Property, order: str) -> tuple[int
 
 
 def _first_lengths(buffer: bytes, offset: int, element: Element, order: str) -> dict[str, int]:
-    """Return the list lengths of the element's first row, which most often are those of all rows."""
+    """Return the list lengths of the element's first row, which are usually those of all rows."""
     lengths: dict[str, int] = {}
     try:
         for prop in element.properties:
@@ -142,9 +144,9 @@ def _first_lengths(buffer: bytes, offset: int, element: Element, order: str) -> 
     except ValueError as error:
         if isinstance(error, InputError):
             raise
-        raise too_short(element, 0) from None
+        raise truncation_error(element, 0) from None
     if offset > len(buffer):
-        raise too_short(element, 0)
+        raise truncation_error(element, 0)
     return lengths
 
 
@@ -170,12 +172,12 @@ def _native(values: Values, prop: Property, order: str) -> Values:
 
 
 def _indices(values: Values) -> Int:
-    with np.errstate(invalid="ignore"):  # an index that is no number becomes one out of range, refused by Mesh
+    with np.errstate(invalid="ignore"):  # NaN becomes an index out of range, which Mesh refuses
         return values.astype(np.int64)
 
 
 def write_ply(mesh: Mesh, path: Path) -> None:
-    """Write binary little-endian PLY: double positions, float normals, all attributes, and int faces if any."""
+    """Write binary little-endian PLY: positions as doubles, normals as floats, all attributes, and faces if any."""
     columns = vertex_columns(mesh)
     vertices = np.empty(len(mesh.vertices), np.dtype([(name, f"<{PLY_TYPES[kind]}") for name, kind, _ in columns]))
     for name, _, values in columns:
@@ -185,7 +187,7 @@ def write_ply(mesh: Mesh, path: Path) -> None:
     faces["corners"] = mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     lines += [f"property {kind} {name}" for name, kind, _ in columns]
-    if len(faces):  # a file without the element is a cloud to every reader
+    if len(faces):  # every reader takes a file without the element for a cloud
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     lines += ["end_header", ""]
     with path.open("wb") as file:
@@ -199,11 +201,7 @@ PLY_TYPES = {
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
-
-ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
-# The header of a PLY file: its encoding, its elements and their properties.
+"""Names of number types in PLY and in numpy."""
 
 
 @dataclass(frozen=True)
@@ -225,27 +223,28 @@ class Element:
 
 
 def parse_header(data: bytes) -> tuple[str, list[Element], int]:
-    """Return the encoding, the elements, and where the rows begin in `data`.
+    """Return the byte order (``<``, ``>``, or nothing for text), the elements, and where the rows begin in `data`.
 
     Raises
     ------
     InputError
-        When the header does not begin, end, or read as PLY prescribes.
+        When the header is malformed.
     """
     if not data.startswith(b"ply"):
-        raise InputError("the file does not begin with 'ply', so it is no PLY file.")
+        raise InputError("the file does not begin with 'ply', so it is not a PLY file.")
     end = data.find(b"end_header")
     if end < 0:
         raise InputError("the PLY header does not end with 'end_header'.")
     start = data.find(b"\n", end) + 1 or len(data)
-    encoding = ""
+    orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+    order: str | None = None
     elements: list[Element] = []
     for line in data[:end].decode("ascii", errors="replace").splitlines()[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
-            case ["format", name, _] if name in ORDERS:
-                encoding = name
+            case ["format", encoding, _] if encoding in orders:
+                order = orders[encoding]
             case ["element", name, count] if count.isdecimal():
                 elements.append(Element(name, int(count)))
             case ["property", "list", count_type, kind, name] if elements and {count_type, kind} <= PLY_TYPES.keys():
@@ -254,53 +253,41 @@ def parse_header(data: bytes) -> tuple[str, list[Element], int]:
                 elements[-1].properties.append(Property(name, PLY_TYPES[kind], None))
             case _:
                 raise InputError(f"the PLY header line {line.strip()[:80]!r} is not understood.")
-    if not encoding:
+    if order is None:
         raise InputError("the PLY header has no format line.")
-    return encoding, elements, start
+    return order, elements, start
 
 
-def too_short(element: Element, rows: int) -> InputError:
-    """Return the failure of a file that ends within the rows of `element`."""
+def truncation_error(element: Element, rows: int) -> InputError:
+    """Return the error for a file that ends within the rows of `element`."""
     return InputError(f"the header declares {element.count} {element.name} rows, but the file ends after {rows}.")
 
 
 Column = tuple[str, str, Values]
-"""Name, PLY's name of the type, and values of shape (V,)."""
-
-_COLORS = ("red", "green", "blue", "alpha")
-
-_RESERVED = ("x", "y", "z", "nx", "ny", "nz", *_COLORS)
-
-_KINDS = {
-    **{"b1": "uchar", "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
-    **{"f2": "float", "f4": "float", "f8": "double"},
-}
-
-_NARROWER = ("int", np.iinfo(np.int32)), ("uint", np.iinfo(np.uint32))
-
-
-# The columns of a PLY file's vertices: positions, normals, colours by their customary names, and other attributes.
+"""Name, PLY type, and values of shape (V,)."""
 
 
 def vertex_columns(mesh: Mesh) -> list[Column]:
     """Return all columns of a mesh; an attribute of several columns becomes NAME_0, NAME_1, and so on."""
+    # Doubles, because projected coordinates lose centimetres in single precision.
     columns: list[Column] = [(name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")]
     if mesh.normals is not None:
         columns += [(f"n{name}", "float", mesh.normals[:, axis]) for axis, name in enumerate("xyz")]
+    color_names = ("red", "green", "blue", "alpha")
     if "colors" in mesh.attributes:
         bytes_ = as_bytes(mesh.attributes["colors"])
-        columns += [(name, "uchar", values) for name, values in zip(_COLORS, bytes_.T, strict=False)]
-    taken = set(_RESERVED)
+        columns += [(name, "uchar", values) for name, values in zip(color_names, bytes_.T, strict=False)]
+    taken = {"x", "y", "z", "nx", "ny", "nz", *color_names}
     for name, values in mesh.attributes.items():
         if name != "colors":
             rows = values.reshape(len(values), -1).T
             names = [name] if values.ndim == 1 else [f"{name}_{number}" for number in range(len(rows))]
-            columns += [(_free(one, taken), _kind(row), row) for one, row in zip(names, rows, strict=True)]
+            columns += [(_unique_word(one, taken), _ply_type(row), row) for one, row in zip(names, rows, strict=True)]
     return columns
 
 
-def _free(name: str, taken: set[str]) -> str:
-    """Return the name as one ASCII word that no other column has, and add it to those taken."""
+def _unique_word(name: str, taken: set[str]) -> str:
+    """Return the name as one ASCII word that is not taken, and mark it as taken."""
     word = re.sub(r"[^!-~]", "_", name) or "_"
     while word.lower() in taken:
         word += "_"
@@ -308,27 +295,27 @@ def _free(name: str, taken: set[str]) -> str:
     return word
 
 
-def _kind(values: Values) -> str:
-    """PLY's type for a column; 64-bit integers become 32-bit ones where they fit, else doubles."""
-    kind = _KINDS.get(values.dtype.str[1:])
+def _ply_type(values: Values) -> str:
+    """PLY type of a column; 64-bit integers become 32-bit ones where they fit, else doubles."""
+    kinds = {
+        **{"b1": "uchar", "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
+        **{"f2": "float", "f4": "float", "f8": "double"},
+    }
+    kind = kinds.get(values.dtype.str[1:])
     if kind is not None:
         return kind
+    # PLY has no 64-bit integers.
     if values.dtype.kind in "iu" and len(values):
-        for name, limits in _NARROWER:
+        for name, limits in (("int", np.iinfo(np.int32)), ("uint", np.iinfo(np.uint32))):
             if limits.min <= values.min() and values.max() <= limits.max:
                 return name
     return "double"
 
 
-_HEADER = 1 << 16
-"""Bytes in which a header that names some hundred properties ends."""
-
-
-# Binary PLY by chunks: the vertices of a cloud are records of one size, so that any stretch of them can be read.
-
-
-def ply_chunks(path: Path, rows: int) -> Iterator[Contents]:
+def ply_chunks(path: Path, rows: int, *, header_bytes: int = 1 << 16) -> Iterator[Contents]:
     """Yield the vertices, at most `rows` at a time; files in text, with faces, or with lists are read as a whole.
+
+    The header is searched in the first `header_bytes`, enough for some hundred properties, then in the whole file.
 
     Raises
     ------
@@ -336,9 +323,8 @@ def ply_chunks(path: Path, rows: int) -> Iterator[Contents]:
         As `read_ply` does.
     """
     with path.open("rb") as file:
-        head = file.read(_HEADER)
-        encoding, elements, start = parse_header(head if b"end_header" in head else head + file.read())
-        order = ORDERS[encoding]
+        head = file.read(header_bytes)
+        order, elements, start = parse_header(head if b"end_header" in head else head + file.read())
         if not order or not _is_cloud(elements):
             yield read_ply(path)
             return
@@ -346,7 +332,7 @@ def ply_chunks(path: Path, rows: int) -> Iterator[Contents]:
         layout = np.dtype([(prop.name, order + prop.type) for prop in vertex.properties])
         held = (path.stat().st_size - start) // max(layout.itemsize, 1)
         if held < vertex.count:
-            raise too_short(vertex, held)
+            raise truncation_error(vertex, held)
         file.seek(start)
         for first in range(0, vertex.count, rows):
             table = np.fromfile(file, layout, min(rows, vertex.count - first))
@@ -354,7 +340,7 @@ def ply_chunks(path: Path, rows: int) -> Iterator[Contents]:
 
 
 def _is_cloud(elements: list[Element]) -> bool:
-    """Whether the vertices come first, have single values only, and no face follows."""
+    """Whether the vertices come first and have no lists, and no face follows."""
     first = elements[0] if elements else Element("", 0)
     names = [prop.name for prop in first.properties]
     plain = all(prop.count_type is None for prop in first.properties) and len(set(names)) == len(names)

@@ -1,9 +1,9 @@
 """PTX, Leica's text format of gridded scans: one block for each position of the scanner, with its pose.
 
-A block begins with the numbers of columns and of rows, the scanner's position and axes (four lines that repeat the
-pose), and a 4 x 4 matrix that moves rows (x, y, z, 1) to common coordinates: its last row is where the scanner stood.
-Then comes a line for each place of the grid, column by column: x, y, z in the scanner's own frame, intensity, and red,
-green, blue where it saw colours. Where nothing came back, x, y and z are zero.
+A block begins with the numbers of columns and rows, the scanner's position and axes (four lines that repeat the pose),
+and a 4 x 4 matrix that moves rows (x, y, z, 1) to common coordinates; its last row is the scanner's position. Then
+comes a line for each grid cell, column by column: x, y, z in the scanner's frame, intensity, and red, green, blue where
+the scanner recorded colours. Cells without a measurement have x = y = z = 0.
 """
 
 from __future__ import annotations
@@ -16,29 +16,25 @@ from typing import IO
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, joined, no_faces
-from gnrecon.io.parse import numbers
+from gnrecon.io.contents import Contents, concatenated, no_faces
+from gnrecon.io.io_parameters import IOParameters
+from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
-
-_POSE_LINES = 8
-_COLORS = slice(4, 7)
-_ORTHOGONAL = 1e-3
-"""Greatest departure of a pose's axes from a rotation with one scale."""
 
 
 def read_ptx(path: Path) -> Contents:
-    """Read all scans, in common coordinates, with the scanner's position and the place in its grid for each point.
+    """Read all scans, in common coordinates, with the scanner's position and the grid cell of each point.
 
     Raises
     ------
     InputError
         When a block is malformed or ends too early.
     """
-    return joined(list(ptx_chunks(path, 1 << 20)))
+    return concatenated(list(ptx_chunks(path, IOParameters.chunk_points)))
 
 
 def ptx_chunks(path: Path, rows: int) -> Iterator[Contents]:
-    """Yield the points that came back, of at most `rows` places of a grid at a time.
+    """Yield the measured points, of at most `rows` grid cells at a time.
 
     Raises
     ------
@@ -50,7 +46,7 @@ def ptx_chunks(path: Path, rows: int) -> Iterator[Contents]:
         while head := _next_line(file):
             number += 1
             columns, height = _size(head, number), _size(_next_line(file), number)
-            matrix = _pose([_next_line(file) for _ in range(_POSE_LINES)], number)
+            matrix = _pose([_next_line(file) for _ in range(8)], number)
             for start in range(0, columns * height, rows):
                 count = min(rows, columns * height - start)
                 table = _table(file, count, number)
@@ -70,16 +66,17 @@ def _size(line: str, number: int) -> int:
     return int(line)
 
 
-def _pose(lines: list[str], number: int) -> Float:
-    """The 4 x 4 matrix, of the last four of eight lines."""
-    rows = [numbers(line.split()) for line in lines]
+def _pose(lines: list[str], number: int, *, tolerance: float = 1e-3) -> Float:
+    """The 4 x 4 matrix in the last four of eight lines; its axes may differ from a scaled rotation by `tolerance`."""
+    rows = [parse_numbers(line.split()) for line in lines]
     if [len(row) for row in rows] != [3, 3, 3, 3, 4, 4, 4, 4]:
         raise InputError(f"scan {number} lacks the four lines of its position or the four of its matrix.")
     matrix = np.stack(rows[4:])
+    # For a rotation with one scale s, the product with the transpose is s^2 times the identity.
     square = matrix[:3, :3] @ matrix[:3, :3].T
     scale = float(np.trace(square)) / 3
-    if not (scale > 0 and np.abs(square / scale - np.eye(3)).max() <= _ORTHOGONAL and np.isfinite(matrix).all()):
-        raise InputError(f"the matrix of scan {number} is no pose: its axes are not orthogonal and of one length.")
+    if not (scale > 0 and np.abs(square / scale - np.eye(3)).max() <= tolerance and np.isfinite(matrix).all()):
+        raise InputError(f"the matrix of scan {number} is not a pose: its axes are not orthogonal and of equal length.")
     return matrix
 
 
@@ -87,7 +84,7 @@ def _table(file: IO[str], count: int, number: int) -> Float:
     """The next `count` rows, of shape (count, 4 or 7)."""
     lines = list(islice(file, count))
     if len(lines) < count or not lines[-1].strip():
-        raise InputError(f"scan {number} ends before the points that its grid has.")
+        raise InputError(f"scan {number} ends before all points of its grid.")
     try:
         table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
     except ValueError as error:
@@ -97,13 +94,14 @@ def _table(file: IO[str], count: int, number: int) -> Float:
     return table
 
 
-def _contents(table: Float, places: Int, height: int, matrix: Float) -> Contents:
-    seen = (table[:, :3] != 0).any(axis=1)
-    table, places = table[seen], places[seen]
+def _contents(table: Float, cells: Int, height: int, matrix: Float) -> Contents:
+    measured = (table[:, :3] != 0).any(axis=1)
+    table, cells = table[measured], cells[measured]
     attributes: dict[str, Values] = {"intensity": table[:, 3]}
     if table.shape[1] == 7:
-        attributes["colors"] = np.clip(np.nan_to_num(table[:, _COLORS]), 0, 255).astype(np.uint8)
-    attributes |= {"row": (places % height).astype(np.int32), "column": (places // height).astype(np.int32)}
+        attributes["colors"] = np.clip(np.nan_to_num(table[:, 4:7]), 0, 255).astype(np.uint8)
+    # Cells are stored column by column, as the scanner turns.
+    attributes |= {"row": (cells % height).astype(np.int32), "column": (cells // height).astype(np.int32)}
     points = table[:, :3] @ matrix[:3, :3] + matrix[3, :3]
     origins = np.broadcast_to(matrix[3, :3], points.shape)
     return Contents(points, None, no_faces(), attributes, (), origins)

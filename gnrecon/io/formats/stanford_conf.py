@@ -1,12 +1,12 @@
 """The Stanford repository's ``.conf``: the range scans of one object, each with the pose that registers it.
 
-A line ``bmesh FILE tx ty tz qx qy qz qw`` (or ``mesh``) names a PLY file beside it, a translation and a quaternion. The
-rotation is the inverse of the one that such a quaternion commonly stands for: its w has the other sign. This holds for
-the repository's own files: with w as written, neighbouring scans of the bunny lie a hundred times their spacing apart.
-Other lines (``camera``) tell how a program should look at the object.
+A line ``bmesh FILE tx ty tz qx qy qz qw`` (or ``mesh``) names a PLY file in the same folder, a translation and a
+quaternion. The rotation is the inverse of the one that the quaternion commonly means: its w has the other sign. So it
+is in the repository's own files: with w as written, neighbouring scans of the bunny are a hundred times their spacing
+apart. Other lines (``camera``) describe a view of the object.
 
-A range scan of that repository is a depth image: the scanner looks along -z of the scan's own frame. How far away it
-stood is not said; it is put at a hundred times the extent of the scan, where all lines of sight are nearly parallel.
+A range scan of that repository is a depth image: the scanner looks along -z of the scan's frame. The file does not give
+its distance; it is set to a hundred times the extent of the scan, where all lines of sight are nearly parallel.
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.io.contents import Contents, joined
+from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.formats.ply import read_ply
-from gnrecon.io.parse import beside, numbers, read_text
+from gnrecon.io.parse import parse_numbers, read_text, sibling_path
 from gnrecon.runtime.errors import InputError
-
-_DISTANCE = 100.0
-"""Of the scanner, in extents of the scan."""
 
 
 @dataclass(frozen=True)
@@ -36,22 +33,22 @@ class Pose:
 
 
 def read_conf(path: Path) -> Contents:
-    """Read all scans that the file names and that are there, in common coordinates, with the scanner's positions.
+    """Read all existing scans that the file names, in common coordinates, with the scanner's positions.
 
-    Repositories leave scans out now and then; those that are missing are named among what is not read.
+    Published data sets may lack some scans; these are listed in `Contents.unread`.
 
     Raises
     ------
     InputError
-        When a line is malformed, or no scan is there.
+        When a line is malformed, or no scan exists.
     """
     poses = parse_conf(read_text(path))
-    there = [pose for pose in poses if (path.parent / pose.file).is_file()]
-    gone = dict.fromkeys(pose.file for pose in poses if not (path.parent / pose.file).is_file())
-    missing = tuple(f"the scan {name}, which is missing" for name in gone)
-    if not there:
-        raise InputError(f"none of the {len(poses)} scans that it names is beside it.")
-    scans = joined([_posed(pose, path.parent) for pose in there])
+    existing = [pose for pose in poses if (path.parent / pose.file).is_file()]
+    absent = dict.fromkeys(pose.file for pose in poses if not (path.parent / pose.file).is_file())
+    missing = tuple(f"the scan {name}, which is missing" for name in absent)
+    if not existing:
+        raise InputError(f"none of the {len(poses)} scans that it names exists in its folder.")
+    scans = concatenated([_posed(pose, path.parent) for pose in existing])
     return replace(scans, unread=(*missing, *scans.unread))
 
 
@@ -68,7 +65,7 @@ def parse_conf(text: str) -> list[Pose]:
         words = line.split()
         if not words or words[0] not in ("mesh", "bmesh"):
             continue
-        values = numbers(words[2:])
+        values = parse_numbers(words[2:])
         length = float(np.linalg.norm(values[3:])) if len(values) == 7 else 0.0
         if not (np.isfinite(values).all() and length > 0):
             raise InputError(f"the line {line.strip()[:80]!r} does not hold a file, a translation and a quaternion.")
@@ -79,7 +76,7 @@ def parse_conf(text: str) -> list[Pose]:
 
 
 def _rotation(quaternion: Float) -> Float:
-    """The matrix that moves columns, for a quaternion (x, y, z, w) whose w has the other sign."""
+    """The matrix that rotates column vectors, for a quaternion (x, y, z, w) whose w has the other sign."""
     x, y, z, w = quaternion * [1, 1, 1, -1]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     rotation: Float = np.eye(3) + 2 * w * cross + 2 * cross @ cross
@@ -87,14 +84,14 @@ def _rotation(quaternion: Float) -> Float:
 
 
 def _posed(pose: Pose, folder: Path) -> Contents:
-    target = beside(folder, pose.file, "scan")
+    target = sibling_path(folder, pose.file, "scan")
     try:
         scan = read_ply(target)
     except InputError as error:
         raise InputError(f"the scan {pose.file}: {error}") from None
     if not len(scan.points):
         raise InputError(f"the scan {pose.file} holds no points.")
-    origin = _scanner(scan.points) @ pose.rotation.T + pose.translation
+    origin = _scanner_position(scan.points) @ pose.rotation.T + pose.translation
     return replace(
         scan,
         points=scan.points @ pose.rotation.T + pose.translation,
@@ -103,8 +100,8 @@ def _posed(pose: Pose, folder: Path) -> Contents:
     )
 
 
-def _scanner(points: Float) -> Float:
-    """Where the scanner stood, of shape (3,), in the scan's own frame."""
+def _scanner_position(points: Float, *, distance_extents: float = 100.0) -> Float:
+    """The scanner's position, of shape (3,), in the scan's frame; see the module on its distance in extents."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     middle: Float = (lower + upper) / 2
-    return np.array([*middle[:2], middle[2] + _DISTANCE * float(np.linalg.norm(upper - lower))])
+    return np.array([*middle[:2], middle[2] + distance_extents * float(np.linalg.norm(upper - lower))])

@@ -1,6 +1,6 @@
 """STL, triangles without shared vertices: read by trimesh, with equal corners merged; written binary (float32).
 
-Coordinates are in the file's own frame unless its header names an origin, see `gnrecon.io.origin`.
+Coordinates may be relative to an origin that the header states, see `gnrecon.io.origin`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
-from gnrecon.io.origin import HEADER, far_origin, header, origin_in
+from gnrecon.io.origin import float32_origin, parse_origin, stl_header
 from gnrecon.runtime.errors import InputError
 
 
@@ -28,8 +28,8 @@ def read_stl(path: Path) -> Contents:
 
     try:
         with path.open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # how numpy reports words that are no numbers
-            origin = origin_in(file.read(HEADER))
+            warnings.simplefilter("error", DeprecationWarning)  # how numpy reports words that are not numbers
+            origin = parse_origin(file.read(80))
             file.seek(0)
             loaded = load_stl(file)
     except (HeaderError, DeprecationWarning, ValueError):
@@ -38,6 +38,7 @@ def read_stl(path: Path) -> Contents:
     if not solids:
         raise InputError("the file holds no complete STL solid: it is empty, cut short, or of another format.")
     corners = np.concatenate([np.asarray(solid["vertices"], np.float64) for solid in solids])
+    # np.unique sorts the positions; `rank` restores the order of appearance.
     _, first, which = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
@@ -48,9 +49,9 @@ def read_stl(path: Path) -> Contents:
 def write_stl(mesh: Mesh, path: Path) -> None:
     """Write binary STL; coordinates are rounded to float32, the only precision that the format has.
 
-    They are relative to an origin, named in the header, where rounding would otherwise join different vertices.
+    They are relative to an origin, stated in the header, where rounding would otherwise merge different vertices.
     """
-    origin = far_origin(mesh)
+    origin = float32_origin(mesh)
     record = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets = np.zeros(len(mesh.faces), record)
     area = mesh.face_vectors
@@ -58,6 +59,6 @@ def write_stl(mesh: Mesh, path: Path) -> None:
     facets["normal"] = area / lengths
     facets["corners"] = mesh.corners if origin is None else mesh.corners - origin
     with path.open("wb") as file:
-        file.write(header(origin))
+        file.write(stl_header(origin))
         np.array(len(facets), "<u4").tofile(file)
         facets.tofile(file)

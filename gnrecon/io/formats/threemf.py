@@ -1,9 +1,11 @@
 """3MF, the 3D Manufacturing Format: an XML model in a ZIP archive, with colours by its materials extension.
 
-Written here because the format's own library and trimesh hold coordinates in float32 or drop colours. A file that is
-written has one object, in millimetres, the unit that readers assume; coordinates are text with all digits of float64.
-Most readers turn them into float32, so a mesh far from the origin is stored about its middle, and the item that builds
-it carries the way there. Archive members have a fixed date, so that equal meshes give equal bytes.
+Implemented here because the format's own library and trimesh store coordinates in float32 or drop colours. Written
+files have one object, in millimetres, the unit that readers assume; coordinates are text with all digits of float64.
+Most readers convert them to float32, so a mesh far from the origin is stored relative to its middle, and the build item
+has the translation. Archive members have a fixed date, so that equal meshes give equal bytes.
+
+Models may be large, so their XML is parsed as a stream, without a tree.
 
 Specifications: 3MF Core 1.3, Materials and Properties 1.2 (https://3mf.io/spec).
 """
@@ -27,116 +29,102 @@ from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
-from gnrecon.io.parse import format_rows, numbers
+from gnrecon.io.io_parameters import IOParameters
+from gnrecon.io.parse import format_rows, parse_numbers
 from gnrecon.runtime.errors import InputError
 
-CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
-
-MATERIAL = "http://schemas.microsoft.com/3dmanufacturing/material/2015/02"
-
-MODEL_TYPE = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
-
-_FAR = 1e-6
-"""Rounding to float32, as a share of the mesh's diagonal, from which on it is stored about its middle."""
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-
-_DECLARATION = '<?xml version="1.0" encoding="UTF-8"?>\n'
-
-_TYPES = (
-    f'{_DECLARATION}<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">\n'
-    '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>\n'
-    '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/>\n</Types>\n'
-)
-
-_RELATIONS = (
-    f'{_DECLARATION}<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">\n'
-    f'<Relationship Target="/3D/3dmodel.model" Id="rel0" Type="{MODEL_TYPE}"/>\n</Relationships>\n'
-)
-
-_COLORS, _OBJECT = 1, 2
-"""Numbers of the two resources."""
+_NAMESPACES = {
+    "core": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02",
+    "materials": "http://schemas.microsoft.com/3dmanufacturing/material/2015/02",
+    "model": "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel",
+}
+"""XML namespaces of the model, and the type of the relationship that leads to it."""
 
 
 def write_3mf(mesh: Mesh, path: Path) -> None:
     """Write one object with all digits of float64, and colours where the mesh has them; 3MF has no vertex normals."""
+    declaration = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    types = (
+        '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">\n'
+        '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>\n'
+        '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/>\n</Types>\n'
+    )
+    relations = (
+        '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">\n'
+        f'<Relationship Target="/3D/3dmodel.model" Id="rel0" Type="{_NAMESPACES["model"]}"/>\n</Relationships>\n'
+    )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, blocks in (
-            ("[Content_Types].xml", iter([_TYPES])),
-            ("_rels/.rels", iter([_RELATIONS])),
+            ("[Content_Types].xml", iter([types])),
+            ("_rels/.rels", iter([relations])),
             ("3D/3dmodel.model", _model(mesh)),
         ):
-            entry = zipfile.ZipInfo(name, _EPOCH)
+            entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # the first date that a ZIP archive can store
             entry.compress_type = zipfile.ZIP_DEFLATED
+            # The size is not known before, and may exceed the 4 GiB of the older format.
             with archive.open(entry, "w", force_zip64=True) as file:
+                file.write(declaration.encode("ascii"))
                 for block in blocks:
                     file.write(block.encode("ascii"))
 
 
 def _model(mesh: Mesh) -> Iterator[str]:
-    """The model's XML, in blocks."""
+    """The model's XML, in blocks: the resources are a group of colours, with the number 1, and the object, 2."""
     colors = mesh.attributes.get("colors")
     shift = _shift(mesh)
-    yield f'{_DECLARATION}<model unit="millimeter" xml:lang="en-US" xmlns="{CORE}" xmlns:m="{MATERIAL}">\n<resources>\n'
+    core, materials = _NAMESPACES["core"], _NAMESPACES["materials"]
+    yield f'<model unit="millimeter" xml:lang="en-US" xmlns="{core}" xmlns:m="{materials}">\n<resources>\n'
     which = None
     if colors is not None:
         palette, which = _palette(with_alpha(as_bytes(colors)))
-        yield f'<m:colorgroup id="{_COLORS}">\n'
+        yield '<m:colorgroup id="1">\n'
         yield from format_rows('<m:color color="#%08X"/>\n', palette)
         yield "</m:colorgroup>\n"
     kind = "model" if _is_closed(mesh) else "surface"
-    default = "" if colors is None else f' pid="{_COLORS}" pindex="0"'
-    yield f'<object id="{_OBJECT}" type="{kind}"{default}>\n<mesh>\n<vertices>\n'
+    default = "" if colors is None else ' pid="1" pindex="0"'
+    yield f'<object id="2" type="{kind}"{default}>\n<mesh>\n<vertices>\n'
     yield from format_rows('<vertex x="%r" y="%r" z="%r"/>\n', mesh.vertices - shift)
     yield "</vertices>\n<triangles>\n"
     if which is None:
         yield from format_rows('<triangle v1="%d" v2="%d" v3="%d"/>\n', mesh.faces)
     else:
         corners = np.hstack([mesh.faces, which[mesh.faces]])
-        template = f'<triangle v1="%d" v2="%d" v3="%d" pid="{_COLORS}" p1="%d" p2="%d" p3="%d"/>\n'
+        template = '<triangle v1="%d" v2="%d" v3="%d" pid="1" p1="%d" p2="%d" p3="%d"/>\n'
         yield from format_rows(template, corners)
-    way = "1 0 0 0 1 0 0 0 1 {!r} {!r} {!r}".format(*shift.tolist())
-    item = f' transform="{way}"' if shift.any() else ""
+    matrix = "1 0 0 0 1 0 0 0 1 {!r} {!r} {!r}".format(*shift.tolist())
+    item = f' transform="{matrix}"' if shift.any() else ""
     yield "</triangles>\n</mesh>\n</object>\n</resources>\n"
-    yield f'<build>\n<item objectid="{_OBJECT}"{item}/>\n</build>\n</model>\n'
+    yield f'<build>\n<item objectid="2"{item}/>\n</build>\n</model>\n'
 
 
 def _palette(colors: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint32], Int]:
-    """Different colours as RGBA numbers, and for each row of `colors`, of shape (V, 4), which of them it is."""
+    """The distinct colours as RGBA numbers, and the index of each row of `colors`, of shape (V, 4), among them."""
     return np.unique(np.ascontiguousarray(colors).view(">u4")[:, 0].astype(np.uint32), return_inverse=True)
 
 
 def _shift(mesh: Mesh) -> Float:
-    """What is taken from the coordinates, of shape (3,): nothing, unless float32 would spoil them."""
+    """What is subtracted from the coordinates, of shape (3,): zero, unless float32 rounding would be visible."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    # Readers may convert coordinates to float32.
     rounding = float(np.abs(mesh.vertices).max()) * float(np.finfo(np.float32).eps)
-    return (low + high) / 2 if rounding > _FAR * float(np.linalg.norm(high - low)) else np.zeros(3)
+    visible = IOParameters.visible_rounding_diagonals * float(np.linalg.norm(high - low))
+    return (low + high) / 2 if rounding > visible else np.zeros(3)
 
 
 def _is_closed(mesh: Mesh) -> bool:
-    """Whether every edge has two faces; only such an object may call itself a model."""
+    """Whether every edge has two faces; only such an object may have the type ``model``."""
     edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     counts = np.unique(edges, axis=0, return_counts=True)[1]
     return bool((counts == 2).all())
 
 
 Key = tuple[str, str]
-"""A resource: the part of the archive that holds it, and its number there."""
-
-_DEEPEST = 32
-"""Components within components; deeper ones are taken for a circle."""
-
-_UNPAINTED = -1
-
-
-# Reading 3MF: the objects that the model builds, each in its place, with the colours of their corners.
-#
-# Models grow large, so the XML is walked once, without a tree.
+"""A resource: the part of the archive that holds it, and its number in that part."""
 
 
 @dataclass
 class _Object:
-    """One object: its own mesh, its corners' colours as RGBA numbers, and the objects that it is put together from."""
+    """One object: its own mesh, its corners' colours as RGBA numbers (-1 for none), and its component objects."""
 
     group: str = ""
     place: str = ""
@@ -148,20 +136,20 @@ class _Object:
 
 @dataclass
 class _Model:
-    """All that the parts of an archive define; resources come before their use."""
+    """Everything that the parts of an archive define; resources come before their use."""
 
     objects: dict[Key, _Object] = field(default_factory=dict)
     colors: dict[Key, list[int]] = field(default_factory=dict)
     items: list[tuple[Key, Float]] = field(default_factory=list)
 
     def parts(self) -> set[str]:
-        """Names of the archive's parts that objects or items point to."""
+        """Names of the archive's parts that objects or items refer to."""
         inner = {key[0] for one in self.objects.values() for key, _ in one.parts}
         return inner | {key[0] for key, _ in self.items}
 
 
 def read_3mf(path: Path) -> Contents:
-    """Read all objects that are built into one, each moved by its transform; lengths as they are stored.
+    """Read all objects that the model builds into one mesh, each moved by its transform; lengths as stored.
 
     Raises
     ------
@@ -172,20 +160,20 @@ def read_3mf(path: Path) -> Contents:
         with zipfile.ZipFile(path) as archive:
             model = _load(archive)
     except (zipfile.BadZipFile, zlib.error, expat.ExpatError, KeyError, EOFError) as error:
-        raise InputError(f"the file is no well-formed 3MF archive ({error}).") from None
-    pieces = [piece for key, way in model.items for piece in _placed(model, key, way, 0)]
+        raise InputError(f"the file is not a well-formed 3MF archive ({error}).") from None
+    pieces = [piece for key, matrix in model.items for piece in _transformed(model, key, matrix, 0)]
     if not pieces:
         raise InputError("the 3MF model builds no mesh.")
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=False)])
     colors = np.concatenate([piece.attributes["colors"] for piece in pieces])
-    shown = colors if (colors[:, 3] < 255).any() else colors[:, :3]
+    visible = colors if (colors[:, 3] < 255).any() else colors[:, :3]
     vertices = np.concatenate([piece.vertices for piece in pieces])
-    return Contents(vertices, None, faces, {"colors": shown} if colors.any() else {})
+    return Contents(vertices, None, faces, {"colors": visible} if colors.any() else {})
 
 
 def _load(archive: zipfile.ZipFile) -> _Model:
-    """Read the main part of an archive, and all parts that it leads to."""
+    """Read the main part of an archive, and all parts that it refers to."""
     model = _Model()
     main = _main(archive)
     waiting, seen = [main], {main}
@@ -199,11 +187,11 @@ def _load(archive: zipfile.ZipFile) -> _Model:
 
 
 def _main(archive: zipfile.ZipFile) -> str:
-    """Name of the part that the archive says to begin with."""
+    """Name of the archive's main part."""
     found: list[str] = []
 
     def start(name: str, values: dict[str, str]) -> None:
-        if name.endswith("}Relationship") and values.get("Type") == MODEL_TYPE:
+        if name.endswith("}Relationship") and values.get("Type") == _NAMESPACES["model"]:
             found.append(values.get("Target", "").lstrip("/"))
 
     parser = expat.ParserCreate(namespace_separator="}")
@@ -215,7 +203,7 @@ def _main(archive: zipfile.ZipFile) -> str:
 
 
 class _Part:
-    """Adds what one part of an archive defines to a model; only the main part builds anything."""
+    """Adds the definitions in one part of an archive to a model; only the main part may build objects."""
 
     def __init__(self, model: _Model, name: str, main: bool) -> None:
         self._model, self._name, self._main = model, name, main
@@ -239,7 +227,7 @@ class _Part:
             case "colorgroup" | "basematerials":
                 self._group = self._model.colors.setdefault((self._name, values["id"]), [])
             case "color" | "base":
-                self._group.append(_code(values.get("color", values.get("displaycolor", ""))))
+                self._group.append(_rgba(values.get("color", values.get("displaycolor", ""))))
             case "component":
                 self._object.parts.append(self._reference(values))
             case "item" if self._main:
@@ -251,47 +239,49 @@ class _Part:
         known = self._model.colors.get((self._name, values.get("pid", current.group)))
         first = values.get("p1", current.place)
         if known is None or not first:
-            current.colors.extend((_UNPAINTED,) * 3)
+            current.colors.extend((-1,) * 3)
         else:
             places = (first, values.get("p2", first), values.get("p3", first))
             current.colors.extend(known[int(place)] for place in places)
 
     def _reference(self, values: dict[str, str]) -> tuple[Key, Float]:
-        """The object that a component or an item names, and the 4 x 3 matrix that moves rows (x, y, z, 1)."""
-        way = numbers(values["transform"].split()).reshape(4, 3) if "transform" in values else np.eye(4, 3)
-        # The production extension lets an object lie in another part.
+        """The object that a component or an item refers to, and the 4 x 3 matrix that moves rows (x, y, z, 1)."""
+        matrix = parse_numbers(values["transform"].split()).reshape(4, 3) if "transform" in values else np.eye(4, 3)
+        # With the production extension, the object may be in another part.
         path = next((value for name, value in values.items() if name.endswith("}path")), self._name)
-        return (posixpath.normpath(path).lstrip("/"), values["objectid"]), way
+        return (posixpath.normpath(path).lstrip("/"), values["objectid"]), matrix
 
 
-def _placed(model: _Model, key: Key, way: Float, depth: int) -> Iterator[Mesh]:
-    """The meshes of an object and of those within it, moved into place."""
-    if key not in model.objects or depth > _DEEPEST:
-        raise InputError(f"the 3MF model builds the object {key[1]!r}, which is not there or contains itself.")
+def _transformed(model: _Model, key: Key, matrix: Float, depth: int, *, most_depth: int = 32) -> Iterator[Mesh]:
+    """The meshes of an object and its components, moved into place; components deeper than `most_depth` are a cycle."""
+    if key not in model.objects or depth > most_depth:
+        raise InputError(f"the 3MF model builds the object {key[1]!r}, which does not exist or contains itself.")
     current = model.objects[key]
     if current.corners:
-        yield _mesh(current, way)
+        yield _mesh(current, matrix)
     for inner, step in current.parts:
-        yield from _placed(model, inner, np.hstack([step, np.eye(4)[:, 3:]]) @ way, depth + 1)
+        # Transforms move rows (x, y, z, 1), so the inner one comes first, as a 4 x 4 matrix.
+        yield from _transformed(model, inner, np.hstack([step, np.eye(4)[:, 3:]]) @ matrix, depth + 1)
 
 
-def _mesh(current: _Object, way: Float) -> Mesh:
+def _mesh(current: _Object, matrix: Float) -> Mesh:
     """The object's own mesh in place, with RGBA colours, zero where there are none."""
     vertices = np.array(current.vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.array(current.corners, dtype=np.int64).reshape(-1, 3)
     colors = np.zeros((len(vertices), 4), dtype=np.uint8)
-    if not (way[:3] == np.eye(3)).all():
-        vertices = vertices @ way[:3]
-    # A mirroring matrix turns faces inside out, so their corners are reversed.
-    turned = faces if np.linalg.det(way[:3]) > 0 else faces[:, ::-1]
-    mesh = Mesh(vertices + way[3], turned, None, {"colors": colors})
+    if not (matrix[:3] == np.eye(3)).all():
+        vertices = vertices @ matrix[:3]
+    # A mirroring matrix would turn faces inside out, so their corners are reversed.
+    turned = faces if np.linalg.det(matrix[:3]) > 0 else faces[:, ::-1]
+    mesh = Mesh(vertices + matrix[3], turned, None, {"colors": colors})
     codes = np.array(current.colors, dtype=np.int64)
     # Where the corners at a vertex differ, the first one's colour is written last.
-    painted = np.flatnonzero(codes != _UNPAINTED)[::-1]
+    painted = np.flatnonzero(codes != -1)[::-1]
     colors[faces.reshape(-1)[painted]] = codes[painted].astype(">u4").view(np.uint8).reshape(-1, 4)
     return mesh
 
 
-def _code(text: str) -> int:
+def _rgba(text: str) -> int:
     """RGBA of ``#RRGGBB`` or ``#RRGGBBAA``, as one number."""
+    # Without an alpha channel, colours are opaque.
     return int(text.lstrip("#").ljust(8, "F")[:8], 16)

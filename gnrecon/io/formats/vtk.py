@@ -1,8 +1,8 @@
 """VTK's legacy format (``# vtk DataFile Version``), data sets of the kind POLYDATA, as text or big-endian binary.
 
-A file is a sequence of sections: a line of words that names a section and its size, then its numbers, in VTK's manual
-"VTK File Formats", up to version 5.1 with its offsets and connectivity. VTK itself weighs 140 MB and ends the process
-on some damaged files, and meshio reads no polydata, so the sections are walked here.
+A file is a sequence of sections: a line that names a section and its size, then its numbers, as in VTK's manual "VTK
+File Formats", up to version 5.1 with its offsets and connectivity. It is parsed here because VTK itself takes 140 MB
+and aborts the process on some damaged files, and meshio does not read polydata.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from urllib.parse import unquote
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, fan, no_faces
-from gnrecon.io.parse import numbers
+from gnrecon.io.contents import Contents, fan_triangles, no_faces
+from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
 _TYPES = {
@@ -24,14 +24,12 @@ _TYPES = {
     **{"unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtkidtype": "i4"},
     **{"vtktypeint64": "i8", "vtktypeuint64": "u8", "vtktypeint32": "i4"},
 }
-"""Names of number types in lower case, as numpy names them; ids are written with 32 bits."""
-
-_CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
+"""Number types, in lower case, and their names in numpy; ids have 32 bits."""
 
 
 @dataclass
 class _Data:
-    """What has been read so far."""
+    """Data read so far."""
 
     points: Float | None = None
     faces: list[Int] = field(default_factory=list)
@@ -57,16 +55,16 @@ def read_vtk(path: Path) -> Contents:
     if data.points is None:
         raise InputError("the file declares no points.")
     faces = np.concatenate(data.faces) if data.faces else no_faces()
-    return assemble(data.points, faces, data.arrays, data.normals, data.unread)
+    return assemble_contents(data.points, faces, data.arrays, data.normals, data.unread)
 
 
 class _Source:
-    """A file's bytes and how far they are read."""
+    """A file's bytes and the current position."""
 
     def __init__(self, data: bytes) -> None:
         lines = data.split(b"\n", 3)
         if not data.startswith(b"# vtk DataFile") or len(lines) < 4:
-            raise InputError("the file does not begin as a legacy VTK file does.")
+            raise InputError("the file does not begin like a legacy VTK file.")
         kind = lines[2].strip().upper()
         if kind not in (b"ASCII", b"BINARY"):
             raise InputError(f"expected ASCII or BINARY, but found {kind[:20].decode('ascii', 'replace')!r}.")
@@ -93,6 +91,7 @@ class _Source:
                 raise InputError(f"the file ends within {count} numbers of the type {kind}.")
             block, self.place = self.data[self.place : end], end
             return np.frombuffer(block, dtype.newbyteorder(">")).astype(dtype)
+        # Each number takes at least a byte; a larger count is refused before memory is allocated.
         if count > len(self.data) - self.place:
             raise InputError(f"the file ends within {count} numbers of the type {kind}.")
         words = self.data[self.place :].split(None, count)
@@ -102,7 +101,7 @@ class _Source:
         found = [word.decode("ascii", errors="replace") for word in words]
         if dtype.kind in "iu":
             return np.array([int(word) for word in found], dtype)
-        return numbers(found)
+        return parse_numbers(found)
 
 
 def _section(source: _Source, words: list[str], data: _Data) -> None:
@@ -117,7 +116,7 @@ def _section(source: _Source, words: list[str], data: _Data) -> None:
             data.of_points, data.count = name == "POINT_DATA", _count(words, 1)
         case "METADATA":
             _skip_metadata(source)
-        case _ if name in _CELLS:
+        case "VERTICES" | "LINES" | "POLYGONS" | "TRIANGLE_STRIPS":
             _cells(source, words, data)
         case "FIELD":
             _fields(source, words, data)
@@ -139,7 +138,7 @@ def _word(words: list[str], place: int) -> str:
 
 
 def _skip_metadata(source: _Source) -> None:
-    """Names of components and the like follow, up to a blank line."""
+    """Skip names of components and the like, up to a blank line."""
     while source.place < len(source.data):
         end = source.data.find(b"\n", source.place) + 1 or len(source.data)
         line, source.place = source.data[source.place : end], end
@@ -148,22 +147,22 @@ def _skip_metadata(source: _Source) -> None:
 
 
 def _cells(source: _Source, words: list[str], data: _Data) -> None:
-    """Polygons with their counts in between or, since version 5, with offsets beside them."""
+    """Read polygons with interleaved counts or, since version 5, with separate offsets."""
     rows, size, start = _count(words, 1), _count(words, 2), source.place
     following = source.words()
     if following[:1] == ["OFFSETS"]:
         offsets = source.numbers(rows, _word(following, 1)).astype(np.int64)
         following = source.words()
         if following[:1] != ["CONNECTIVITY"]:
-            raise InputError("expected the line CONNECTIVITY behind the offsets.")
+            raise InputError("expected the line CONNECTIVITY after the offsets.")
         corners: Int = source.numbers(size, _word(following, 1)).astype(np.int64)
-        counts = split_counts(offsets, corners)
+        counts = counts_from_offsets(offsets, corners)
     else:
         source.place = start
         counts, corners = _counted(source.numbers(size, "int").astype(np.int64), rows)
     name = words[0].upper()
     if name in ("POLYGONS", "TRIANGLE_STRIPS"):
-        data.faces.append(triangles(counts, corners, strips=name == "TRIANGLE_STRIPS"))
+        data.faces.append(triangulate_cells(counts, corners, strips=name == "TRIANGLE_STRIPS"))
     elif name == "LINES":
         data.unread.append("lines")
 
@@ -196,19 +195,20 @@ def _fields(source: _Source, words: list[str], data: _Data) -> None:
 
 
 def _array(source: _Source, words: list[str], data: _Data) -> None:
-    """One of the classic attributes of points or of polygons."""
+    """Read one of the classic attributes of points or of polygons."""
     name, title = words[0].upper(), _word(words, 1) if len(words) > 1 else ""
     match name:
         case "SCALARS":
             columns = _count(words, 3) if len(words) > 3 else 1
             start = source.place
+            # The line LOOKUP_TABLE is optional.
             if source.words()[:1] != ["LOOKUP_TABLE"]:
                 source.place = start
             _keep(data, title, source.numbers(columns * data.count, _word(words, 2)), columns)
         case "COLOR_SCALARS":
             columns = _count(words, 2)
             values = source.numbers(columns * data.count, "unsigned_char" if source.binary else "float")
-            # Text holds shares of full brightness.
+            # Text files store shares of full brightness.
             shares = values if source.binary else np.rint(255 * np.clip(values.astype(np.float64), 0, 1))
             _keep(data, title, shares.astype(np.uint8), columns)
         case "LOOKUP_TABLE":
@@ -222,7 +222,7 @@ def _array(source: _Source, words: list[str], data: _Data) -> None:
         case "TENSORS":
             _keep(data, title, source.numbers(9 * data.count, _word(words, 2)), 9)
         case _:
-            raise InputError(f"the line {' '.join(words)[:60]!r} begins no section that is known.")
+            raise InputError(f"the line {' '.join(words)[:60]!r} does not begin a known section.")
 
 
 def _keep(data: _Data, name: str, values: Values, columns: int) -> None:
@@ -232,10 +232,10 @@ def _keep(data: _Data, name: str, values: Values, columns: int) -> None:
         data.unread.append("values of polygons or of the whole")
 
 
-# What the two forms of VTK's polydata have in common: names of number types, strips, and what an array means.
+# The rest is shared with the XML format, see `gnrecon.io.formats.vtp`.
 
 
-def assemble(
+def assemble_contents(
     points: Float, faces: Int, arrays: Mapping[str, Values], normals: str | None, unread: list[str]
 ) -> Contents:
     """Return the contents of a data set.
@@ -245,7 +245,7 @@ def assemble(
     points : array of shape (N, 3)
     faces : integer array of shape (F, 3)
     arrays : the points' arrays by name, of shape (N,) or (N, C)
-    normals : name of the array that holds the normals, if any; else one called ``Normals`` does
+    normals : name of the array that holds the normals; by default ``Normals``, if there is one
     unread : what else the file holds
 
     Raises
@@ -259,7 +259,7 @@ def assemble(
             raise InputError(f"{name!r} has {len(values)} values, but there are {len(points)} points.")
     chosen = next((name for name in (normals, "Normals") if name in attributes), None)
     directions = None if chosen is None or attributes[chosen].shape[1:] != (3,) else attributes.pop(chosen)
-    # VTK draws an array of bytes as the colours that it holds.
+    # VTK displays an array of bytes as colours.
     colors = next((name for name, one in attributes.items() if one.dtype == np.uint8 and _is_color(one)), None)
     if colors is not None:
         attributes = {"colors": attributes.pop(colors), **attributes}
@@ -276,27 +276,28 @@ def _is_color(values: Values) -> bool:
     return values.ndim == 2 and values.shape[1] in (3, 4)
 
 
-def triangles(counts: Int, corners: Int, strips: bool) -> Int:
+def triangulate_cells(counts: Int, corners: Int, strips: bool) -> Int:
     """Return the triangles, of shape (F, 3), of polygons or of triangle strips.
 
     Parameters
     ----------
     counts : integer array of shape (P,), corners of each
     corners : integer array of shape (counts.sum(),)
-    strips : whether each is a strip, in which every other triangle is turned
+    strips : whether each is a strip, in which the orientation of triangles alternates
     """
     if not strips or not len(counts):
-        return fan(counts, corners) if len(counts) else no_faces()
+        return fan_triangles(counts, corners) if len(counts) else no_faces()
     starts = np.cumsum(counts) - counts
     found = []
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         strip = np.stack([corners[start + k : start + count - 2 + k] for k in range(3)], axis=1)
+        # Every other triangle of a strip has the opposite orientation.
         strip[1::2] = strip[1::2, [1, 0, 2]]
         found.append(strip)
     return np.concatenate(found)
 
 
-def split_counts(offsets: Int, corners: Int) -> Int:
+def counts_from_offsets(offsets: Int, corners: Int) -> Int:
     """Return how many corners each polygon has, of shape (P,), from offsets of shape (P + 1,) that begin with 0.
 
     Raises

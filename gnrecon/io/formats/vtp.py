@@ -1,8 +1,8 @@
 """VTP, VTK's XML format of polydata: arrays as text, base64 or raw bytes, in place or appended, also compressed.
 
-After VTK's manual "VTK File Formats", section XML. Arrays in binary begin with a count of bytes; compressed ones with
-the number of blocks, the size of a block, that of the last one, and the compressed size of each. VTK itself weighs
-140 MB and ends the process on some damaged files, so this is walked here.
+After VTK's manual "VTK File Formats", section XML. Binary arrays begin with a count of bytes; compressed ones with the
+number of blocks, the size of a block, that of the last one, and the compressed size of each. It is parsed here because
+VTK itself takes 140 MB and aborts the process on some damaged files.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import binascii
 import itertools
 import lzma
+import re
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,17 +20,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gnrecon.geometry.arrays import Int, Values
-from gnrecon.io.contents import Contents, joined, no_faces
-from gnrecon.io.formats.vtk import assemble, split_counts, triangles
-from gnrecon.io.parse import numbers
+from gnrecon.io.contents import Contents, concatenated, no_faces
+from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, triangulate_cells
+from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
-
-_KINDS = {"Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Float32", "Float64"}
-_UNPACK: dict[str, Callable[[bytes], bytes]] = {
-    "vtkZLibDataCompressor": zlib.decompress,
-    "vtkLZMADataCompressor": lzma.decompress,
-}
-_APPENDED = b"<AppendedData"
 
 
 @dataclass(frozen=True)
@@ -38,7 +32,7 @@ class _File:
 
     order: str
     header: np.dtype[np.generic]
-    compressor: str
+    decompress: Callable[[bytes], bytes] | None
     appended: bytes
     raw: bool
 
@@ -58,23 +52,27 @@ def read_vtp(path: Path) -> Contents:
         raise InputError(f"the file is not a well-formed VTP file ({error}).") from None
     if not pieces:
         raise InputError("the file holds no piece of polydata.")
-    return joined(pieces)
+    return concatenated(pieces)
 
 
 def _open(data: bytes) -> tuple[ElementTree.Element, _File]:
     """Return the XML without the appended block, and how arrays are read."""
-    xml, _, rest = data.partition(_APPENDED)
+    decompressors: dict[str, Callable[[bytes], bytes]] = {
+        "vtkZLibDataCompressor": zlib.decompress,
+        "vtkLZMADataCompressor": lzma.decompress,
+    }
+    xml, _, rest = data.partition(b"<AppendedData")
     tag, _, block = rest.partition(b">")
-    # Raw bytes are no XML, so the tree ends before them.
+    # Raw bytes are not XML, so the tree ends before them.
     root = ElementTree.fromstring(xml + b"</VTKFile>" if rest else xml)
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise InputError(f"expected a VTKFile of the type PolyData, but found {root.get('type', root.tag)!r}.")
     compressor = root.get("compressor", "")
-    if compressor and compressor not in _UNPACK:
-        raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(_UNPACK)}, or none.")
+    if compressor and compressor not in decompressors:
+        raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(decompressors)}, or none.")
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
-    return root, _File(order, header, compressor, block.partition(b"_")[2], b"raw" in tag)
+    return root, _File(order, header, decompressors.get(compressor), block.partition(b"_")[2], b"raw" in tag)
 
 
 def _piece(piece: ElementTree.Element, file: _File) -> Contents:
@@ -89,7 +87,7 @@ def _piece(piece: ElementTree.Element, file: _File) -> Contents:
     cells = piece.find("CellData")
     unread += ["values of polygons"] if cells is not None and len(cells) else []
     normals = None if data is None else data.get("Normals")
-    return assemble(found[0].astype(np.float64), np.concatenate(faces), arrays, normals, unread)
+    return assemble_contents(found[0].astype(np.float64), np.concatenate(faces), arrays, normals, unread)
 
 
 def _whole(text: str | None) -> int:
@@ -104,20 +102,20 @@ def _faces(piece: ElementTree.Element, name: str, file: _File) -> Int:
         return no_faces()
     corners = arrays["connectivity"].astype(np.int64).ravel()
     ends = arrays["offsets"].astype(np.int64).ravel()
-    counts = split_counts(np.concatenate([[0], ends]), corners)
-    return triangles(counts, corners, strips=name == "Strips")
+    counts = counts_from_offsets(np.concatenate([[0], ends]), corners)
+    return triangulate_cells(counts, corners, strips=name == "Strips")
 
 
 def _values(array: ElementTree.Element, file: _File) -> Values:
     """Return an array of shape (N,), or (N, C) where it has C > 1 components."""
     kind = array.get("type", "")
-    if kind not in _KINDS:
+    if re.fullmatch("U?Int(8|16|32|64)|Float(32|64)", kind) is None:
         raise InputError(f"the number type {kind[:40]!r} is unknown or not read.")
     dtype = np.dtype(kind.lower())
     form = array.get("format", "ascii")
     if form == "ascii":
         words = (array.text or "").split()
-        values: Values = np.array([int(word) for word in words], dtype) if dtype.kind in "iu" else numbers(words)
+        values: Values = np.array([int(word) for word in words], dtype) if dtype.kind in "iu" else parse_numbers(words)
     else:
         values = np.frombuffer(_bytes(array, form, file), np.dtype(file.order + dtype.str[1:])).astype(dtype)
     columns = _whole(array.get("NumberOfComponents", "1"))
@@ -129,7 +127,7 @@ def _bytes(array: ElementTree.Element, form: str, file: _File) -> bytes:
         block = file.appended[_whole(array.get("offset")) :]
         return _from_raw(block, file) if file.raw else _from_base64(block.lstrip(), file)
     if form != "binary":
-        raise InputError(f"the form {form[:20]!r} of an array is unknown.")
+        raise InputError(f"the format {form[:20]!r} of an array is unknown.")
     return _from_base64("".join((array.text or "").split()).encode("ascii", "replace"), file)
 
 
@@ -141,37 +139,38 @@ def _header(data: bytes, file: _File, count: int) -> list[int]:
 
 
 def _from_raw(data: bytes, file: _File) -> bytes:
-    if not file.compressor:
+    if file.decompress is None:
         size = _header(data, file, 1)[0]
         return _exactly(data[file.header.itemsize :], size)
     blocks = _header(data, file, 1)[0]
-    sizes = _header(data, file, 3 + _few(blocks, data))[3:]
-    return _unpacked(data[(3 + blocks) * file.header.itemsize :], sizes, file)
+    sizes = _header(data, file, 3 + _require_plausible(blocks, data))[3:]
+    return _decompressed(data[(3 + blocks) * file.header.itemsize :], sizes, file.decompress)
 
 
 def _from_base64(text: bytes, file: _File) -> bytes:
-    """The same in base64, where the header of compressed data is a text of its own."""
+    """The bytes of an array in base64, where the header of compressed data is encoded separately."""
     width = file.header.itemsize
-    if not file.compressor:
+    if file.decompress is None:
         size = _header(_decoded(text, width), file, 1)[0]
-        return _exactly(_decoded(text, width + _few(size, text))[width:], size)
-    blocks = _few(_header(_decoded(text, width), file, 1)[0], text)
+        return _exactly(_decoded(text, width + _require_plausible(size, text))[width:], size)
+    blocks = _require_plausible(_header(_decoded(text, width), file, 1)[0], text)
     length = (3 + blocks) * width
     sizes = _header(_decoded(text, length), file, 3 + blocks)[3:]
-    return _unpacked(_decoded(text[_encoded(length) :], _few(sum(sizes), text)), sizes, file)
+    packed = _decoded(text[_encoded_size(length) :], _require_plausible(sum(sizes), text))
+    return _decompressed(packed, sizes, file.decompress)
 
 
-def _encoded(size: int) -> int:
-    """How many letters of base64 so many bytes take."""
+def _encoded_size(size: int) -> int:
+    """Number of base64 characters for so many bytes."""
     return -(-size // 3) * 4
 
 
 def _decoded(text: bytes, size: int) -> bytes:
-    """The first `size` bytes of a text in base64."""
-    return binascii.a2b_base64(text[: _encoded(size)])[:size]
+    """The first `size` bytes of base64 text."""
+    return binascii.a2b_base64(text[: _encoded_size(size)])[:size]
 
 
-def _few(count: int, data: bytes) -> int:
+def _require_plausible(count: int, data: bytes) -> int:
     """Refuse a number of blocks or bytes that is larger than the data itself."""
     if count > len(data):
         raise InputError("an array declares more than the file holds.")
@@ -184,6 +183,6 @@ def _exactly(data: bytes, size: int) -> bytes:
     return data[:size]
 
 
-def _unpacked(data: bytes, sizes: list[int], file: _File) -> bytes:
+def _decompressed(data: bytes, sizes: list[int], decompress: Callable[[bytes], bytes]) -> bytes:
     ends = np.cumsum([0, *sizes], dtype=np.int64).tolist()
-    return b"".join(_UNPACK[file.compressor](data[start:end]) for start, end in itertools.pairwise(ends))
+    return b"".join(decompress(data[start:end]) for start, end in itertools.pairwise(ends))

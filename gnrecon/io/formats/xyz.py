@@ -1,8 +1,8 @@
 """Columns of numbers in text: XYZ, PTS, TXT, CSV, separated by blanks, commas, semicolons or tabs; read and written.
 
-Columns are named by a header line (``x,y,z,nx,ny,nz`` or ``//X Y Z Intensity``), or else guessed from their number:
-three directions of unit length are normals, the others as scanners commonly write them. A first line that is one bare
-count, as in PTS files, is checked against the rows.
+Columns are named by a header line (``x,y,z,nx,ny,nz`` or ``//X Y Z Intensity``). Otherwise they are guessed from their
+number: three that form unit vectors are normals, and the others are what scanners commonly write. A first line with a
+single count, as in PTS files, is checked against the rows.
 """
 
 from __future__ import annotations
@@ -23,18 +23,6 @@ from gnrecon.io.formats.ply import vertex_columns
 from gnrecon.io.parse import read_text
 from gnrecon.runtime.errors import InputError
 
-_COMMENTS = ("#", "//", ";", "%")
-
-_SEPARATORS = re.compile(r"[\s,;]+")
-
-_UNIT_SHARE = 0.9  # of the rows whose vectors must be of unit length for them to be normals
-
-_UNIT_TOLERANCE = 0.05  # some scanners store normals with two digits
-
-_NORMAL = ["nx", "ny", "nz"]
-
-_COLOR = ["red", "green", "blue"]
-
 
 def read_xyz(path: Path) -> Contents:
     """Read a table of points.
@@ -42,17 +30,17 @@ def read_xyz(path: Path) -> Contents:
     Raises
     ------
     InputError
-        When a word is no number, rows differ in length, a count line does not fit, or there are fewer than 3 columns.
+        When a word is not a number, rows differ in length, a count line is wrong, or there are fewer than 3 columns.
     """
-    names, count, body = split(read_text(path))
-    rows = table(body)
+    names, count, body = split_head(read_text(path))
+    rows = parse_table(body)
     if count is not None and len(rows) != count:
         raise InputError(f"the first line declares {count} points, but {len(rows)} follow.")
-    return from_columns(dict(zip(named(names, rows), rows.T, strict=True)))
+    return from_columns(dict(zip(column_names(names, rows), rows.T, strict=True)))
 
 
-def named(names: list[str] | None, rows: Float) -> list[str]:
-    """Return the names of the columns of a table of shape (N, C): those of its header, or else guessed ones.
+def column_names(names: list[str] | None, rows: Float) -> list[str]:
+    """Return the names of the columns of a table of shape (N, C): those of its header, or guessed ones.
 
     Raises
     ------
@@ -61,14 +49,14 @@ def named(names: list[str] | None, rows: Float) -> list[str]:
     """
     if rows.shape[1] < 3:
         raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1]}.")
-    names = _guess(rows) if names is None else names
+    names = _guess_names(rows) if names is None else names
     if len(names) != rows.shape[1]:
         raise InputError(f"the header names {len(names)} columns, but the rows hold {rows.shape[1]}.")
     return names
 
 
 def _words(line: str) -> list[str]:
-    return [word.strip("\"'") for word in _SEPARATORS.split(line.strip()) if word]
+    return [word.strip("\"'") for word in re.split(r"[\s,;]+", line.strip()) if word]
 
 
 def _is_number(word: str) -> bool:
@@ -79,8 +67,8 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def split(text: str) -> tuple[list[str] | None, int | None, str]:
-    """Return the column names and the count that the file's head states, and the rows that follow them.
+def split_head(text: str) -> tuple[list[str] | None, int | None, str]:
+    """Return the column names and the count in the file's head, and the rows that follow.
 
     Raises
     ------
@@ -91,9 +79,10 @@ def split(text: str) -> tuple[list[str] | None, int | None, str]:
     start = 0
     for line in io.StringIO(text):
         stripped = line.strip()
-        comment = stripped.startswith(_COMMENTS)
+        comment = stripped.startswith(("#", "//", ";", "%"))
         words = _words(stripped.lstrip("#/;%"))
         if words and not comment and all(map(_is_number, words)):
+            # A line with a single whole number is the count of a PTS file.
             if len(words) == 1 and words[0].isdecimal():
                 return names, int(words[0]), text[start + len(line) :]
             return names, None, text[start:]
@@ -107,28 +96,28 @@ def split(text: str) -> tuple[list[str] | None, int | None, str]:
     raise InputError("the file holds no points.")
 
 
-def table(body: str) -> Float:
+def parse_table(body: str) -> Float:
     """Return the rows as an array of shape (N, columns).
 
     Raises
     ------
     InputError
-        When there are none, a word is no number, or rows differ in length.
+        When there are none, a word is not a number, or rows differ in length.
     """
     first = body.lstrip().partition("\n")[0]
     if ";" in first and "," in first:
-        body = body.replace(",", ".")  # a spreadsheet of a country that writes decimal commas
+        body = body.replace(",", ".")  # a spreadsheet with decimal commas
     body = body.translate(str.maketrans(",;\t", "   "))
     if not body.strip():
         raise InputError("the file holds no points.")
     try:
         return np.loadtxt(io.StringIO(body), dtype=np.float64, comments=["#", "//"], ndmin=2)
     except ValueError as error:
-        raise InputError(_sentence(str(error))) from None
+        raise InputError(_row_error(str(error))) from None
 
 
-def _sentence(message: str) -> str:
-    """Return numpy's complaint about a row in words that fit a data file."""
+def _row_error(message: str) -> str:
+    """Return numpy's message about a row in terms of the file."""
     if found := re.search(r"could not convert string (.*?) to .*? at row (\d+)", message):
         return f"{found[1]} in row {int(found[2]) + 1} is not a number."
     if found := re.search(r"columns changed from (\d+) to (\d+) at row (\d+)", message):
@@ -136,49 +125,50 @@ def _sentence(message: str) -> str:
     return f"the rows are not a table of numbers ({message.partition(';')[0]})."
 
 
-def _is_unit(vectors: Float) -> bool:
-    """Whether nearly all finite non-zero rows, of a block of shape (N, 3), are directions."""
+def _are_unit_vectors(vectors: Float, *, least_share: float = 0.9, tolerance: float = 0.05) -> bool:
+    """Whether at least a share of the finite non-zero rows, of shape (N, 3), have unit length.
+
+    The tolerance of the length is wide because some scanners store normals with two digits.
+    """
     lengths = np.linalg.norm(vectors, axis=1)
     lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
-    return len(lengths) > 0 and bool((np.abs(lengths - 1) < _UNIT_TOLERANCE).mean() >= _UNIT_SHARE)
+    return len(lengths) > 0 and bool((np.abs(lengths - 1) < tolerance).mean() >= least_share)
 
 
-def _guess(rows: Float) -> list[str]:
+def _guess_names(rows: Float) -> list[str]:
     """Return names for the columns of a table without a header."""
+    normal, color = ["nx", "ny", "nz"], ["red", "green", "blue"]
     extra = rows.shape[1] - 3
-    if extra >= 3 and _is_unit(rows[:, 3:6]):
-        rest = _COLOR if extra == 6 else ["intensity"] if extra == 4 else []
-        names = [*_NORMAL, *rest]
-    elif extra == 6 and _is_unit(rows[:, 6:9]):
-        names = [*_COLOR, *_NORMAL]
-    elif extra == 7 and _is_unit(rows[:, 7:10]):
-        names = ["intensity", *_COLOR, *_NORMAL]
+    if extra >= 3 and _are_unit_vectors(rows[:, 3:6]):
+        rest = color if extra == 6 else ["intensity"] if extra == 4 else []
+        names = [*normal, *rest]
+    elif extra == 6 and _are_unit_vectors(rows[:, 6:9]):
+        names = [*color, *normal]
+    elif extra == 7 and _are_unit_vectors(rows[:, 7:10]):
+        names = ["intensity", *color, *normal]
     else:
-        names = {1: ["intensity"], 3: _COLOR, 4: ["intensity", *_COLOR]}.get(extra, [])
+        names = {1: ["intensity"], 3: color, 4: ["intensity", *color]}.get(extra, [])
     return ["x", "y", "z", *names, *(f"column_{i + 1}" for i in range(3 + len(names), rows.shape[1]))]
 
 
 def write_xyz(cloud: Mesh, path: Path) -> None:
     """Write the vertices with all their columns, and a line that names them: commented out unless the file is a CSV.
 
-    Numbers have the digits that read back as the same ones.
+    Numbers have enough digits to read back exactly.
     """
     columns = vertex_columns(cloud)
     comma = path.suffix.lower() == ".csv"
     separator = "," if comma else " "
     words = ["%d" if values.dtype.kind in "biu" else "%r" for _, _, values in columns]
-    # One column at a time keeps integers of any size exact.
+    # Formatting column by column keeps large integers exact.
     cells = [[word % number for number in values.tolist()] for word, (_, _, values) in zip(words, columns, strict=True)]
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(("" if comma else "# ") + separator.join(name for name, _, _ in columns) + "\n")
         file.writelines(separator.join(row) + "\n" for row in zip(*cells, strict=True))
 
 
-# Tables in text by chunks: blocks of whole lines, each read as a small file with the columns of the first one.
-
-
 def xyz_chunks(path: Path, rows: int) -> Iterator[Contents]:
-    """Yield the points of at most `rows` lines at a time. Columns without names are guessed from the first block.
+    """Yield the points of at most `rows` lines at a time; columns without names are guessed from the first block.
 
     Raises
     ------
@@ -186,17 +176,17 @@ def xyz_chunks(path: Path, rows: int) -> Iterator[Contents]:
         As `read_xyz` does, with rows counted within a block.
     """
     with path.open("r", encoding="utf-8-sig", errors="replace") as file:
-        names, count, body = split(_block(file, rows))
-        first = table(body)
-        names = named(names, first)
+        names, count, body = split_head(_block(file, rows))
+        first = parse_table(body)
+        names = column_names(names, first)
         found = len(first)
         yield from_columns(dict(zip(names, first.T, strict=True)))
         while block := _block(file, rows):
             if not block.strip():
                 continue
-            values = table(block)
+            values = parse_table(block)
             found += len(values)
-            yield from_columns(dict(zip(named(names, values), values.T, strict=True)))
+            yield from_columns(dict(zip(column_names(names, values), values.T, strict=True)))
     if count is not None and found != count:
         raise InputError(f"the first line declares {count} points, but {found} follow.")
 

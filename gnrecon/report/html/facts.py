@@ -1,4 +1,4 @@
-"""What the page says in numbers and words, read from a run's report; whatever the report lacks is left out."""
+"""Numbers and sentences for the page, from a run's report; what the report lacks is left out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Report = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Fact:
-    """A number or a word with its label, and what is to be said of it besides."""
+    """A number or a word with its label and a note."""
 
     label: str
     value: str
@@ -30,23 +30,6 @@ class Bar:
     fact: Fact
     width: float
     kept: bool = False
-
-
-INGEST = {
-    "read": "read",
-    "non_finite": "without finite coordinates",
-    "zero_normals": "without a direction",
-    "duplicates": "at the position of another",
-    "repeated": "copies, of a scan that is there twice",
-    "outliers": "scattered off the surface",
-    "clusters": "in isolated clusters",
-    "held_out": "held out to check the fit",
-    "thinned": "thinned out",
-    "kept": "fitted",
-}
-"""Counts of ingest in their order, in words."""
-
-YES = {True: "yes", False: "no"}
 
 
 def title(report: Report) -> str:
@@ -70,7 +53,7 @@ def verdict(report: Report) -> str:
 
 
 def headlines(report: Report) -> list[Fact]:
-    """The few numbers that stand on top."""
+    """The numbers at the top of the page."""
     mesh, metrics, resources = report["mesh"], report.get("metrics"), report.get("resources")
     facts = []
     if report.get("ingest"):
@@ -90,23 +73,35 @@ def headlines(report: Report) -> list[Fact]:
 
 def ingest(report: Report) -> list[Bar]:
     """What became of the points, as bars."""
+    words = {
+        "read": "read",
+        "non_finite": "without finite coordinates",
+        "zero_normals": "without a direction",
+        "duplicates": "at the position of another",
+        "repeated": "in a repeated copy of the scan",
+        "outliers": "scattered off the surface",
+        "clusters": "in isolated clusters",
+        "held_out": "held out for validation",
+        "thinned": "thinned out",
+        "kept": "fitted",
+    }
     counts = report.get("ingest") or {}
     read = counts.get("read", 0)
     return [
-        Bar(Fact(words, count(counts[name]), share(counts[name], read)), counts[name] / read, name in ("read", "kept"))
-        for name, words in INGEST.items()
+        Bar(Fact(label, count(counts[name]), share(counts[name], read)), counts[name] / read, name in ("read", "kept"))
+        for name, label in words.items()
         if read and (counts.get(name) or name in ("read", "kept"))
     ]
 
 
 def remarks(report: Report) -> list[str]:
-    """Sentences of the run about itself: normals, how the fit ended, what was done to the mesh."""
+    """Sentences about the run: normals, how the fit ended, what was done to the mesh."""
     counts, fit = report.get("ingest") or {}, report.get("fit") or {}
     sentences = [f"Normals: {counts['normals']}."] if counts.get("normals") else []
     if counts.get("outliers_found"):
-        sentences.append(f"Left {counts['outliers_found']} points alone that look like outliers.")
+        sentences.append(f"Kept {counts['outliers_found']} points that look like outliers.")
     if counts.get("clusters_found"):
-        sentences.append(f"Left {counts['clusters_found']} points alone that lie in isolated clusters.")
+        sentences.append(f"Kept {counts['clusters_found']} points in isolated clusters.")
     if layers := (report.get("scan") or {}).get("layers"):
         sentences.append(Layers(**layers).describe())
     return [*sentences, *(fit[name] for name in ("method", "status") if fit.get(name)), *report.get("actions", [])]
@@ -126,7 +121,7 @@ def surface(report: Report) -> list[Fact]:
     facts.append(Fact("Area", figure(mesh["area"], 6), "file units²"))
     if mesh["closed"]:
         facts.append(Fact("Volume", figure(mesh["volume"], 6), "file units³"))
-    facts += [Fact(word.capitalize(), YES[mesh[word]]) for word in ("closed", "manifold", "oriented")]
+    facts += [Fact(word.capitalize(), _yes_or_no(mesh[word])) for word in ("closed", "manifold", "oriented")]
     if (report.get("fineness") or {}).get("chord_error") is not None:
         fineness = report["fineness"]
         cells = f"from the fitted surface, with {count(fineness['resolution'])} cells"
@@ -158,7 +153,7 @@ def metrics(report: Report) -> list[tuple[Fact, str]]:
     ]
     rows = [(fact, meaning.format(target=target)) for fact, meaning in rows]
     if values.get("normal_consistency") is not None:
-        meaning = "mean |cosine| of a sample's normal and the nearest one's, mean of both ways"
+        meaning = "mean |cosine| of a sample's normal and the nearest one's, mean of both directions"
         rows.append((Fact("Normal consistency", figure(values["normal_consistency"], 4)), meaning))
     meaning = (
         f"harmonic mean of precision {figure(values['precision'], 4)} and recall {figure(values['recall'], 4)} "
@@ -201,8 +196,12 @@ def _value(value: Any) -> str:
     if value is None:
         return "not given"
     if isinstance(value, bool):
-        return YES[value]
+        return _yes_or_no(value)
     return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _yes_or_no(value: bool) -> str:
+    return "yes" if value else "no"
 
 
 def _words(name: str) -> str:

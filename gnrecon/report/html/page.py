@@ -1,4 +1,4 @@
-"""The page: one file that holds a run's report, its mesh and its scan, and needs no network to be read."""
+"""Makes a page of a run: one HTML file with the report, the mesh and the scan, which needs no network."""
 
 from __future__ import annotations
 
@@ -16,16 +16,9 @@ from gnrecon.report.html import facts
 from gnrecon.report.html.charts import bars, convergence, quality
 from gnrecon.report.html.scales import count, css, figure, ramp
 from gnrecon.report.html.viewer import Layer, layers, model
+from gnrecon.report.report_parameters import ChartLayout
 from gnrecon.runtime.errors import MeshError
 from gnrecon.runtime.files import write_text
-
-FOLDER = Path(__file__).parent / "assets"
-
-PROGRAM = ("shaders.js", "scene.js", "viewer.js", "controls.js")
-"""Parts of the page's program, in their order."""
-
-LEGEND = (300, 140)
-"""Size of a legend, which stands in the narrow panel."""
 
 
 def write_page(
@@ -37,7 +30,7 @@ def write_page(
     ----------
     path : path
     report : dict
-        As `Reconstruction.report`; ``mesh`` must be there, the rest is shown as far as it is.
+        As `Reconstruction.report`; ``mesh`` is required, other parts are shown where present.
     mesh : Mesh
         In file units; its attributes become the model's colours.
     cloud : PointCloud, optional
@@ -64,7 +57,7 @@ def page_text(report: Mapping[str, Any], mesh: Mesh, cloud: PointCloud | None = 
     shown = layers(mesh, origins, {} if unsupported is None else {"distance": unsupported})
     packed = model(mesh, cloud, shown, solid=bool(report["mesh"]["closed"]))
     environment = Environment(
-        loader=FileSystemLoader(FOLDER),
+        loader=FileSystemLoader(_assets()),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -81,23 +74,28 @@ def page_text(report: Mapping[str, Any], mesh: Mesh, cloud: PointCloud | None = 
         quality=_quality(mesh),
         style=_verbatim("page.css"),
         library=_verbatim("three.bundle.min.js"),
-        program=Markup("\n").join(map(_verbatim, PROGRAM)),
+        program=Markup("\n").join(map(_verbatim, ("shaders.js", "scene.js", "viewer.js", "controls.js"))),
     )
 
 
 def style_text() -> str:
-    """Return the page's style sheet, for pages that are to look like it."""
+    """Return the page's style sheet, for other pages in the same style."""
     return _verbatim("page.css")
 
 
+def _assets() -> Path:
+    return Path(__file__).parent / "assets"
+
+
 def _verbatim(name: str) -> Markup:
-    return Markup((FOLDER / name).read_text(encoding="utf-8"))
+    return Markup((_assets() / name).read_text(encoding="utf-8"))
 
 
 def _legend(layer: Layer) -> Markup:
     colors = [css(color) for color in ramp(layer.kind.ramp)[::4]]
     within = layer.beyond is not None and layer.low < layer.beyond < layer.high
-    return bars(layer.histogram, layer.unit, strip=colors, size=LEGEND, mark=layer.beyond if within else None)
+    layout = ChartLayout(width=300, height=140)  # for the narrow panel
+    return bars(layer.histogram, layer.unit, strip=colors, layout=layout, mark=layer.beyond if within else None)
 
 
 def _residuals(report: Mapping[str, Any]) -> list[dict[str, Any]]:

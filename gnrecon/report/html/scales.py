@@ -1,9 +1,10 @@
-"""Numbers as a reader wants them: few digits, thousands set apart, a true minus sign."""
+"""Numbers as text with few digits and grouped thousands, marks of axes at round numbers, and colour ramps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -13,14 +14,15 @@ import numpy.typing as npt
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.colors import to_linear, to_srgb
 
-MINUS, TIMES = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}"
 
-_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+def typographic(number: str) -> str:
+    """Return the text of a number with a true minus sign."""
+    return number.replace("-", "\N{MINUS SIGN}")
 
 
 def count(number: float) -> str:
-    """Return a whole number with its thousands set apart."""
-    return f"{round(number):,}".replace("-", MINUS)
+    """Return a whole number with grouped thousands."""
+    return typographic(f"{round(number):,}")
 
 
 def figure(number: float, digits: int = 3) -> str:
@@ -35,8 +37,9 @@ def figure(number: float, digits: int = 3) -> str:
     if -4 <= exponent < 7:
         text = f"{number:,.{max(0, digits - 1 - exponent)}f}"
     else:
-        text = f"{mantissa} {TIMES} 10{str(exponent).translate(_RAISED)}"
-    return text.replace("-", MINUS)
+        raised = str(exponent).translate(str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"))
+        text = f"{mantissa} \N{MULTIPLICATION SIGN} 10{raised}"
+    return typographic(text)
 
 
 def seconds(number: float) -> str:
@@ -69,40 +72,18 @@ STOPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "plain": ("#26305c", "#2f7f98", "#7cc08a", "#f4e58c"),
     }
 )
-"""Colours at equal steps, from the lowest value to the highest."""
-
-SIZE = 256
-
-# From linear sRGB to the responses of the eye's cones, and from their cube roots to Oklab.
-_CONES = np.array(
-    [
-        [0.4122214708, 0.5363325363, 0.0514459929],
-        [0.2119034982, 0.6806995451, 0.1073969566],
-        [0.0883024619, 0.2817188376, 0.6299787005],
-    ]
-)
-
-_LAB = np.array(
-    [
-        [0.2104542553, 0.7936177850, -0.0040720468],
-        [1.9779984951, -2.4285922050, 0.4505937099],
-        [0.0259040371, 0.7827717662, -0.8086757660],
-    ]
-)
+"""Colours at equal steps. Sequential ramps change in lightness throughout; diverging ones are lightest at zero."""
 
 
-# Colour ramps for values on a surface, interpolated in Oklab.
-#
-# Oklab (Ottosson 2020, "A perceptual color space for image processing") measures colours so that equal steps look
-# equal; a ramp that is straight between a few colours there neither bands nor hides differences. Sequential ramps rise
-# in lightness from zero; diverging ones are lightest in the middle, which is zero.
+def ramp(name: str, *, size: int = 256) -> npt.NDArray[np.uint8]:
+    """Return the sRGB colours of a ramp of `STOPS`, of shape (size, 3), from the lowest value to the highest.
 
-
-def ramp(name: str) -> npt.NDArray[np.uint8]:
-    """Return the sRGB colours of a ramp of `STOPS`, of shape (256, 3), from the lowest value to the highest."""
+    Colours are interpolated in Oklab (Ottosson 2020, "A perceptual color space for image processing"), where equal
+    steps look equal, so that a ramp neither bands nor hides differences.
+    """
     colors = np.array([list(bytes.fromhex(color[1:])) for color in STOPS[name]], dtype=np.uint8)
     stops = _to_oklab(to_linear(colors))
-    places = np.linspace(0, 1, SIZE)
+    places = np.linspace(0, 1, size)
     lab = np.stack([np.interp(places, np.linspace(0, 1, len(stops)), channel) for channel in stops.T], axis=1)
     return to_srgb(_from_oklab(lab))
 
@@ -113,16 +94,31 @@ def css(color: npt.NDArray[np.uint8]) -> str:
 
 
 def _to_oklab(light: Float) -> Float:
-    lab: Float = np.cbrt(light @ _CONES.T) @ _LAB.T
+    cones, opponents = _oklab_matrices()
+    lab: Float = np.cbrt(light @ cones.T) @ opponents.T
     return lab
 
 
 def _from_oklab(lab: Float) -> Float:
-    light: Float = (lab @ np.linalg.inv(_LAB).T) ** 3 @ np.linalg.inv(_CONES).T
+    cones, opponents = _oklab_matrices()
+    light: Float = (lab @ np.linalg.inv(opponents).T) ** 3 @ np.linalg.inv(cones).T
     return light
 
 
-# Where the marks of an axis stand: at round numbers.
+@cache
+def _oklab_matrices() -> tuple[Float, Float]:
+    """From linear sRGB to the responses of the eye's cones, and from their cube roots to Oklab; Ottosson 2020."""
+    cones = [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+    opponents = [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+    return np.array(cones), np.array(opponents)
 
 
 def linear(low: float, high: float, most: int = 5) -> list[float]:
@@ -145,8 +141,8 @@ def labels(places: list[float]) -> list[str]:
     step = min((after - before for before, after in pairwise(places)), default=0) or 1.0
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
     if digits > 5 or max(map(abs, places), default=0) >= 1e6:
-        return [f"{place:.1e}".replace("-", MINUS) for place in places]
-    return [f"{place:,.{digits}f}".replace("-", MINUS) for place in places]
+        return [typographic(f"{place:.1e}") for place in places]
+    return [typographic(f"{place:,.{digits}f}") for place in places]
 
 
 def _count(low: float, high: float, step: float) -> int:

@@ -1,7 +1,7 @@
-"""What the page's viewer is given: the surface, the points and the layers, as compressed arrays in text.
+"""Packs the surface, the points and the layers for the page's viewer, as compressed arrays in text.
 
-Positions are relative to the middle of the mesh's box and in units of its radius, so that single precision suffices
-wherever the file's coordinates lie; numbers that the viewer shows are turned back in double precision.
+Positions are relative to the centre of the mesh's box and in units of its radius, so that single precision suffices for
+any coordinates; the viewer converts numbers that it shows back in double precision.
 """
 
 from __future__ import annotations
@@ -25,12 +25,6 @@ from gnrecon.geometry.statistics import Histogram
 from gnrecon.rendering import vertex_sky
 from gnrecon.report.html.scales import figure, ramp
 
-MOST_FACES, MOST_POINTS = 300_000, 100_000
-"""What a browser turns smoothly, and what a page can hold without becoming slow to open."""
-
-NO_VALUE = -3e38
-"""Stands for a value that is not finite: single precision has it, and no layer reaches so far."""
-
 
 @dataclass(frozen=True)
 class Model:
@@ -41,14 +35,22 @@ class Model:
     buffers : dict of str
         Arrays by name, each little-endian, compressed by zlib, in base64.
     scene : dict
-        All that is no array: the place and the size of the model, its layers and counts, ready for JSON.
+        Position and size of the model, its layers and counts, ready for JSON.
     """
 
     buffers: dict[str, str]
     scene: dict[str, Any]
 
 
-def model(mesh: Mesh, cloud: PointCloud | None, shown: Sequence[Layer], solid: bool) -> Model:
+def model(
+    mesh: Mesh,
+    cloud: PointCloud | None,
+    shown: Sequence[Layer],
+    solid: bool,
+    *,
+    most_faces: int = 300_000,
+    most_points: int = 100_000,
+) -> Model:
     """Pack a mesh and its scan for the viewer.
 
     Parameters
@@ -60,10 +62,12 @@ def model(mesh: Mesh, cloud: PointCloud | None, shown: Sequence[Layer], solid: b
         Of the same mesh.
     solid : bool
         Whether the mesh bounds a solid, so that a section through it is filled.
+    most_faces, most_points : int
+        Limits of what is shown: browsers turn so much smoothly, and the page opens quickly.
     """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
-    light = lighten(Mesh(mesh.vertices, mesh.faces, mesh.normals, _attributes(mesh, shown)), MOST_FACES)
+    light = lighten(Mesh(mesh.vertices, mesh.faces, mesh.normals, _attributes(mesh, shown)), most_faces)
     buffers = {
         "positions": pack(((light.vertices - centre) / radius).astype("<f4")),
         "shape": pack(_shape(light)),
@@ -85,7 +89,7 @@ def model(mesh: Mesh, cloud: PointCloud | None, shown: Sequence[Layer], solid: b
         "points": None,
     }
     if cloud is not None and np.isfinite(cloud.points).all(axis=1).any():
-        scene["points"] = _add_points(buffers, cloud, centre, radius)
+        scene["points"] = _add_points(buffers, cloud, centre, radius, most_points)
     return Model(buffers, scene)
 
 
@@ -102,22 +106,22 @@ def _attributes(mesh: Mesh, shown: Sequence[Layer]) -> dict[str, Values]:
 
 
 def _shape(mesh: Mesh) -> npt.NDArray[np.int16]:
-    """Normals and the share of the sky that is seen, of shape (V, 4), as normalised 16-bit numbers."""
+    """Normals and ambient occlusion, of shape (V, 4), as normalised 16-bit numbers."""
     shape = np.concatenate([mesh.vertex_normals(), vertex_sky(mesh)[:, None]], axis=1)
     numbers: npt.NDArray[np.int16] = np.round(np.clip(shape, -1, 1) * 32767).astype("<i2")
     return numbers
 
 
 def _values(values: Values) -> npt.NDArray[np.float32]:
+    """Values in single precision; -3e38, which the viewer knows and no layer reaches, where they are not finite."""
     numbers = values.astype(np.float64)
-    single: npt.NDArray[np.float32] = np.where(np.isfinite(numbers), np.clip(numbers, -1e38, 1e38), NO_VALUE).astype(
-        "<f4"
-    )
+    shown = np.where(np.isfinite(numbers), np.clip(numbers, -1e38, 1e38), -3e38)
+    single: npt.NDArray[np.float32] = shown.astype("<f4")
     return single
 
 
 def _rgba(colors: Values) -> npt.NDArray[np.uint8]:
-    """8-bit colours of shape (N, 4), because graphics cards want rows of four bytes."""
+    """8-bit colours of shape (N, 4), because WebGL aligns rows to four bytes."""
     rgba = np.full((len(colors), 4), 255, dtype=np.uint8)
     rgba[:, :3] = as_bytes(colors)[:, :3]
     return rgba
@@ -135,13 +139,13 @@ def _described(layer: Layer) -> dict[str, Any]:
     }
 
 
-def _add_points(buffers: dict[str, str], cloud: PointCloud, centre: Float, radius: float) -> dict[str, Any]:
-    """Pack some of the points; return what there is to say of them."""
+def _add_points(buffers: dict[str, str], cloud: PointCloud, centre: Float, radius: float, most: int) -> dict[str, Any]:
+    """Pack at most so many of the points; return their counts and spacing."""
     from scipy.spatial import cKDTree
 
     finite = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
-    if len(finite) > MOST_POINTS:
-        finite = np.sort(np.random.default_rng(0).choice(finite, MOST_POINTS, replace=False))
+    if len(finite) > most:
+        finite = np.sort(np.random.default_rng(0).choice(finite, most, replace=False))
     points = (cloud.points[finite] - centre) / radius
     buffers["points"] = pack(points.astype("<f4"))
     if cloud.normals is not None:
@@ -156,15 +160,6 @@ def _add_points(buffers: dict[str, str], cloud: PointCloud, centre: Float, radiu
     return {"shown": len(finite), "all": len(cloud), "spacing": spacing}
 
 
-BINS = 56
-
-PERCENTILE = 99.0
-"""Where a scale ends: the few values beyond it would leave all others in one colour. They take the last colour."""
-
-
-# What a mesh can be coloured by: one layer for each field of values that it carries, with its scale and its spread.
-
-
 @dataclass(frozen=True)
 class Kind:
     """How a field of values is shown.
@@ -174,9 +169,9 @@ class Kind:
     title, meaning : str
         For the reader.
     power : int or None
-        Of the file's unit of length that the values are in; None where it is not known.
+        Of the file's unit of length in the values' unit; None where it is not known.
     ramp : str
-        A name of `ramps.STOPS`.
+        A name of `gnrecon.report.html.scales.STOPS`.
     signed : bool
         Whether zero is the middle of the scale.
     """
@@ -198,7 +193,7 @@ KINDS = {
     ),
     "sigma": Kind(
         "Uncertainty",
-        "Standard deviation of the position along the normal, as the fit itself sees it.",
+        "Standard deviation of the position along the normal, estimated by the fit.",
         1,
         "uncertainty",
     ),
@@ -208,9 +203,7 @@ KINDS = {
         "Gaussian curvature", "Product of the two principal curvatures.", -2, "curvature", signed=True
     ),
 }
-"""The fields that gnrecon itself makes; whatever else a mesh carries is shown under its own name."""
-
-UNITS = {1: "file units", -1: "1 / file unit", -2: "1 / file unit²", None: ""}
+"""Attributes that gnrecon computes; others are shown under their own names."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +221,7 @@ class Layer:
     histogram : Histogram
         Of the surface's area over the values, from `low` to `high`.
     figures : tuple of pairs of str
-        What is worth saying in numbers, each with its label.
+        Statistics, each with its label.
     beyond : float, optional
         Value from which on the surface is hatched.
     """
@@ -245,7 +238,7 @@ class Layer:
     @property
     def unit(self) -> str:
         """Unit of the values, in words."""
-        return UNITS[self.kind.power]
+        return {1: "file units", -1: "1 / file unit", -2: "1 / file unit²", None: ""}[self.kind.power]
 
 
 def layers(
@@ -257,7 +250,7 @@ def layers(
     ----------
     mesh : Mesh
     origins : mapping of str to str
-        How the values of an attribute were found, for those that are none of `KINDS`.
+        How the values of an attribute were found, for attributes that are not in `KINDS`.
     beyond : mapping of str to float
         Values of an attribute from which on the surface is hatched.
     """
@@ -278,12 +271,12 @@ def vertex_areas(mesh: Mesh) -> Float:
     return areas
 
 
-def _layer(name: str, values: Float, areas: Float, origins: Mapping[str, str]) -> Layer:
+def _layer(name: str, values: Float, areas: Float, origins: Mapping[str, str], *, bins: int = 56) -> Layer:
     origin = origins.get(name, "carried by the mesh")
     kind = KINDS.get(name) or Kind(_sentence(name.replace("_", " ")), f"{_sentence(origin)}.", None, "plain")
     finite = np.isfinite(values)
     low, high = _scale(values[finite], kind)
-    histogram = Histogram.of(values[finite], low, high, BINS, areas[finite])
+    histogram = Histogram.of(values[finite], low, high, bins, areas[finite])
     return Layer(name, kind, values, low, high, histogram, _figures(values[finite], areas[finite], kind))
 
 
@@ -291,12 +284,16 @@ def _sentence(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def _scale(values: Float, kind: Kind) -> tuple[float, float]:
-    """Ends of the scale for finite values of shape (N,): never equal."""
+def _scale(values: Float, kind: Kind, *, end_percentile: float = 99.0) -> tuple[float, float]:
+    """Ends of the scale for finite values of shape (N,): never equal.
+
+    The scale ends at a percentile, because a few extreme values would leave all others in one colour; values beyond it
+    get the last colour.
+    """
     if kind.signed:
-        reach = float(np.percentile(np.abs(values), PERCENTILE)) or 1.0
+        reach = float(np.percentile(np.abs(values), end_percentile)) or 1.0
         return -reach, reach
-    low, high = (float(end) for end in np.percentile(values, [100 - PERCENTILE, PERCENTILE]))
+    low, high = (float(end) for end in np.percentile(values, [100 - end_percentile, end_percentile]))
     if kind.power is not None:
         low = 0.0
     return (low, high) if high > low else (low, low + (abs(low) or 1.0))

@@ -1,18 +1,42 @@
-"""The cases, in groups: to add one, add a line.
+"""The cases in named groups. To add a case, add a line.
 
 Lengths of the analytic scans are in radii, angles in degrees; see `scans.AnalyticScan`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.accuracy.files import BareScan, RangeScan
-from benchmarks.accuracy.scans import AnalyticScan
-from benchmarks.cases import CASES as PAPER
-from benchmarks.groups import cases_of
-from benchmarks.problem import Case, Problem
+from benchmarks.accuracy.problem import Case, Problem
+from benchmarks.accuracy.scans import PAPER_SCANS, AnalyticScan, RangeScan, UnorientedScan
+from gnrecon.runtime.errors import UsageError
+
+Groups = Mapping[str, Mapping[str, Case]]
+"""Cases by name, in groups by name."""
+
+
+def cases_of(groups: Groups) -> dict[str, Case]:
+    """Return the cases of all groups by name, each once."""
+    return {name: case for group in groups.values() for name, case in group.items()}
+
+
+def chosen_cases(names: Iterable[str], groups: Groups) -> dict[str, Case]:
+    """Return the cases of the named groups and the named cases, each once, in the order of the tables.
+
+    Raises
+    ------
+    UsageError
+        When a name is neither.
+    """
+    cases, wanted = cases_of(groups), set[str]()
+    for name in names:
+        if name not in groups and name not in cases:
+            known = ", ".join(map(repr, cases))
+            raise UsageError(f"There is no case {name!r}; the groups are {', '.join(groups)}, the cases {known}.")
+        wanted |= set(groups.get(name, [name]))
+    return {name: case for name, case in cases.items() if name in wanted}
 
 
 @dataclass(frozen=True)
@@ -36,8 +60,8 @@ SRB: dict[str, Case] = {
     "gargoyle, no normals": RangeScan("gargoyle.ply", normals=False),
 }
 VIPSS: dict[str, Case] = {
-    "kitten": BareScan("kitten.xyz", "kitten_gt.obj", genus=1),
-    "mug": BareScan("mug.xyz", "mug_gt.obj", genus=2),
+    "kitten": UnorientedScan("kitten.xyz", "kitten_gt.obj", genus=1),
+    "mug": UnorientedScan("mug.xyz", "mug_gt.obj", genus=2),
 }
 CLEAN: dict[str, Case] = {
     "sphere": AnalyticScan("sphere", 2000),
@@ -81,7 +105,7 @@ SPARSE: dict[str, Case] = {
 }
 
 GROUPS: dict[str, dict[str, Case]] = {
-    "paper": {name: Within("paper", case) for name, case in PAPER.items()},
+    "paper": {name: Within("paper", case) for name, case in PAPER_SCANS.items()},
     "srb": {name: Within("srb", case) for name, case in SRB.items()},
     "vipss": {name: Within("vipss500", case) for name, case in VIPSS.items()},
     "analytic": CLEAN | NOISY | SPARSE,
@@ -89,8 +113,8 @@ GROUPS: dict[str, dict[str, Case]] = {
     "noisy": NOISY,
     "sparse": SPARSE,
 }
-"""Names that stand for several cases; `analytic` for the last three together."""
+"""Groups of cases by name; `analytic` is the last three together."""
 
 CASES = cases_of(GROUPS)
 HARD = {*NOISY, *SPARSE}
-"""The cases in which gnrecon is to be better than its best peer."""
+"""The cases in which gnrecon is meant to beat its best peer."""

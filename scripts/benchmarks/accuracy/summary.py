@@ -1,4 +1,4 @@
-"""What the trials of a case come to, and in how many of the hard cases gnrecon is ahead of its best peer."""
+"""Summaries of the trials of a case, their table, and how many hard cases gnrecon wins against its best peer."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rich.table import Table
+
 from benchmarks.accuracy.cases import HARD
-from benchmarks.comparison import best_setting
-from benchmarks.methods import PEERS
-from benchmarks.problem import Problem
+from benchmarks.accuracy.comparison import best_setting
+from benchmarks.accuracy.methods import METHODS, PEERS
+from benchmarks.accuracy.problem import Problem
+from benchmarks.harness.tables import Figure, number_or_dash
 from gnrecon.geometry.point_cloud import PointCloud
 
 LENGTHS = (
@@ -23,14 +26,12 @@ LENGTHS = (
     "samples_hausdorff",
 )
 OTHERS = ("normal_consistency", "f_score", "components", "genus", "boundary_edges", "seconds", "peak_memory_mb")
-QUARTER = 0.75
-"""What a quarter or more below the best peer is, as a ratio of mean distances."""
 
 
 def summarise(records: Sequence[dict[str, Any]], problem: Problem) -> dict[str, Any]:
-    """Return what is known of a case, and for each of its methods the medians over seeds at the best setting.
+    """Return the facts of a case, and for each of its methods the medians over seeds at the best setting.
 
-    Distances are in the truth's own unit; `factor` leads to the `unit` in which they are told.
+    Distances are in the truth's own unit; `factor` converts them to the reported `unit`.
     """
     found = [record | _derived(record) for record in records]
     names = dict.fromkeys(record["method"] for record in found)
@@ -48,14 +49,14 @@ def summarise(records: Sequence[dict[str, Any]], problem: Problem) -> dict[str, 
 
 @dataclass(frozen=True)
 class Standing:
-    """In how many hard cases gnrecon's symmetric mean is below the best peer's, and by a quarter or more."""
+    """Number of hard cases in which gnrecon's symmetric mean is below the best peer's, and by a quarter or more."""
 
     cases: int
     below: int
     quarter: int
 
     def describe(self) -> str:
-        """Say it in a sentence."""
+        """Return it as a sentence."""
         return (
             f"Of {self.cases} noisy or sparse analytic cases, gnrecon's mean distance is below the best peer's in "
             f"{self.below}, by a quarter or more in {self.quarter}."
@@ -63,14 +64,14 @@ class Standing:
 
 
 def standing(summaries: Sequence[dict[str, Any]]) -> Standing | None:
-    """Return how gnrecon stands in the hard cases among `summaries`; None where none of them sets it beside a peer.
+    """Return how gnrecon stands in the hard cases of `summaries`; None where none of them compares it with a peer.
 
     A method that failed is infinitely far from the truth.
     """
     ratios = [ratio for ratio in map(_ratio, (s for s in summaries if s["case"] in HARD)) if ratio is not None]
     if not ratios:
         return None
-    return Standing(len(ratios), sum(ratio < 1 for ratio in ratios), sum(ratio <= QUARTER for ratio in ratios))
+    return Standing(len(ratios), sum(ratio < 1 for ratio in ratios), sum(ratio <= 0.75 for ratio in ratios))
 
 
 def best_peer(summary: dict[str, Any]) -> str | None:
@@ -86,7 +87,7 @@ def _ratio(summary: dict[str, Any]) -> float | None:
     ours, theirs = _mean(summary, "gnrecon"), _mean(summary, peer)
     if math.isinf(theirs):
         return math.inf if math.isinf(ours) else 0.0
-    # Ball pivoting on a clean plane has no error at all, and nothing is a multiple of zero.
+    # Ball pivoting on a clean plane has no error at all.
     return ours / theirs if theirs else math.inf
 
 
@@ -100,3 +101,81 @@ def _derived(record: dict[str, Any]) -> dict[str, Any]:
         return {}
     there, back = record["reference_to_mesh_rms"], record["mesh_to_reference_rms"]
     return {"rms": math.sqrt((there**2 + back**2) / 2)}
+
+
+COLUMNS = (
+    Figure("reference_to_mesh_mean", "truth to mesh", "{:,.3f}"),
+    Figure("mesh_to_reference_mean", "mesh to truth", "{:,.3f}"),
+    Figure("chamfer_mean", "mean", "{:,.3f}"),
+    Figure("rms", "RMS", "{:,.3f}"),
+    Figure("hausdorff", "Hausdorff", "{:,.1f}"),
+    Figure("normal_consistency", "normals", "{:.4f}"),
+    Figure("f_score", "F-score", "{:.4f}"),
+    Figure("components", "parts", "{:g}"),
+    Figure("genus", "genus", "{:g}"),
+    Figure("closed", "closed", "{}"),
+    Figure("seconds", "s", "{:,.1f}"),
+    Figure("peak_memory_mb", "MB"),
+)
+SAMPLE_COLUMNS = (
+    Figure("samples_chamfer", "Chamfer of samples", "{:,.3f}"),
+    Figure("samples_hausdorff", "Hausdorff of samples", "{:,.2f}"),
+)
+SETTINGS = {"depth": "depth", "filterscale": "scale"}
+"""Names of settings in the table."""
+
+
+def accuracy_table(summaries: Sequence[dict[str, Any]], seeds: int) -> Table:
+    """Return a table of the summaries of `summary.summarise`; the best peer of each case is marked with a star."""
+    caption = "Mean: half the sum of both ways. F-score at 0.5 % of the radius. *: the best peer by the mean."
+    table = Table(caption=caption + (f" Medians over {seeds} seeds." if seeds > 1 else ""))
+    has_samples = any(done["samples_chamfer"] is not None for summary in summaries for done in _measured(summary))
+    columns = [*COLUMNS, *(SAMPLE_COLUMNS if has_samples else ())]
+    table.add_column("case and method", no_wrap=True)
+    for column in columns:
+        table.add_column(column.label, justify="right")
+    for summary in summaries:
+        table.add_row(f"[bold]{summary['case']}[/bold]")
+        table.add_row(f"[dim]{_described(summary)}[/dim]")
+        star = best_peer(summary)
+        for method, figures in summary["methods"].items():
+            name = f"{method_title(method, figures)}{' *' if method == star else ''}"
+            table.add_row(name, *(_cell(figures, column, summary["factor"]) for column in columns))
+        table.add_section()
+    return table
+
+
+def method_title(method: str, figures: dict[str, Any]) -> str:
+    """Return the method's name with its reported setting."""
+    settings = figures.get("settings", {})
+    return ", ".join([method, *(f"{SETTINGS[key]} {settings[key]:g}" for key in SETTINGS if key in settings)])
+
+
+def failures(summaries: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a sentence for every method that made no mesh of a case, in the order of the methods' table."""
+    return [
+        f"{summary['case']}, {method}: {summary['methods'][method]['error']}"
+        for summary in summaries
+        for method in METHODS
+        if "error" in summary["methods"].get(method, {})
+    ]
+
+
+def _described(summary: dict[str, Any]) -> str:
+    genus = "" if summary["genus"] is None else f", genus {summary['genus']}"
+    against = "; measured against the scan" if summary["against_scan"] else ""
+    return f"{summary['points']:,} points{genus}; {summary['unit']}{against}"
+
+
+def _measured(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    return [figures for figures in summary["methods"].values() if "error" not in figures]
+
+
+def _cell(figures: dict[str, Any], column: Figure, factor: float) -> str:
+    if "error" in figures:
+        return "failed" if column.key == "chamfer_mean" else ""
+    value = figures[column.key]
+    if value is not None and column.key == "closed":
+        return "yes" if value == 1 else "no"
+    in_unit = factor * value if value is not None and column.key in LENGTHS else value
+    return number_or_dash(in_unit, column.form)

@@ -1,0 +1,22 @@
+"""Parameters of reading and writing that several functions share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class IOParameters:
+    """Sizes and tolerances of reading and writing files."""
+
+    most_points: int = 2_000_000
+    # Points to keep of a scan: far fewer describe a surface well, and all later stages fit into memory.
+
+    chunked_file_bytes: int = 1 << 24
+    # Size of a file from which it is read by chunks; a smaller one fits into memory several times.
+
+    chunk_points: int = 1 << 20
+    # Points in a chunk: their arrays take some ten megabytes, and libraries read so many at full speed.
+
+    visible_rounding_diagonals: float = 1e-6
+    # Rounding to float32, in diagonals of the mesh, that is reported or avoided: about eight times the float32 epsilon.

@@ -1,0 +1,41 @@
+"""Parameters of the estimate and of the page's charts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """Model of what a default run takes, fitted to measured runs; see `gnrecon.report.estimate` for the formula.
+
+    Times are processor seconds of one thread, of clouds of 500 to 35,000 points at three qualities and resolutions.
+    """
+
+    start_seconds: float = 3.0  # measured: imports and the first stages of a small scan
+    read_points_per_second: float = 100_000.0  # measured: reading and cleaning
+    fit_seconds: float = 6.8  # measured: fit of `fit_points` with `detail_features`
+    fit_points: int = 500  # the smallest cloud measured
+    fit_exponent: float = 0.545  # slope of log time over log points in the measurements
+    mesh_seconds: float = 50.0  # measured: mesh of `mesh_cells` with `detail_features`
+    mesh_cells: int = 256  # the default resolution
+    detail_features: int = 600  # features per cube with --quality normal
+    two_core_share: float = 0.5  # share of the processor seconds that pass on two idle cores; more cores help little
+    fit_memory_mb: float = 950.0  # upper end of the measured 750 to 950 MB of a fit
+    mesh_memory_mb: float = 505.0  # measured: mesh of few cells
+    mesh_cells_memory_mb: float = 886.0  # measured: what a mesh of `mesh_memory_cells` takes more
+    mesh_memory_cells: int = 512  # the resolution of that measurement
+    read_point_bytes: float = 600.0  # measured: each point that is read
+
+
+@dataclass(frozen=True)
+class ChartLayout:
+    """Size of a chart and its margins, in SVG units, which are about a pixel on the page."""
+
+    width: int = 440  # one of two columns of the page
+    height: int = 210
+    left: int = 12
+    right: int = 12
+    top: int = 14  # a note fits above the bars
+    bottom: int = 40  # the axis, its numbers and its name
+    strip_height: int = 12  # strip of colours below the bars of a legend

@@ -1,1 +1,0 @@
-"""Many scans at a time: what befalls some of them, a batch that is killed, and throughput."""

@@ -1,1 +1,0 @@
-"""What a large scan costs, fitted by blocks, and whether its surface has seams."""

@@ -1,0 +1,1 @@
+"""What the benchmarks share: the command line, processes and times, pictures."""

@@ -1,1 +1,0 @@
-"""Normals that gnrecon estimates, beside the true ones and open3d's."""

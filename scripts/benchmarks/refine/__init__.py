@@ -1,1 +1,0 @@
-"""Refinement of meshes beside the libraries' own remeshing and simplification."""

@@ -1,1 +1,0 @@
-"""Whether sigma tells the true error of a reconstruction."""

@@ -1,0 +1,51 @@
+"""The parameters of reading and writing are frozen, all used, and have the effect that they describe."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import FrozenInstanceError, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scan_writers import file_of, random_cloud
+
+import gnrecon.io
+from gnrecon.io import IOParameters, read_scans
+from gnrecon.io.streaming import read_chunks
+from gnrecon.options import Options
+
+ROOM = Path(gnrecon.io.__file__).parent
+
+
+def test_they_are_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        IOParameters().most_points = 1  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(IOParameters)])
+def test_each_is_used(name: str) -> None:
+    trees = [ast.parse(path.read_text()) for path in ROOM.rglob("*.py")]
+    assert any(isinstance(node, ast.Attribute) and node.attr == name for tree in trees for node in ast.walk(tree))
+
+
+def test_scans_are_thinned_to_the_most_points(tmp_path: Path) -> None:
+    path = file_of("ply", random_cloud(np.random.default_rng(2), 300), tmp_path)
+    thinned, _ = read_scans([path], parameters=IOParameters(most_points=50))
+    assert 5 < len(thinned) <= 50
+    np.testing.assert_array_equal(thinned.points, read_scans([path], most=50)[0].points)
+    assert Options.of().read_points == IOParameters.most_points
+    whole = read_scans([path])[0]
+    assert len(whole) == 300
+    np.testing.assert_array_equal(whole.points, read_scans([path], parameters=IOParameters())[0].points)
+
+
+def test_only_large_files_are_read_by_chunks(tmp_path: Path) -> None:
+    path = file_of("ply", random_cloud(np.random.default_rng(3), 100), tmp_path)
+
+    def sizes(parameters: IOParameters) -> list[int]:
+        return [len(chunk.points) for chunk in read_chunks(path, ".ply", parameters=parameters)]
+
+    assert sizes(IOParameters(chunked_file_bytes=0, chunk_points=40)) == [40, 40, 20]
+    assert sizes(IOParameters(chunked_file_bytes=path.stat().st_size + 1, chunk_points=40)) == [100]
+    assert [len(chunk.points) for chunk in read_chunks(path, ".ply")] == sizes(IOParameters()) == [100]
