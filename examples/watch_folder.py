@@ -1,12 +1,11 @@
-"""Watch a folder: each scan that is completely written there becomes a verified mesh, once.
+"""Watch a folder: each scan that was completely written there becomes a verified mesh, once.
 
     python examples/watch_folder.py incoming meshes --quality draft
 
-A scan counts as complete when its size and time have stayed the same from one look to the next. The folder is looked at
-again and again rather than subscribed to, because network shares, on which scanners like to write, tell nobody of
-changes. A scan then moves to ``incoming/done``, and one that fails to ``incoming/failed``, beside a text file with the
-reason; what is in neither is still to be done, so that nothing else has to be remembered. Ctrl-C or a polite kill ends
-the watch, in the middle of a reconstruction as well: nothing half-made is left, and its scan stays where it is.
+A scan is complete when its size and time have not changed between two looks. The folder is polled, because network
+shares, to which many scanners write, send no notifications. A finished scan moves to ``incoming/done``, and one that
+fails to ``incoming/failed``, with a text file of the reason; the others are still to do, so no other state is kept.
+Ctrl-C or SIGTERM ends the watch, even during a reconstruction: no partial file is left, and the scan stays in place.
 """
 
 from __future__ import annotations
@@ -22,9 +21,6 @@ from typing import Any
 
 import gnrecon
 
-INTERVAL = 2.0
-"""Seconds between two looks."""
-
 Stamp = tuple[int, int]
 """A file's size, and when it was last written."""
 
@@ -32,18 +28,18 @@ _log = logging.getLogger("watch_folder")
 
 
 class Stopper(gnrecon.Progress):
-    """Ends a reconstruction once the watch is to end."""
+    """Ends a reconstruction when the watch ends."""
 
     def __init__(self, stop: Event) -> None:
         self._stop = stop
 
     def stage(self, name: str) -> None:
-        """Look at each stage."""
+        """Check at each stage."""
         del name
         self._check()
 
     def advance(self, share: float) -> None:
-        """Look within stages, too."""
+        """Check within stages, too."""
         del share
         self._check()
 
@@ -52,8 +48,11 @@ class Stopper(gnrecon.Progress):
             raise gnrecon.Cancelled
 
 
-def watch(incoming: Path, meshes: Path, options: Mapping[str, Any], stop: Event, interval: float = INTERVAL) -> None:
-    """Reconstruct what comes into a folder until `stop` is set; meshes are PLY files named for their scans."""
+def watch(incoming: Path, meshes: Path, options: Mapping[str, Any], stop: Event, interval: float = 2.0) -> None:
+    """Reconstruct the scans that arrive in a folder until `stop` is set; meshes are PLY files named after their scans.
+
+    `interval` is the time between two looks, in seconds.
+    """
     _log.info("Watching %s.", incoming)
     seen: dict[Path, Stamp] = {}
     while not stop.is_set():
@@ -66,13 +65,13 @@ def watch(incoming: Path, meshes: Path, options: Mapping[str, Any], stop: Event,
 
 
 def _one(scan: Path, mesh: Path, options: Mapping[str, Any], stop: Event) -> None:
-    """Make one scan's mesh and move the scan away; a watch that ends leaves both as they were."""
+    """Make the mesh of a scan and move the scan; if the watch ends, no mesh is made and the scan stays."""
     _log.info("%s", scan)
     try:
         result = gnrecon.reconstruct(scan, progress=Stopper(stop), **options)
         notes = result.save(mesh)
     except gnrecon.Cancelled:
-        _log.info("%s waits for the next time.", scan)
+        _log.info("%s stays for the next run.", scan)
         return
     except gnrecon.GnreconError as failure:
         aside = _moved(scan, "failed")
@@ -84,7 +83,7 @@ def _one(scan: Path, mesh: Path, options: Mapping[str, Any], stop: Event) -> Non
 
 
 def _scans(folder: Path) -> list[Path]:
-    """The files of a folder that gnrecon reads; hidden ones are those that others are still writing."""
+    """Return the files of a folder that gnrecon reads; hidden ones are still being written."""
     known = gnrecon.readable()
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     return [path for path in files if Path(path.name.lower().removesuffix(".gz")).suffix in known]
@@ -93,13 +92,13 @@ def _scans(folder: Path) -> list[Path]:
 def _stamp(path: Path) -> Stamp:
     try:
         found = path.stat()
-    except FileNotFoundError:  # whoever wrote it has renamed it meanwhile
+    except FileNotFoundError:  # it was renamed since
         return 0, 0
     return found.st_size, found.st_mtime_ns
 
 
 def _moved(scan: Path, name: str) -> Path:
-    """Move a scan into a folder beside it, under a name that nothing there has, and return where it is now."""
+    """Move a scan into a subfolder under a free name, and return its new path."""
     folder = scan.parent / name
     folder.mkdir(exist_ok=True)
     names = chain([scan.name], (f"{scan.stem}.{number}{scan.suffix}" for number in count(2)))
@@ -108,13 +107,13 @@ def _moved(scan: Path, name: str) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Watch as the arguments say, until Ctrl-C or a polite kill."""
+    """Watch until Ctrl-C or SIGTERM."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("incoming", type=Path, help="folder where scans arrive")
     parser.add_argument("meshes", type=Path, help="folder for the meshes")
     parser.add_argument("--quality", default="normal", help="draft, normal or high")
     parser.add_argument("--resolution", type=int, help="cells along the longest side")
-    parser.add_argument("--interval", type=float, default=INTERVAL, help="seconds between two looks")
+    parser.add_argument("--interval", type=float, default=2.0, help="seconds between two looks")
     chosen = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     stop = Event()

@@ -1,4 +1,7 @@
-"""Watertight meshes from point clouds: sine networks fitted to the signed distance by Gauss-Newton.
+"""Watertight meshes from point clouds by neural signed distance fields.
+
+By default, fixed sine features are fitted by linear least squares; `reconstruct` with ``widths`` fits a network by
+Gauss-Newton.
 
 >>> import gnrecon
 >>> result = gnrecon.reconstruct("scan.ply")        # doctest: +SKIP
@@ -89,7 +92,6 @@ _ROOMS = {
     "gnrecon.report.report": ("report_schema",),
     "gnrecon.solid": ("Shape", "shaped"),
 }
-_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Cancelled",
@@ -152,8 +154,9 @@ deprecated_paths.install()
 def __getattr__(name: str) -> Any:
     if f"{__name__}.{name}" in deprecated_paths.MOVED:
         return import_module(f"{__name__}.{name}")
-    if name not in _ROOM_OF:
+    room = next((room for room, names in _ROOMS.items() if name in names), None)
+    if room is None:
         raise AttributeError(f"module 'gnrecon' has no attribute {name!r}")
-    value = getattr(import_module(_ROOM_OF[name]), name)
+    value = getattr(import_module(room), name)
     globals()[name] = value
     return value

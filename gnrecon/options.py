@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from gnrecon.export import RefineOptions
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.mesh_field import MeshOptions
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Region
 from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach
 from gnrecon.ingest import parse_outliers, require_mode
-from gnrecon.ingest.noise import neighbour_spacing
 from gnrecon.ingest.orientation import require_orientation
+from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.option_table import OptionTable, option_documentation, option_rows
 from gnrecon.runtime.errors import UsageError
 

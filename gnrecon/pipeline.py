@@ -18,15 +18,15 @@ from gnrecon.export import (
     Attribute,
     Metrics,
     Neighbourhood,
-    invented,
     measure,
     require_bordered,
     require_sound,
     trim,
+    unsupported_area,
     verify_file,
     vertex_error,
 )
-from gnrecon.export.mesh_field import fine_enough, mesh_field
+from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
@@ -51,7 +51,7 @@ from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
 from gnrecon.version import __version__
-from gnrecon.vertex_attributes import Sources, adorn, fitting, wanted
+from gnrecon.vertex_attributes import AttributeSources, compute_attributes, requested_names, without_unsupported
 
 _log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Reconstruction:
         """
         # Only trimming makes a mesh open, and the file is verified as the mesh was.
         bordered = not self.report["mesh"]["closed"]
-        mesh = fitting(self.mesh, Path(path), self.report["options"]["attributes"])
+        mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
         return write_mesh(mesh, path, overwrite, verify=lambda written: _verify(written, bordered))
 
     def to_trimesh(self) -> Any:
@@ -154,7 +154,7 @@ def reconstruct(
     normals : array of shape (N, 3), optional
         Outward normals that go with an array of points.
     reference : path, Mesh, PointCloud, or another library's, optional
-        MeshedScan to measure the mesh against.
+        Known surface to measure the mesh against.
     format : str, optional
         Format of the scan's file, such as ``"ply"``; by default its extension.
     progress : Progress, optional
@@ -172,7 +172,7 @@ def reconstruct(
     if chosen.work_dir is not None:
         require_work_folder(chosen.work_dir)
     with limited(chosen.threads):
-        run = _Run(source_name(source), chosen, progress or Progress())
+        run = _PipelineRun(source_name(source), chosen, progress or Progress())
         scan = _read(run, source, normals, format, reference)
         ingested = _ingest(run, scan)
         fitted = _fit(run, ingested)
@@ -184,7 +184,7 @@ def reconstruct(
 
 
 @dataclass
-class _Run:
+class _PipelineRun:
     """What all steps of a run share.
 
     Parameters
@@ -221,17 +221,17 @@ class _Run:
         return chosen.resolution is None and chosen.edge_length is None and chosen.max_error is None
 
 
-def _read(run: _Run, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
+def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
     """Read the scan and the reference."""
     with run.stages("read"):
         cloud, reading = read_source(source, normals, format, run.options.read_points, run.options.region())
         run.progress.advance(0.5)
         scan = ScanRead(cloud, reading, _reference(reference))
-    wanted(cloud, run.options.attributes)  # a misspelt name is refused before the work
+    requested_names(cloud, run.options.attributes)  # a misspelt name is refused before the work
     return scan
 
 
-def _ingest(run: _Run, scan: ScanRead) -> Ingested:
+def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     """Clean and thin the points, orient their normals, and choose a resolution from their spacing."""
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
@@ -244,7 +244,7 @@ def _ingest(run: _Run, scan: ScanRead) -> Ingested:
     return ingested
 
 
-def _fit(run: _Run, ingested: Ingested) -> Fitted:
+def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
     """Fit the field, and measure its residuals."""
     options, samples = run.options, ingested.samples
     total = options.fit().steps_for(len(samples))
@@ -265,18 +265,18 @@ def _fit(run: _Run, ingested: Ingested) -> Fitted:
     return Fitted(sdf, solution, residuals, held_out)
 
 
-def _mesh(run: _Run, scan: ScanRead, fitted: Fitted) -> MeshedScan:
+def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
-        run.options = replace(run.options, resolution=fine_enough(sdf, run.options.resolution))
+        run.options = replace(run.options, resolution=cells_for_curvature(sdf, run.options.resolution))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     neighbourhood = Neighbourhood(scan.cloud.points)
     return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, neighbourhood.spacing(), None)
 
 
-def _trim(run: _Run, surface: MeshedScan) -> MeshedScan:
+def _trim(run: _PipelineRun, surface: MeshedScan) -> MeshedScan:
     """Cut off what is farther from the points than ``trim``, where that was given."""
     reach = run.options.trim_at(surface.spacing)
     if reach is not None:
@@ -289,7 +289,7 @@ def _trim(run: _Run, surface: MeshedScan) -> MeshedScan:
 
 
 def _finish(
-    run: _Run, scan: ScanRead, ingested: Ingested, fitted: Fitted, surface: MeshedScan
+    run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted, surface: MeshedScan
 ) -> tuple[FinishedMesh, Uncertainty | None]:
     """Verify the mesh, give its vertices attributes, and measure it against the reference."""
     mesh, trimming = surface.mesh, surface.trimming
@@ -297,9 +297,11 @@ def _finish(
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with run.stages("attributes"):
         distances = surface.neighbourhood.distances(mesh.vertices)
-        unsupported = invented(mesh, distances, surface.spacing)
-        sources = Sources(mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options)
-        mesh, attributes, remarks = adorn(sources, run.progress.advance)
+        unsupported = unsupported_area(mesh, distances, surface.spacing)
+        sources = AttributeSources(
+            mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options
+        )
+        mesh, attributes, remarks = compute_attributes(sources, run.progress.advance)
     run.remark([*(unsupported.describe() if trimming is None else []), *remarks])
     finished = FinishedMesh(mesh, facts, unsupported, attributes, None)
     if scan.reference is not None:
@@ -307,7 +309,7 @@ def _finish(
     return finished, sources.uncertainty
 
 
-def _measure(run: _Run, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:
+def _measure(run: _PipelineRun, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:
     """Measure the mesh against the reference; its vertices get the attribute ``error``."""
     mesh, attributes = finished.mesh, finished.attributes
     with run.stages("measure"):

@@ -1,4 +1,7 @@
-"""One scan for the command line: refuse early, reconstruct with a progress bar, write everything or nothing."""
+"""Runs one reconstruction for the command line as a transaction.
+
+Invalid arguments are refused before any work, a progress bar shows the stages, and all files are written or none.
+"""
 
 from __future__ import annotations
 
@@ -40,13 +43,10 @@ STAGES = {
     "write": "Writing",
 }
 
-THUMBNAIL = (240, 180)
-"""Width and height of the small picture that an overview of many runs shows, in pixels."""
-
 
 @dataclass(frozen=True)
 class Files:
-    """What one run reads and writes; `config` is written, `settings` is the configuration that was read."""
+    """The files that a run reads and writes; `config` is written, `settings` is the configuration that was read."""
 
     scans: tuple[Path, ...]
     output: Path
@@ -62,12 +62,12 @@ class Files:
     settings: Path | None = None
 
     def check(self) -> None:
-        """Refuse before any work what would fail after it.
+        """Refuse, before any work, what would fail after it.
 
         Raises
         ------
         UsageError
-            When an extension is unknown, or two files are one.
+            When an extension is unknown, or two files are the same.
         InputError
             When an input is missing.
         OutputError
@@ -80,15 +80,15 @@ class Files:
             raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
-        inputs, targets = self.named()
+        inputs, targets = self.inputs_and_targets()
         require_files(inputs, targets, self.overwrite)
 
-    def named(self) -> tuple[list[Path], list[Path]]:
-        """Return the files that are read, those that scans name among them, and the files that are written."""
-        asked = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
+    def inputs_and_targets(self) -> tuple[list[Path], list[Path]]:
+        """Return the files that are read, with those that scans name, and the files that are written."""
+        targets = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
         inputs = [path for path in (self.reference, self.settings) if path is not None]
         return [*all_input_files(self.scans, self.format), *all_input_files(inputs)], [
-            path for path in asked if path is not None
+            path for path in targets if path is not None
         ]
 
 
@@ -107,20 +107,20 @@ def run(
     Parameters
     ----------
     files, options : what is read and written, and how, see `Options`
-    command : the line that asked for it, for the report
-    quiet, verbose : say nothing but failures; print choices, counts, stages and steps
-    log : file to append to what the library logs
-    watcher : told of stages and steps in the bar's place
+    command : the command line, for the report
+    quiet, verbose : print failures only; print choices, counts, stages and steps
+    log : file to append the library's log to
+    watcher : receives stages and steps instead of the progress bar
 
     Raises
     ------
     GnreconError
-        Whatever the stages raise; nothing is written then.
+        From any stage; nothing is written then.
     """
     files.check()
     console = Console(stderr=True, quiet=quiet)
-    others = [path for paths in files.named() for path in paths]
-    bar = shown(console, verbose) if watcher is None else nullcontext(watcher)
+    others = [path for paths in files.inputs_and_targets() for path in paths]
+    bar = progress_bar(console, verbose) if watcher is None else nullcontext(watcher)
     with logged(console if verbose else None, log, others), bar as progress:
         result = reconstruct(files.scans, reference=files.reference, format=files.format, progress=progress, **options)
         result.report["command"] = command
@@ -132,17 +132,17 @@ def run(
     if result.metrics is not None:
         print("\n".join(result.metrics.describe()))
     if result.interrupted:
-        print(f"gnrecon: Interrupted; {files.output} shows the best field until then.", file=console.file)
+        print(f"gnrecon: Interrupted; {files.output} is the mesh of the best field so far.", file=console.file)
         return ExitCode.INTERRUPTED
     return ExitCode.OK
 
 
-def _write(files: Files, result: Reconstruction) -> list[str]:
-    """Write the mesh, and with it what was asked for besides; all of them or none."""
+def _write(files: Files, result: Reconstruction, *, thumbnail_pixels: tuple[int, int] = (240, 180)) -> list[str]:
+    """Write the mesh and the side files, all of them or none; an overview of a batch shows the thumbnail."""
     origin = written_origin(result.mesh, files.output)
     result.report["origin"] = None if origin is None else origin.tolist()
     with ExitStack() as stack:
-        # The side files are complete under their temporary names before the mesh receives its own.
+        # Side files are complete under temporary names before the mesh gets its name.
         if files.report is not None:
             report = stack.enter_context(atomic_write(files.report, files.overwrite))
             report.write_text(json.dumps(result.report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -151,7 +151,7 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
             render_sheet(result.mesh, picture, points=result.cloud)
         if files.thumbnail is not None:
             small = stack.enter_context(atomic_write(files.thumbnail, files.overwrite))
-            render(result.mesh, small, size=THUMBNAIL)
+            render(result.mesh, small, size=thumbnail_pixels)
         if files.model is not None:
             model = stack.enter_context(atomic_write(files.model, files.overwrite))
             result.sdf.save(model, overwrite=True)
@@ -166,7 +166,7 @@ def _write(files: Files, result: Reconstruction) -> list[str]:
 
 
 def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, Any]) -> str:
-    """Return a line about a written mesh, from the facts and resources of the report."""
+    """Return a line about a written mesh, from the mesh facts and resources of the report."""
     if facts["closed"]:
         kind = f"genus {facts['genus']}, closed and manifold, volume {facts['volume']:.6g}"
     else:
@@ -178,8 +178,8 @@ def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, An
     )
 
 
-class Shown(PipelineProgress):
-    """Stages, steps and remarks on a console."""
+class ConsoleProgress(PipelineProgress):
+    """Shows stages, steps and remarks on a console."""
 
     def __init__(self, console: Console, bar: Progress, verbose: bool) -> None:
         self._console, self._bar, self._verbose = console, bar, verbose
@@ -212,8 +212,8 @@ class Shown(PipelineProgress):
 
 
 @contextmanager
-def shown(console: Console, verbose: bool) -> Iterator[Shown]:
-    """Show a bar on a terminal while the block runs, and give what must be told of stages, steps and remarks."""
+def progress_bar(console: Console, verbose: bool) -> Iterator[ConsoleProgress]:
+    """Show a progress bar on a terminal while the block runs, and yield the callbacks that fill it."""
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:10}"),
@@ -223,4 +223,4 @@ def shown(console: Console, verbose: bool) -> Iterator[Shown]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield Shown(console, bar, verbose)
+        yield ConsoleProgress(console, bar, verbose)

@@ -1,7 +1,7 @@
-"""A fitted field's solid in other shapes than its own: offset, hollowed, cropped.
+"""Meshes a fitted field as an offset, hollow or cropped solid.
 
-The order is: mesh the field, near the crop only and as finely as the crop asks for; extract surfaces at a distance from
-that mesh; take the inner one away for a shell; cut the crop's box out last, so that a cropped shell is open to see.
+In this order: mesh the field near the crop, at the resolution of the crop; extract offset surfaces from that mesh;
+subtract the inner one for a shell; and cut out the box of the crop last, so that a cropped shell shows its wall.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.export.boolean import crop, subtract
-from gnrecon.export.mesh_field import StageTimer, mesh_field, untimed
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.mesh_field import MeshOptions, StageTimer, mesh_field, untimed
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.fit import NeuralSDF
@@ -22,23 +21,17 @@ from gnrecon.options import Options
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
-MARGIN = 3
-"""Cells beyond a crop that are meshed too, so that what closes the surface there is cut away."""
-
-PROBE = 48
-"""Points along each side of the box in which the deepest place of a solid is looked for."""
-
 
 @dataclass(frozen=True)
 class Shape:
-    """What to make of a solid; lengths in file units.
+    """Offset, wall thickness and crop of a solid; lengths in file units.
 
     Parameters
     ----------
     offset : float
-        How far the surface is moved outward, inward where negative.
+        Distance by which the surface moves outward, or inward if negative.
     shell : float, optional
-        Thickness of the wall that is left, measured inward from the surface, offset included.
+        Thickness of the wall that remains, measured inward from the surface after the offset.
     crop : array of shape (2, 3), optional
         Lower and upper corner of the box that is kept.
 
@@ -58,7 +51,7 @@ class Shape:
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Distances from the zero level at which surfaces are wanted: the outer, and the inner of a shell."""
+        """Distances of the surfaces from the zero level: the outer one, and the inner one of a shell."""
         return (self.offset,) if self.shell is None else (self.offset, self.offset - self.shell)
 
 
@@ -86,7 +79,7 @@ def shaped(
     Mesh
         Closed, with normals, in file units.
     list of str
-        A sentence for each thing that a user should know: what was dropped, repaired, or is not supported by data.
+        Sentences for the user: what was dropped, repaired, or is not supported by data.
 
     Raises
     ------
@@ -100,14 +93,14 @@ def shaped(
     region = sdf.bounds
     if shape.crop is not None:
         # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
-        region = _around(shape.crop, max(map(abs, shape.levels)) + MARGIN * cell, sdf.bounds)
+        region = _around(shape.crop, max(map(abs, shape.levels)) + _margin(cell), sdf.bounds)
     data, remarks = _data(sdf, region)
-    # What is only measured from is best left as fine as it is.
+    # A mesh that only serves to measure offsets from is not refined.
     plain = options if 0.0 in shape.levels else replace(options, remesh=None, adaptive=False, simplify=None, faces=None)
     meshed = mesh_field(sdf, _at(plain, region, cell), data=data, bounds=region, stages=stages, advance=advance)
     mesh, remarks = meshed.mesh, remarks + meshed.actions
     if options.edge_length is not None and options.max_error is None:
-        remarks.append(meshed.fineness.describe())  # meshing was asked for cells of that size, and so does not tell
+        remarks.append(meshed.fineness.describe())  # meshing got a resolution, and so does not report it
     surfaces = []
     for level in shape.levels:
         surface = mesh
@@ -123,11 +116,16 @@ def shaped(
         return result if shape.crop is None else crop(result, shape.crop), remarks
 
 
+def _margin(cell: float, *, cells: float = 3) -> float:
+    """How far beyond a crop is meshed, so that what closes the surface at the border is cut away."""
+    return cells * cell
+
+
 def _around(box: Float, reach: float, limits: Float) -> Float:
-    """The part within `limits` of a box with so much more on each side; all boxes of shape (2, 3)."""
+    """A box grown by `reach` on each side, within `limits`; all boxes of shape (2, 3)."""
     low, high = np.maximum(box[0] - reach, limits[0]), np.minimum(box[1] + reach, limits[1])
     if not (low < high).all():
-        raise UsageError(f"The crop lies outside of the model, whose box is {_corners(limits)}.")
+        raise UsageError(f"The crop lies outside of the model; the box of the model is {_corners(limits)}.")
     return np.stack([low, high])
 
 
@@ -142,12 +140,12 @@ def _at(options: Options, region: Float, cell: float) -> MeshOptions:
 
 
 def _data(sdf: NeuralSDF, region: Float) -> tuple[Float | None, list[str]]:
-    """The points that tell which parts of the mesh are real, and a sentence where there are none."""
+    """The points that support parts of the mesh, and a sentence where there are none."""
     if sdf.data is None:
-        return None, ["The model holds no points of its scan, so that parts which no data supports are not dropped."]
+        return None, ["The model holds no points of its scan, so parts that no data supports are kept."]
     near = sdf.data[((sdf.data >= region[0]) & (sdf.data <= region[1])).all(axis=1)]
     if not len(near):
-        return None, ["None of the model's points lie in the box, so that what the mesh shows there was not scanned."]
+        return None, ["None of the model's points lie in the box: the mesh there is not supported by data."]
     return near, []
 
 
@@ -160,11 +158,11 @@ def _offset(
     box: Float | None,
     advance: ProgressCallback,
 ) -> tuple[Mesh, list[str]]:
-    """The surface at a distance from a mesh, and how far from it its vertices were found to lie."""
-    reach = max(level, 0.0) + MARGIN * cell
+    """The surface at a distance from a mesh, and a sentence with the measured distance of its vertices."""
+    reach = max(level, 0.0) + _margin(cell)
     bounds = np.stack([mesh.vertices.min(axis=0) - reach, mesh.vertices.max(axis=0) + reach])
     if box is not None:
-        bounds = _around(box, MARGIN * cell, bounds)
+        bounds = _around(box, _margin(cell), bounds)
     field = OffsetField(mesh, level, sdf.frame, bounds)
     try:
         meshed = mesh_field(field, _at(options, bounds, cell), data=None, bounds=bounds, advance=advance)
@@ -180,9 +178,12 @@ def _offset(
     return surface, [*remarks, f"The surface offset by {level:g} lies {found}."]
 
 
-def _require_depth(field: OffsetField, bounds: Float) -> None:
-    """Say so where the reason for a missing surface is that the solid is not so deep."""
-    axes = [np.linspace(low, high, PROBE) for low, high in bounds.T]
+def _require_depth(field: OffsetField, bounds: Float, *, probes_per_side: int = 48) -> None:
+    """Raise a UsageError if a surface is missing because the solid is not deep enough.
+
+    `probes_per_side` points along each side of the box look for the deepest place: a wall of 1/48 of the box is found.
+    """
+    axes = [np.linspace(low, high, probes_per_side) for low, high in bounds.T]
     values = field.sdf(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
     if values.min() >= 0:
         deepest = max(0.0, -(float(values.min()) + field.level))

@@ -1,16 +1,16 @@
-"""What a finished mesh is told of each of its vertices: a stage of the pipeline, after all that moves vertices.
+"""Computes per-vertex attributes of a finished mesh: distance to the points, their attributes, curvature, sigma.
 
-To add an attribute, write a function from `Sources` to attributes and sentences, and a line in `MAKERS`.
+To add an attribute, write a function from `AttributeSources` to attributes and sentences, and call it in
+`compute_attributes`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from gnrecon.export import Attribute, Neighbourhood, carry, curvatures, sparsely
+from gnrecon.export import Attribute, Neighbourhood, curvatures, interpolate_from_samples, transfer_attributes
 from gnrecon.fit import NeuralSDF, Uncertainty
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -22,23 +22,23 @@ from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 
 @dataclass(frozen=True)
-class Sources:
-    """All that attributes are made from.
+class AttributeSources:
+    """The data that attributes are computed from.
 
     Parameters
     ----------
     mesh : Mesh
-        In its final state, in file units.
+        Final, in file units.
     sdf : NeuralSDF
-        The field that it was extracted from.
+        The field that the mesh was extracted from.
     cloud : PointCloud
         The scan as it was read.
     around : Neighbourhood
-        Of its points.
+        Of the scan's points.
     distances : array of shape (V,)
-        From each vertex to the nearest of them, in file units.
+        From each vertex to the nearest of these points, in file units.
     samples : Samples
-        What the fit saw of it.
+        The points of the fit.
     options : Options
     """
 
@@ -52,7 +52,7 @@ class Sources:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """That of the field, where it was asked for and can be had."""
+        """Uncertainty of the field, where the options request it and the data determines it."""
         if not self.options.uncertainty:
             return None
         try:
@@ -61,23 +61,20 @@ class Sources:
             return None
 
 
-GRID = ("row", "column")
-"""Places in a scanner's grid: a surface has none, so they are carried over only where they are asked for by name."""
-
-UNASKED = ("distance", "error")
-"""What vertices carry without being asked to, and without a scan that holds it."""
-
-Made = tuple[list[Attribute], list[str]]
-"""Attributes, and sentences about what could not be made."""
+MadeAttributes = tuple[list[Attribute], list[str]]
+"""Attributes, and sentences about those that could not be made."""
 
 
-def adorn(sources: Sources, advance: ProgressCallback = ignore_progress) -> tuple[Mesh, list[Attribute], list[str]]:
+def compute_attributes(
+    sources: AttributeSources, advance: ProgressCallback = ignore_progress
+) -> tuple[Mesh, list[Attribute], list[str]]:
     """Return the mesh with its attributes, the attributes themselves, and sentences for the user."""
     attributes: list[Attribute] = []
     sentences: list[str] = []
-    for number, maker in enumerate(MAKERS):
-        advance(number / len(MAKERS))
-        made, remarks = maker(sources)
+    functions = (_distance, _carried, _curvature, _sigma)
+    for number, function in enumerate(functions):
+        advance(number / len(functions))
+        made, remarks = function(sources)
         attributes += made
         sentences += remarks
     by_name = {one.name: one for one in attributes}
@@ -85,8 +82,10 @@ def adorn(sources: Sources, advance: ProgressCallback = ignore_progress) -> tupl
     return mesh, list(by_name.values()), sentences
 
 
-def wanted(cloud: PointCloud, attributes: str) -> list[str]:
-    """Return the names of a cloud's attributes that ``--attributes`` asks for; ``distance`` may be among them.
+def requested_names(cloud: PointCloud, attributes: str) -> list[str]:
+    """Return the attributes of a cloud that ``--attributes`` selects; ``distance`` may be among them.
+
+    ``auto`` selects all but the row and column of a scanner's grid, which mean nothing on a surface.
 
     Raises
     ------
@@ -95,56 +94,62 @@ def wanted(cloud: PointCloud, attributes: str) -> list[str]:
     """
     offered = list(dict.fromkeys(["distance", *cloud.attributes]))
     if attributes in ("auto", "none"):
-        return [name for name in offered if name not in GRID] if attributes == "auto" else []
+        return [name for name in offered if name not in ("row", "column")] if attributes == "auto" else []
     names = [name.strip() for name in attributes.split(",")]
     for name in names:
         if name not in offered:
-            raise UsageError(f"There is no attribute {name!r} to carry over; this scan offers {', '.join(offered)}.")
+            raise UsageError(f"There is no attribute {name!r} to carry over; this scan has {', '.join(offered)}.")
     return names
 
 
-def fitting(mesh: Mesh, path: Path, attributes: str) -> Mesh:
-    """Leave out what nobody asked for where the format that the path names has no place for it.
+def without_unsupported(mesh: Mesh, path: Path, attributes: str) -> Mesh:
+    """Return a mesh without the automatic attributes that the file's format cannot hold.
+
+    ``distance`` and ``error`` are automatic: they are added without a scan that holds them. With ``auto``, they are
+    left out silently; others are kept, so that the writer reports what the format cannot hold.
 
     Parameters
     ----------
     mesh : Mesh
     path : file to write
-    attributes : what was asked for, as in `Options`
+    attributes : as in `Options`
     """
     if attributes != "auto":
         return mesh
+    automatic = ("distance", "error")
     kept = {
         name: values
         for name, values in mesh.attributes.items()
-        if name not in UNASKED or supports_attribute(path, name, values)
+        if name not in automatic or supports_attribute(path, name, values)
     }
     return replace(mesh, attributes=kept)
 
 
-def _distance(sources: Sources) -> Made:
-    """How far each vertex lies from the nearest scanned point, in file units."""
-    if "distance" not in wanted(sources.cloud, sources.options.attributes):
+def _distance(sources: AttributeSources) -> MadeAttributes:
+    """Distance from each vertex to the nearest point of the scan, file units."""
+    if "distance" not in requested_names(sources.cloud, sources.options.attributes):
         return [], []
     return [Attribute("distance", sources.distances, "distance to the nearest point as read, file units")], []
 
 
-def _carried(sources: Sources) -> Made:
-    """Whatever the scan holds of its points."""
-    names = [name for name in wanted(sources.cloud, sources.options.attributes) if name in sources.cloud.attributes]
+def _carried(sources: AttributeSources) -> MadeAttributes:
+    """The scan's own attributes of its points."""
+    names = [
+        name for name in requested_names(sources.cloud, sources.options.attributes) if name in sources.cloud.attributes
+    ]
     if "distance" not in names:
-        return carry(sources.mesh.vertices, sources.cloud, names, sources.around)
+        return transfer_attributes(sources.mesh.vertices, sources.cloud, names, sources.around)
     names.remove("distance")
-    attributes, sentences = carry(sources.mesh.vertices, sources.cloud, names, sources.around)
-    return attributes, [*sentences, "The points' attribute 'distance' gives way to the distance from the points."]
+    attributes, sentences = transfer_attributes(sources.mesh.vertices, sources.cloud, names, sources.around)
+    return attributes, [*sentences, "The points' attribute 'distance' is replaced by the distance to the points."]
 
 
-def _curvature(sources: Sources) -> Made:
+def _curvature(sources: AttributeSources) -> MadeAttributes:
     """Mean and Gauss curvature of the field's level sets through the vertices."""
-    return (curvature_of(sources.mesh, sources.sdf) if sources.options.curvature else []), []
+    return (curvature_attributes(sources.mesh, sources.sdf) if sources.options.curvature else []), []
 
 
-def curvature_of(mesh: Mesh, sdf: NeuralSDF) -> list[Attribute]:
+def curvature_attributes(mesh: Mesh, sdf: NeuralSDF) -> list[Attribute]:
     """Return mean and Gauss curvature of the field's level sets through a mesh's vertices."""
     mean, gauss = curvatures(sdf.gradient(mesh.vertices), sdf.hessian(mesh.vertices))
     origin = "of the field's level set, from its gradient and second derivatives; per"
@@ -154,17 +159,14 @@ def curvature_of(mesh: Mesh, sdf: NeuralSDF) -> list[Attribute]:
     ]
 
 
-def _sigma(sources: Sources) -> Made:
-    """The standard deviation of each vertex's position along the normal, in file units."""
+def _sigma(sources: AttributeSources) -> MadeAttributes:
+    """Standard deviation of each vertex's position along the normal, file units."""
     if not sources.options.uncertainty:
         return [], []
     uncertainty = sources.uncertainty
     if uncertainty is None:
-        return [], ["There is no sigma, because the data does not determine the field's parameters."]
-    carried = "sigma" in wanted(sources.cloud, sources.options.attributes)
-    remarks = ["The points' attribute 'sigma' gives way to the standard deviation of the surface."] * carried
-    sigma = sparsely(uncertainty.sigma, sources.mesh)
+        return [], ["There is no sigma: the data does not determine the field's parameters."]
+    carried = "sigma" in requested_names(sources.cloud, sources.options.attributes)
+    remarks = ["The points' attribute 'sigma' is replaced by the standard deviation of the surface."] * carried
+    sigma = interpolate_from_samples(uncertainty.sigma, sources.mesh)
     return [Attribute("sigma", sigma, f"Laplace approximation, {uncertainty.describe()}")], remarks
-
-
-MAKERS: tuple[Callable[[Sources], Made], ...] = (_distance, _carried, _curvature, _sigma)

@@ -1,4 +1,4 @@
-# Sourced by the scripts beside it: makes the virtual environment .venv of this repository on first use.
+# Sourced by the other scripts of this folder: makes the virtual environment .venv of this repository on first use.
 #
 # A set-up that ended well leaves a stamp, .venv/ready.<extra>, as its very last act. The stamp holds where the
 # repository lies and a hash of what was installed from, so that an interrupted, outdated or moved set-up is done again.
@@ -119,7 +119,7 @@ set_up() {
         export LC_ALL=C PIP_USER=0
         unset PYTHONPATH PYTHONHOME
         flock -n 9 || { say "waiting for another set-up to end" && flock 9; }
-        # Another call may have done it meanwhile.
+        # Another call may have done it since.
         is_ready "$1" || make_environment "$1"
     ) 9<"$repository"
 }

@@ -1,6 +1,6 @@
-"""Writes the signatures of all public names into docs/api.md, each below its heading; the prose there is left alone.
+"""Writes the signatures of all public names into docs/api.md, each below its heading; the prose is not changed.
 
-Without a heading for a public name, or with one for what is not public, it says so and writes nothing.
+If headings and public names differ, it prints the differences and writes nothing.
 """
 
 from __future__ import annotations
@@ -8,30 +8,26 @@ from __future__ import annotations
 import inspect
 import re
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 import gnrecon
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
-WIDTH = 116
-MANY = ("Options", "FitOptions")
-"""Classes whose fields are the options, which are told of elsewhere."""
-
-_HEADING = re.compile(r"^### (\w+)\n", re.MULTILINE)
-_BLOCK = re.compile(r"\A\s*```text\n.*?^```\n", re.MULTILINE | re.DOTALL)
 
 
 def names(page: str) -> list[str]:
     """Return the names that a page has a heading for, in its order."""
-    return _HEADING.findall(page)
+    return re.findall(r"^### (\w+)\n", page, flags=re.MULTILINE)
 
 
 def updated(page: str) -> str:
     """Return a page with the signature of each name below its heading."""
-    parts = _HEADING.split(page)
+    parts = re.split(r"^### (\w+)\n", page, flags=re.MULTILINE)
+    block_pattern = re.compile(r"\A\s*```text\n.*?^```\n", re.MULTILINE | re.DOTALL)
     for number in range(1, len(parts), 2):
-        name, prose = parts[number], _BLOCK.sub("", parts[number + 1]).strip("\n")
+        name, prose = parts[number], block_pattern.sub("", parts[number + 1]).strip("\n")
         lines = [*rendered(name), *(f"    {line}" for line in members(name))]
         block = "\n".join(["```text", *lines, "```", "", ""]) if lines else ""
         end = "\n" if number + 2 == len(parts) else "\n\n"
@@ -40,17 +36,17 @@ def updated(page: str) -> str:
 
 
 def rendered(name: str) -> list[str]:
-    """The signature of a public name, in lines; none of a text or a failure."""
+    """Return the signature of a public name, in lines; none for strings and exceptions."""
     found = getattr(gnrecon, name)
     if not callable(found) or (inspect.isclass(found) and issubclass(found, Exception)):
         return []
-    if name in MANY:
+    if name in ("Options", "FitOptions"):  # their fields are the options, which have a page of their own
         return [f"{name}(**options)"]
     return _wrapped(name, inspect.signature(found), own=not inspect.isclass(found))
 
 
 def members(name: str) -> list[str]:
-    """The public methods and properties of a class, in lines, in the order of their definition."""
+    """Return the public methods and properties of a class, in lines, in the order of their definition."""
     found = getattr(gnrecon, name)
     if not inspect.isclass(found) or issubclass(found, Exception):
         return []
@@ -66,12 +62,12 @@ def members(name: str) -> list[str]:
     return lines
 
 
-def _wrapped(name: str, signature: inspect.Signature, own: bool) -> list[str]:
-    """One line, or one for each parameter where that is too long; `own` where what is returned is not the class."""
+def _wrapped(name: str, signature: inspect.Signature, own: bool, *, width: int = 116) -> list[str]:
+    """Return one line, or one per parameter if it exceeds `width` characters; `own` adds the type that is returned."""
     parts = _parameters(signature)
     end = f") -> {_typed(signature.return_annotation)}" if own else ")"
     line = f"{name}({', '.join(parts)}{end}"
-    if len(line) <= WIDTH:
+    if len(line) <= width:
         return [line]
     return [f"{name}(", *(f"    {part}," for part in parts), end]
 
@@ -97,6 +93,8 @@ def _typed(annotation: Any) -> str:
 def _shown(default: Any) -> str:
     if repr(default) == "<factory>":
         return "{}"
+    if is_dataclass(default) and not isinstance(default, type) and default == type(default)():
+        return f"{type(default).__name__}()"
     return default.__name__ if callable(default) else repr(default)
 
 

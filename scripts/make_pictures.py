@@ -1,7 +1,7 @@
 """Makes the pictures of the documentation: scan and mesh side by side.
 
-Run it as ``.venv/bin/python scripts/make_pictures.py [NAME ...]``. Scans that are not part of the repository are looked
-for in ``--data`` and left out, with a sentence, where they are absent.
+Run it as ``.venv/bin/python scripts/make_pictures.py [NAME ...]``. Scans that are not part of the
+repository are taken from ``--data``; those that are missing are skipped with a message.
 """
 
 from __future__ import annotations
@@ -13,15 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from holed_can import RADIUS, can, distance
+from holed_can import Can
 from PIL import Image
 
 import gnrecon
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PICTURES = REPOSITORY / "docs" / "images"
-SIZE = (1200, 520)
-
 OWN = {"bracket": (REPOSITORY / "sample_data" / "bracket_dense.ply", (-55.0, 28.0), "z")}
 OPEN = {"open_scan": ("real/bunny_scans/bun000.ply", (40.0, 20.0), "y")}
 HOLED: dict[str, tuple[dict[str, Any], ...]] = {
@@ -31,7 +28,8 @@ OTHERS = {"anchor": ("srb/anchor.ply", (-50.0, 25.0), "z"), "gargoyle": ("srb/ga
 
 
 def main() -> int:
-    """Draw the named pictures, or all of them."""
+    """Draw the named pictures, by default all."""
+    folder, size = REPOSITORY / "docs" / "images", (1200, 520)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=[*OWN, *HOLED, *OTHERS, *OPEN], help="pictures to make")
     parser.add_argument(
@@ -39,29 +37,29 @@ def main() -> int:
     )
     chosen = parser.parse_args()
     others = {name: (chosen.data / path, view, up) for name, (path, view, up) in {**OTHERS, **OPEN}.items()}
-    PICTURES.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for name in chosen.names:
         if name in HOLED:
-            draw_holed(PICTURES / f"{name}.png", HOLED[name])
+            draw_holed(folder / f"{name}.png", HOLED[name], size)
             continue
         scan, view, up = {**OWN, **others}[name]
         if not scan.is_file():
-            print(f"{name}: left out, because there is no file {scan}.", file=sys.stderr)
+            print(f"{name}: skipped, because there is no file {scan}.", file=sys.stderr)
             continue
         cloud = gnrecon.read_cloud(scan)
         if name in OPEN:
-            draw_open(cloud, PICTURES / f"{name}.png", view, up)
+            draw_open(cloud, folder / f"{name}.png", view, up, size)
             continue
         result = gnrecon.reconstruct(cloud)
-        gnrecon.render(result.mesh, PICTURES / f"{name}.png", size=SIZE, views=[view], points=cloud, up=up)
-        print(PICTURES / f"{name}.png")
+        gnrecon.render(result.mesh, folder / f"{name}.png", size=size, views=[view], points=cloud, up=up)
+        print(folder / f"{name}.png")
     return 0
 
 
-def draw_holed(path: Path, asked: Sequence[dict[str, Any]]) -> None:
-    """Draw a can with a hole as it comes out when other things are asked of its surface, and print their figures."""
-    cloud, panel, shown = can(0.12, 0.45), (SIZE[0] // 4, SIZE[1]), []
-    for options in asked:
+def draw_holed(path: Path, choices: Sequence[dict[str, Any]], size: tuple[int, int]) -> None:
+    """Draw the reconstructions of a can with a hole with different options, and print their figures."""
+    cloud, panel, shown = Can().scan(0.12, 0.45), (size[0] // 4, size[1]), []
+    for options in choices:
         mesh = gnrecon.reconstruct(cloud, quality="draft", resolution=72, curvature=True, **options).mesh
         shown.append(gnrecon.render(mesh, size=panel, views=[(65.0, 12.0)], up="z"))
         print(options, described(mesh))
@@ -70,10 +68,10 @@ def draw_holed(path: Path, asked: Sequence[dict[str, Any]]) -> None:
 
 
 def described(mesh: gnrecon.Mesh) -> str:
-    """Return how a can is in its hole, and how far from the truth."""
-    hole = np.linalg.norm(mesh.vertices - [RADIUS, 0, 0], axis=1) < 0.3
+    """Return the curvatures in the hole of a can, and the distances from the truth."""
+    hole = Can().in_hole(mesh.vertices, 0.3)
     mean, gauss = (np.asarray(mesh.attributes[f"{name}_curvature"])[hole] for name in ("mean", "gauss"))
-    off = np.abs(distance(mesh.vertices))
+    off = np.abs(Can().distance(mesh.vertices))
     return (
         f"in the hole |k1 + k2| {np.median(np.abs(2 * mean)):.2g}, |k1 k2| {np.median(np.abs(gauss)):.2g} in the "
         f"median, {off[hole].mean():.2g} off on the mean and {off[hole].max():.2g} at most; elsewhere "
@@ -81,12 +79,12 @@ def described(mesh: gnrecon.Mesh) -> str:
     )
 
 
-def draw_open(cloud: gnrecon.PointCloud, path: Path, view: tuple[float, float], up: str) -> None:
-    """Draw a scan, its closed surface, and what of that is near data, side by side."""
+def draw_open(cloud: gnrecon.PointCloud, path: Path, view: tuple[float, float], up: str, size: tuple[int, int]) -> None:
+    """Draw a scan, its closed surface, and the part of the surface near data, side by side."""
     result = gnrecon.reconstruct(cloud, max_points=6000, subsample="voxel", steps=0)
     mesh, beyond = result.mesh, result.report["mesh"]["invented_beyond"]
     near, _ = gnrecon.trim(mesh, np.asarray(mesh.attributes["distance"], dtype=np.float64), beyond)
-    panel = (SIZE[0] // 3, SIZE[1])
+    panel = (size[0] // 3, size[1])
     shown = [gnrecon.render(None, size=panel, views=[view], points=cloud, up=up)]
     shown += [gnrecon.render(part, size=panel, views=[view], up=up) for part in (mesh, near)]
     Image.fromarray(np.concatenate(shown, axis=1)).save(path)

@@ -22,10 +22,6 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import write_mesh
 
-SPACING = 0.6  # mm between the grid's points
-TOLERANCE = 0.08  # mm
-SEED = 20_260
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -45,31 +41,34 @@ SAMPLES = {
 }
 
 
-def mesh_shape(shape: Shape) -> Mesh:
-    """Return the zero level of a shape by marching cubes, its vertices moved onto the surface itself."""
-    axes = [np.arange(low, high + SPACING, SPACING) for low, high in zip(shape.low, shape.high, strict=True)]
-    # A slab at a time, because the distance functions hold a dozen arrays of their points' number.
+def mesh_shape(shape: Shape, *, spacing: float = 0.6) -> Mesh:
+    """Return the zero level of a shape by marching cubes, its vertices projected onto the surface.
+
+    The grid's points are `spacing` millimetres apart.
+    """
+    axes = [np.arange(low, high + spacing, spacing) for low, high in zip(shape.low, shape.high, strict=True)]
+    # A slab at a time, because the distance functions hold a dozen arrays of this size.
     slabs = [
         shape.distance(np.stack(np.meshgrid(slab, *axes[1:], indexing="ij"), axis=-1).reshape(-1, 3))
         for slab in np.array_split(axes[0], 16)
     ]
     values = np.concatenate(slabs).reshape([len(axis) for axis in axes])
     vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        values, 0.0, spacing=(SPACING,) * 3
+        values, 0.0, spacing=(spacing,) * 3
     )
     return Mesh(project(shape.distance, vertices + np.array(shape.low)), faces)
 
 
-def thin(mesh: Mesh, shape: Shape) -> Mesh:
-    """Return the mesh with every edge collapsed that moves no face by more than `TOLERANCE`, and projected again."""
+def thin(mesh: Mesh, shape: Shape, *, tolerance: float = 0.08) -> Mesh:
+    """Return the mesh with all edges collapsed that move no face by more than `tolerance` mm, and projected again."""
     # Collapses by quadric error alone, as open3d's, fold plane faces over their own holes.
     full = manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
-    few = full.simplify(TOLERANCE).to_mesh64()
+    few = full.simplify(tolerance).to_mesh64()
     return Mesh(project(shape.distance, few.vert_properties), few.tri_verts.astype(np.int64))
 
 
 def write_scan(cloud: PointCloud, path: Path) -> None:
-    """Write a cloud as text of three columns (.xyz), or as binary PLY of float32 with the normals it has."""
+    """Write a cloud as text of three columns (.xyz), or as binary PLY of float32 with its normals."""
     if path.suffix == ".xyz":
         np.savetxt(path, cloud.points, fmt="%.3f")
         return
@@ -79,14 +78,14 @@ def write_scan(cloud: PointCloud, path: Path) -> None:
     open3d.t.io.write_point_cloud(path, tensors)
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, *, seed: int = 20_260) -> None:
     """Write every file into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     meshes = {name: mesh_shape(shape) for name, shape in SHAPES.items()}
     for name, mesh in meshes.items():
         write_mesh(thin(mesh, SHAPES[name]), folder / f"{name}_reference.ply", overwrite=True)
     for number, (file, sample) in enumerate(SAMPLES.items()):
-        cloud = scan(meshes[sample.shape], sample.scanner, sample.count, np.random.default_rng([SEED, number]))
+        cloud = scan(meshes[sample.shape], sample.scanner, sample.count, np.random.default_rng([seed, number]))
         write_scan(cloud if sample.normals else cloud.with_normals(None), folder / file)
 
 

@@ -98,7 +98,7 @@ def test_failures_are_set_aside_with_the_reason(folders: tuple[Path, Path]) -> N
 
 
 class Soon(Event):
-    """Is set in the middle of a reconstruction: when it has been asked so many times."""
+    """Is set during a reconstruction: after a number of checks."""
 
     left = 6
 
@@ -117,7 +117,7 @@ def test_the_watch_ends_within_a_reconstruction_and_leaves_the_scan(folders: tup
     assert names(incoming) == ["ring.ply"]
 
 
-def test_a_polite_kill_ends_the_watch(folders: tuple[Path, Path]) -> None:
+def test_sigterm_ends_the_watch(folders: tuple[Path, Path]) -> None:
     command = [sys.executable, str(REPOSITORY / "examples" / "watch_folder.py"), *map(str, folders)]
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:

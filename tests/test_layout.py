@@ -161,8 +161,8 @@ def test_a_package_is_listed_room_by_room(tmp_path: Path) -> None:
         make_architecture.updated("# Title\n", tmp_path)
 
 
-def test_the_architecture_names_no_file_that_is_gone() -> None:
-    names = re.findall(r"(?<![\w/])((?:gnrecon/)?(?:\w+/)*\w+\.py)\b", ARCHITECTURE.read_text())
+@pytest.mark.parametrize("page", sorted(ARCHITECTURE.parent.rglob("*.md")), ids=lambda page: page.name)
+def test_documents_name_no_file_that_is_gone(page: Path) -> None:
+    names = re.findall(r"(?<![\w/])((?:\w+/)+\w+\.py)\b", page.read_text())
     root = PACKAGE.parent
-    gone = [name for name in names if not any((base / name).is_file() for base in (root, PACKAGE))]
-    assert not gone
+    assert not [name for name in names if not any((base / name).is_file() for base in (root, PACKAGE))]

@@ -15,7 +15,7 @@ from gnrecon.config import typed
 from gnrecon.export import RefineOptions
 from gnrecon.fit import FitOptions
 from gnrecon.ingest import prepare
-from gnrecon.io import read_scans
+from gnrecon.io.io_parameters import IOParameters
 from gnrecon.option_table import option_rows
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
@@ -122,7 +122,7 @@ def test_the_command_line_has_every_option_with_the_same_default(command: Any) -
 
 
 def test_defaults_of_the_table_are_those_of_the_stages() -> None:
-    assert Options().read_points == inspect.signature(read_scans).parameters["most"].default
+    assert Options().read_points == IOParameters.most_points
     assert Options().feature_angle == RefineOptions.feature_angle
     fit = FitOptions()
     assert (Options().normal_residual, Options().quality, Options().seed) == (fit.normals, fit.quality, fit.seed)

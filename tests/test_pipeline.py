@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scan_files import FAST, TORUS_VOLUME, TUBE, box, gnrecon, sphere, torus, write_scan
+from made_shapes import box, sphere
+from scan_files import FAST, TORUS_VOLUME, TUBE, gnrecon, torus, write_scan
 from scipy.spatial.transform import Rotation
 
 from gnrecon.export import measure
@@ -203,7 +204,7 @@ def test_progress_is_told_of_stages_steps_and_remarks(scan: Cloud) -> None:
     result = reconstruct(*twice, progress=told, widths=(200,), steps=2, resolution=32)
     assert told.stages == STAGES
     assert told.steps == [(1, 2), (2, 2)]
-    assert f"Dropped 7 of {len(twice[0])} points at the position of another." in told.remarks
+    assert f"Dropped 7 of {len(twice[0])} points that duplicate another." in told.remarks
     assert result.report["fit"]["status"] in told.remarks
     assert set(result.report["actions"]) <= set(told.remarks)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from reproduction.__main__ import main
-from reproduction.figures import HIGH, LOW, MIDDLE, coloured, draw_surfaces
+from reproduction.figures import coloured, draw_surfaces
 
 from gnrecon.geometry.mesh import Mesh
 
@@ -49,4 +49,4 @@ def test_missing_data_is_one_sentence(tmp_path: Path, capfd: pytest.CaptureFixtu
 def test_colours_are_white_at_zero() -> None:
     mesh = Mesh(np.zeros((3, 3)), np.zeros((0, 3), dtype=int))
     colors = coloured(mesh, np.array([-2.0, 0.0, 1.0]), 1.0).attributes["colors"]
-    assert colors.tolist() == [list(LOW), list(MIDDLE), list(HIGH)]
+    assert colors.tolist() == [[33, 102, 172], [247, 247, 247], [178, 24, 43]]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scan_files import sphere
+from made_shapes import sphere
 
 from gnrecon.export import require_sound
 from gnrecon.fit import NeuralSDF
@@ -75,9 +75,9 @@ def test_a_crop_is_exact_and_as_fine_as_asked(sdf: NeuralSDF) -> None:
     assert (mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()) == (corner[0, 2], corner[1, 2])
     inner = ((mesh.vertices > corner[0]) & (mesh.vertices < corner[1])).all(axis=1)
     assert np.abs(radii(mesh.vertices[inner]) - 1).max() < 0.02
-    finer, _ = shaped(sdf, replace(OPTIONS, resolution=64), Shape(crop=corner))
-    assert len(finer.faces) > 2.5 * len(mesh.faces)
-    assert finer.volume == pytest.approx(mesh.volume, rel=0.01)
+    refined_resolution, _ = shaped(sdf, replace(OPTIONS, resolution=64), Shape(crop=corner))
+    assert len(refined_resolution.faces) > 2.5 * len(mesh.faces)
+    assert refined_resolution.volume == pytest.approx(mesh.volume, rel=0.01)
 
 
 def test_a_cropped_shell_is_open_to_see_and_still_one_solid(sdf: NeuralSDF) -> None:
@@ -106,7 +106,7 @@ def test_shapes_that_leave_nothing(sdf: NeuralSDF) -> None:
         shaped(sdf, OPTIONS, Shape(offset=-1.2 * BIG))
     with pytest.raises(UsageError, match="leaves nothing"):
         shaped(sdf, OPTIONS, Shape(shell=1.2 * BIG))
-    with pytest.raises(UsageError, match="The crop lies outside of the model, whose box is"):
+    with pytest.raises(UsageError, match="The crop lies outside of the model; the box of the model is"):
         shaped(sdf, OPTIONS, Shape(crop=box(3.0, 4.0)))
     with pytest.raises(MeshError, match="no zero level"):
         shaped(sdf, OPTIONS, Shape(crop=box(0.9, 1.05)))

@@ -14,12 +14,12 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import read_mesh
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.errors import FitError, UsageError
-from gnrecon.vertex_attributes import wanted
+from gnrecon.vertex_attributes import requested_names
 
 FAST = {"widths": (300,), "steps": 0, "resolution": 32}
 
 
-class Told(Progress):
+class Recorder(Progress):
     """Remembers stages and remarks."""
 
     def __init__(self) -> None:
@@ -75,8 +75,8 @@ def test_only_what_is_asked_for(scan: PointCloud, asked: str, given: list[str]) 
 
 
 def test_a_misspelt_name_is_refused_before_the_fit(scan: PointCloud) -> None:
-    told = Told()
-    with pytest.raises(UsageError, match=r"no attribute 'colour'.*offers distance, colors, height, half"):
+    told = Recorder()
+    with pytest.raises(UsageError, match=r"no attribute 'colour'.*has distance, colors, height, half"):
         reconstruct(scan, attributes="colour", progress=told)
     assert told.stages == ["read"]
     with pytest.raises(UsageError, match="names separated by commas, not 'a,,b'"):
@@ -84,12 +84,12 @@ def test_a_misspelt_name_is_refused_before_the_fit(scan: PointCloud) -> None:
 
 
 def test_a_scan_with_distances_of_its_own_is_told_that_they_give_way(scan: PointCloud) -> None:
-    told = Told()
+    told = Recorder()
     own: dict[str, Any] = {"distance": np.full(len(scan), 9.0)}
     mesh = reconstruct(PointCloud(scan.points, scan.normals, own), progress=told, **FAST).mesh
     assert mesh.attributes["distance"].max() < 1
-    assert "The points' attribute 'distance' gives way to the distance from the points." in told.remarks
-    assert wanted(PointCloud(scan.points, None, own), "auto") == ["distance"]
+    assert "The points' attribute 'distance' is replaced by the distance to the points." in told.remarks
+    assert requested_names(PointCloud(scan.points, None, own), "auto") == ["distance"]
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".3mf", ".off", ".stl"])
@@ -132,9 +132,9 @@ def test_curvature_of_a_torus(scan: PointCloud) -> None:
 def doubtful(scan: PointCloud) -> Reconstruction:
     """With an attribute of the points that has the name of the surface's standard deviation."""
     own = PointCloud(scan.points, scan.normals, {"sigma": scan.points[:, 2]})
-    told = Told()
+    told = Recorder()
     found = reconstruct(own, progress=told, uncertainty=True, **FAST)
-    assert "The points' attribute 'sigma' gives way to the standard deviation of the surface." in told.remarks
+    assert "The points' attribute 'sigma' is replaced by the standard deviation of the surface." in told.remarks
     return found
 
 
@@ -154,7 +154,7 @@ def test_a_sigma_that_cannot_be_had_is_a_sentence(scan: PointCloud, monkeypatch:
         raise FitError("No factor.")
 
     monkeypatch.setattr("gnrecon.vertex_attributes.Uncertainty.of", refuse)
-    told = Told()
+    told = Recorder()
     found = reconstruct(scan, progress=told, uncertainty=True, **FAST)
     assert "sigma" not in found.mesh.attributes
     assert any(remark.startswith("There is no sigma") for remark in told.remarks)
@@ -162,5 +162,5 @@ def test_a_sigma_that_cannot_be_had_is_a_sentence(scan: PointCloud, monkeypatch:
 
 def test_places_in_a_grid_are_carried_only_when_asked_for(scan: PointCloud) -> None:
     gridded = PointCloud(scan.points, scan.normals, {"row": np.arange(len(scan)), "intensity": scan.points[:, 0]})
-    assert wanted(gridded, "auto") == ["distance", "intensity"]
-    assert wanted(gridded, "row") == ["row"]
+    assert requested_names(gridded, "auto") == ["distance", "intensity"]
+    assert requested_names(gridded, "row") == ["row"]

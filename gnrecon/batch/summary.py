@@ -152,7 +152,7 @@ def summary_html(summary: Mapping[str, Any], folder: Path) -> str:
         }
         for name in summary["causes"]
     ]
-    return environment.get_template("overview.html.j2").render(
+    return environment.get_template("summary.html.j2").render(
         summary=summary,
         folder=folder.absolute().name,
         scans=scans,

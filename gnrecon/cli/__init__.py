@@ -1,1 +1,1 @@
-"""What the command line does beside reconstructing, one file for each command, each with one function that does it."""
+"""The command line: `app` runs it, files named `*_command.py` define the commands, the others do their work."""

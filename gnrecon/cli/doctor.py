@@ -1,7 +1,7 @@
-"""A diagnosis of the installation: what is there, what is missing, and the command that mends it.
+"""Diagnoses the installation for ``gnrecon doctor``: what is installed, what is missing, and how to install it.
 
-It must run when almost nothing else does, so only the standard library and rich are imported here. Packages are
-imported in processes of their own, because a broken native library may end the process that loads it.
+It must run when almost nothing else does, so only the standard library and rich are imported here. Each package is
+imported in its own process, because a broken native library may crash the process that loads it.
 """
 
 from __future__ import annotations
@@ -47,16 +47,6 @@ PACKAGES = {
 }
 """What setup.cfg requires, by the name to install and the name to import."""
 
-LEAST_MEMORY = 2 * 2**30  # bytes: open3d, torch and one fit of a small scan
-LEAST_DISK = 2**28  # bytes: a model and some meshes
-IMPORT_SECONDS = 120.0
-
-_DEVICES = """
-import torch
-cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
-print(f"CPU with {torch.get_num_threads()} threads; CUDA: {', '.join(cuda) or 'none'}")
-"""
-
 
 @dataclass(frozen=True)
 class Check:
@@ -64,10 +54,10 @@ class Check:
 
     Parameters
     ----------
-    name : what was looked at
-    ok : whether it is as gnrecon needs it
-    found : what is there, in words
-    remedy : the command or the advice that mends it; empty when `ok`
+    name : what was checked
+    ok : whether gnrecon can work with it
+    found : what was found, in words
+    remedy : the command or the advice that repairs it; empty when `ok`
     """
 
     name: str
@@ -77,7 +67,7 @@ class Check:
 
 
 def diagnose() -> list[Check]:
-    """Return all checks, in the order in which faults are best mended. A fault is a result: nothing is raised."""
+    """Return all checks, in the order in which faults are best repaired. Faults are results; nothing is raised."""
     with ThreadPoolExecutor(max_workers=2) as pool:
         packages = list(pool.map(check_package, PACKAGES, PACKAGES.values()))
         devices = pool.submit(check_devices)
@@ -117,7 +107,7 @@ def check_python() -> Check:
 
 
 def check_library(library: str) -> Check:
-    """Return whether the loader finds a shared library; the remedy installs all that are missing at once."""
+    """Return whether the loader finds a shared library; the remedy installs all missing ones at once."""
     name = f"{library} (Debian package {LIBRARIES[library]})"
     fault = loading_fault(library)
     return Check(name, not fault, fault or "loads", install_command(missing_library_packages()) if fault else "")
@@ -134,52 +124,57 @@ def check_package(distribution: str, module: str) -> Check:
         return Check(distribution, True, version)
     remedy = f"{sys.executable} -m pip install --force-reinstall {distribution}"
     missing = missing_library_packages()
-    # A package that is installed but fails while system libraries are missing is most often mended by those.
+    # A package that is installed but fails while system libraries are missing most often needs those.
     if version != "not installed" and missing:
         remedy = install_command(missing)
     return Check(distribution, False, f"{version}: {said}", remedy)
 
 
 def check_plugins() -> list[Check]:
-    """Return, for each reader, writer and residual that other packages bring, whether it can be loaded."""
+    """Return, for each reader, writer and residual of a plug-in, whether it can be loaded."""
     from gnrecon.runtime.plugins import PluginKind, installed
 
     checks = []
     for plugin in (plugin for kind in get_args(PluginKind) for plugin in installed(kind)):
         code = f"from gnrecon.runtime.plugins import find; find({plugin.kind!r}, {plugin.entry.name!r}).load()"
         ok, said = run_python(code)
-        remedy = "" if ok else f"Mend or uninstall {plugin.package}."
+        remedy = "" if ok else f"Repair or uninstall {plugin.package}."
         checks.append(Check(f"{plugin.kind} {plugin.entry.name}", ok, plugin.package if ok else said, remedy))
     return checks
 
 
 def check_devices() -> Check:
     """Return what torch can compute on."""
-    ok, said = run_python(_DEVICES)
-    return Check("torch devices", ok, said, "" if ok else "Mend torch first.")
+    code = """
+import torch
+cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+print(f"CPU with {torch.get_num_threads()} threads; CUDA: {', '.join(cuda) or 'none'}")
+"""
+    ok, said = run_python(code)
+    return Check("torch devices", ok, said, "" if ok else "Repair torch first.")
 
 
-def check_memory() -> Check:
-    """Return whether the memory that is free now suffices for a small scan."""
+def check_memory(*, needed_bytes: int = 2 * 2**30) -> Check:
+    """Return whether the free memory suffices for open3d, torch and the fit of a small scan."""
     try:
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        # The kernel's own estimate counts the caches that it would give back.
+        # The kernel's own estimate includes caches that it can free.
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 free = int(line.split()[1]) * 1024
     except (OSError, ValueError) as fault:
-        return Check("memory", True, f"cannot be told here ({fault})")
+        return Check("memory", True, f"unknown ({fault})")
     found = f"{free / 2**30:.1f} of {whole / 2**30:.1f} GiB free"
-    ok = free >= LEAST_MEMORY
-    return Check("memory", ok, found, "" if ok else f"Free some memory: {LEAST_MEMORY / 2**30:.0f} GiB are needed.")
+    ok = free >= needed_bytes
+    return Check("memory", ok, found, "" if ok else f"Free some memory: {needed_bytes / 2**30:.0f} GiB are needed.")
 
 
-def check_disk(folder: Path) -> Check:
-    """Return whether there is room for results in `folder`."""
+def check_disk(folder: Path, *, needed_bytes: int = 2**28) -> Check:
+    """Return whether `folder` has space for a saved field and some meshes."""
     free = shutil.disk_usage(folder).free
-    ok = free >= LEAST_DISK
-    remedy = "" if ok else f"Free some disk: {LEAST_DISK / 2**20:.0f} MiB are needed in {folder}."
+    ok = free >= needed_bytes
+    remedy = "" if ok else f"Free some disk: {needed_bytes / 2**20:.0f} MiB are needed in {folder}."
     return Check("disk", ok, f"{free / 2**30:.1f} GiB free in {folder}", remedy)
 
 
@@ -194,15 +189,16 @@ def check_writable(folder: Path) -> Check:
     return Check("temporary folder", True, f"{folder} is writable")
 
 
-def run_python(code: str) -> tuple[bool, str]:
-    """Run `code` in another process of this Python; return whether it ended well, and the last line that it printed.
+def run_python(code: str, *, timeout_seconds: float = 120.0) -> tuple[bool, str]:
+    """Run `code` in another process of this Python; return whether it succeeded, and the last line that it printed.
 
-    A process that a signal ended (a crash in native code) has the signal's name for its last line.
+    For a process that a signal ended (a crash in native code), the line is the signal's name. The timeout leaves time
+    for a first import from a slow disk.
     """
     try:
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=IMPORT_SECONDS)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=timeout_seconds)
     except subprocess.TimeoutExpired:
-        return False, f"no answer within {IMPORT_SECONDS:.0f} s"
+        return False, f"no answer within {timeout_seconds:.0f} s"
     if done.returncode < 0:
         return False, f"crashed ({signal.Signals(-done.returncode).name})"
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()

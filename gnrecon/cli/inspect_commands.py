@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gnrecon.cli.shared_parameters import Debug, Format, Overwrite, Quiet, Seed
+from gnrecon.cli.shared_parameters import DebugOption, FormatOption, OverwriteOption, QuietOption, SeedOption
 from gnrecon.option_table import Panel
 from gnrecon.runtime.errors import ExitCode
 
@@ -16,12 +16,12 @@ def eval_command(
     mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF, GLB or 3MF file.")],
     reference: Annotated[Path, typer.Option(help="Mesh or cloud to measure it against.")],
     samples: Annotated[int, typer.Option(help="Points drawn on each surface.")] = 100_000,
-    seed: Seed = 0,
+    seed: SeedOption = 0,
     report: Annotated[
         Path | None, typer.Option("--json", help="JSON file to write.", rich_help_panel=Panel.OUTPUT)
     ] = None,
-    overwrite: Overwrite = False,
-    debug: Debug = False,
+    overwrite: OverwriteOption = False,
+    debug: DebugOption = False,
 ) -> None:
     """Print how far a mesh lies from a reference: Chamfer, RMS, Hausdorff, F-score, normal consistency."""
     from gnrecon.cli.inspect_files import evaluate
@@ -33,9 +33,9 @@ def eval_command(
 def convert_command(
     source: Annotated[Path, typer.Argument(help="Mesh or cloud to read.")],
     target: Annotated[Path, typer.Argument(help="File to write; its extension names the format.")],
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
 ) -> None:
     """Write a mesh or a cloud in another format, unchanged, and name what the format cannot hold."""
     from gnrecon.cli.inspect_files import convert
@@ -47,7 +47,7 @@ def convert_command(
 def check_command(
     mesh: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, OFF, GLB or 3MF file.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
-    debug: Debug = False,
+    debug: DebugOption = False,
 ) -> None:
     """Check whether a mesh bounds a solid: exit code 0 if it is a closed, oriented 2-manifold, 5 if it is not."""
     from gnrecon.cli.inspect_files import check
@@ -58,9 +58,9 @@ def check_command(
 
 def info_command(
     scans: Annotated[list[Path], typer.Argument(help="One or more scans; - is standard input.")],
-    format: Format = None,
+    format: FormatOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
-    debug: Debug = False,
+    debug: DebugOption = False,
 ) -> None:
     """Describe a scan, what might make a fit difficult, and what a run would do by default."""
     from gnrecon.cli.scan_info import info

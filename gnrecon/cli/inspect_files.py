@@ -30,9 +30,8 @@ from gnrecon.runtime.errors import ExitCode, MeshError, UsageError
 from gnrecon.runtime.files import require_files, write_text
 
 
-# ``gnrecon check MESH``: whether any mesh bounds a solid, and what is unusual about it.
 def check(path: Path, *, as_json: bool = False) -> int:
-    """Print what a mesh is, as text or as one JSON object, and return the exit code 0 where it bounds a solid.
+    """Print the findings on a mesh, as text or as one JSON object, and return the exit code 0 where it bounds a solid.
 
     Raises
     ------
@@ -43,7 +42,7 @@ def check(path: Path, *, as_json: bool = False) -> int:
     """
     findings = examine(read_mesh(path))
     if as_json:
-        # JSON knows no numbers that are not finite, such as the volume of a mesh with broken vertices.
+        # JSON has no numbers that are not finite, such as the volume of a mesh with broken vertices.
         values = {name: _plain(value) for name, value in findings.as_dict().items()}
         print(json.dumps({"file": str(path), **values}, indent=2))
     else:
@@ -57,7 +56,6 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# ``gnrecon eval MESH --reference FILE``: how far a mesh lies from the surface that it should be.
 def evaluate(
     path: Path, reference: Path, *, samples: int, seed: int, report: Path | None = None, overwrite: bool = False
 ) -> int:
@@ -90,7 +88,6 @@ def evaluate(
     return ExitCode.OK
 
 
-# ``gnrecon convert IN OUT``: any mesh or cloud in another format, unchanged; what is lost on the way is named.
 def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool = False) -> int:
     """Write what a file holds in the format that the target's extension names, and return the exit code 0.
 

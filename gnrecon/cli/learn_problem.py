@@ -1,4 +1,4 @@
-"""``gnrecon learn PROBLEM -o MESH``: a surface from constraints alone, and how well it keeps to them."""
+"""Learns a surface from constraints for ``gnrecon learn``, and reports how well it satisfies them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,16 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gnrecon.cli.learn_inputs import FILES, NAME, DesignFiles, ScanFiles, is_scan, part_mesh, placed
-from gnrecon.export import MeshFacts, curvatures, drop_stray, require_bordered, require_sound, verify, verify_file
+from gnrecon.cli.learn_inputs import PAPER_SCANS, DesignFiles, ScanFiles, is_scan, part_mesh, placed
+from gnrecon.export import (
+    MeshFacts,
+    curvatures,
+    drop_stray_components,
+    require_bordered,
+    require_sound,
+    verify,
+    verify_file,
+)
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import all_input_files, check_writable, write_mesh
@@ -31,16 +39,12 @@ from gnrecon.shape_learning import (
     learn,
     mesh_of,
 )
-from gnrecon.shape_learning.design import Design, DesignFacts, judge
-
-OPEN = "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
-CLOSED = "closed, oriented 2-manifold"
-NO_SCAN = ScanFiles()
+from gnrecon.shape_learning.design import Design, DesignMeasurement, measure_design
 
 
 @dataclass(frozen=True)
 class LearnOptions:
-    """What a run may be asked for; see `gnrecon learn --help`."""
+    """Options of a run; see `gnrecon learn --help`."""
 
     optimiser: str = "gn"
     budget: float | None = None
@@ -52,7 +56,7 @@ class LearnOptions:
     wider: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense, before any work."""
+        """Refuse values out of range, before any work."""
         if self.optimiser not in OPTIMISERS:
             raise UsageError(f"The optimiser is {self.optimiser!r}, but must be one of {', '.join(OPTIMISERS)}.")
         if self.budget is not None and not self.budget > 0:
@@ -64,13 +68,13 @@ class LearnOptions:
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads is {self.threads}, but must be at least 1.")
         if self.wider < 0:
-            raise UsageError(f"The network begins wider by {self.wider} units, but that must be at least 0.")
+            raise UsageError(f"The number of additional units is {self.wider}, but must be at least 0.")
         if self.wider and self.optimiser != "gn":
-            raise UsageError("A network can begin wider by Gauss-Newton alone (--optimiser gn).")
+            raise UsageError("Additional units (--wider) are for Gauss-Newton only (--optimiser gn).")
 
     @property
     def seconds(self) -> float | None:
-        """The budget: 600 s where neither it nor steps were asked for."""
+        """The time limit: 600 s where neither it nor steps were given."""
         return 600.0 if self.budget is None and self.steps is None else self.budget
 
 
@@ -80,32 +84,27 @@ def run_learn(
     options: LearnOptions,
     *,
     files: DesignFiles,
-    scan: ScanFiles = NO_SCAN,
+    scan: ScanFiles | None = None,
     report: Path | None = None,
     overwrite: bool = False,
     quiet: bool = False,
     verbose: bool = False,
     command: str | None = None,
 ) -> int:
-    """Learn a problem's surface, write its mesh once that is verified, and return the exit code.
+    """Learn a problem's surface, verify and write its mesh, and return the exit code.
 
     Raises
     ------
     UsageError, FitError, MeshError, OutputError, MemoryLimitError
-        Each says in one sentence what is wrong; nothing is written then.
+        Each message is one sentence; nothing is written then.
     """
-    if name not in (*PROBLEMS, NAME) and not is_scan(name):
-        known = ", ".join((*PROBLEMS, NAME, *FILES))
-        raise UsageError(f"There is no problem {name!r}; the problems are {known}, and files of scans.")
-    if scan != NO_SCAN and not is_scan(name):
-        raise UsageError(f"A share of points, or a folder of them, is for scans, not for {name}.")
-    if name != NAME and files != DesignFiles():
-        raise UsageError(f"A design is for the problem {NAME} alone, not for {name}.")
+    scan = scan or ScanFiles()
+    _require_consistent(name, files, scan)
     check_writable(output)
     sources = [*files.named(), *([scan.path(name)] if is_scan(name) else [])]
     require_files(all_input_files(sources), [path for path in (output, report) if path is not None], overwrite)
-    design = files.read() if name == NAME else None
-    problem, frame = _posed(name, design, files, scan, options.seed)
+    design = files.read() if name == "bracket" else None
+    problem, frame = _problem_and_frame(name, design, files, scan, options.seed)
     console = Console(stderr=True, quiet=quiet)
     with limited(options.threads):
         learned = learn(
@@ -115,7 +114,7 @@ def run_learn(
             steps=options.steps,
             seed=options.seed,
             wider=options.wider,
-            heard=(lambda found: _say(console, told(found))) if verbose else None,
+            callback=(lambda found: _say(console, measurement_text(found))) if verbose else None,
         )
         rng = np.random.default_rng(options.seed)
         if design is None:
@@ -124,27 +123,38 @@ def run_learn(
         else:
             mesh, notes = part_mesh(learned.field, design, options.resolution, options.curvature, rng)
     facts = require_sound(mesh) if design is not None or verify(mesh).closed else require_bordered(mesh)
-    kept = None if design is None else judge(mesh, design, rng)
-    said = _report(problem, options, learned, facts, kept, command)
-    notes += _write(output, report, mesh, said, overwrite)
-    if kept is not None:
-        notes.append(kept.describe())
-    for sentence in [*notes, learned.solution.status, told(learned.best), _summary(output, facts)]:
+    design_facts = None if design is None else measure_design(mesh, design, rng)
+    values = _report(problem, options, learned, facts, design_facts, command)
+    notes += _write(output, report, mesh, values, overwrite)
+    if design_facts is not None:
+        notes.append(design_facts.describe())
+    for sentence in [*notes, learned.solution.status, measurement_text(learned.best), _summary(output, facts)]:
         _say(console, sentence)
     return ExitCode.INTERRUPTED if learned.solution.interrupted else ExitCode.OK
 
 
-def _posed(
+def _require_consistent(name: str, files: DesignFiles, scan: ScanFiles) -> None:
+    """Refuse an unknown problem, and files that are not for it."""
+    if name not in (*PROBLEMS, "bracket") and not is_scan(name):
+        known = ", ".join((*PROBLEMS, "bracket", *PAPER_SCANS))
+        raise UsageError(f"There is no problem {name!r}; the problems are {known}, and files of scans.")
+    if scan != ScanFiles() and not is_scan(name):
+        raise UsageError(f"--share and --data are for scans, not for {name}.")
+    if name != "bracket" and files != DesignFiles():
+        raise UsageError(f"A design is for the problem bracket only, not for {name}.")
+
+
+def _problem_and_frame(
     name: str, design: Design | None, files: DesignFiles, scan: ScanFiles, seed: int
 ) -> tuple[ShapeProblem, Frame | None]:
-    """Return a problem, and the frame of its file's coordinates where it has one that is not the part's own."""
+    """Return a problem, and the frame of its file's coordinates; a part is meshed in its file's coordinates."""
     if design is not None:
         return bracket(design, seed, files.clip), None
     return scan.problem(name, seed) if is_scan(name) else (PROBLEMS[name](), None)
 
 
-def told(found: Measurement) -> str:
-    """Return a line about a measurement."""
+def measurement_text(found: Measurement) -> str:
+    """Return a line with the loss and distances of a measurement."""
     shares = ", ".join(f"{name} {share:.1e}" for name, share in found.shares.items())
     distance = "" if found.chamfer is None else f"; Chamfer {found.chamfer:.2e} from the known surface"
     return f"Step {found.step}, {found.seconds:.0f} s: loss {found.loss:.2e} ({shares}){distance}."
@@ -155,11 +165,11 @@ def _say(console: Console, sentence: str) -> None:
 
 
 def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> tuple[Mesh, list[str]]:
-    """Return the surface, of a scan without what no point holds, and a sentence about what was dropped."""
+    """Return the surface, for a scan without parts that no point supports, and a sentence about what was dropped."""
     mesh = mesh_of(learned.field, problem.shown or problem.box, options.resolution)
     notes: list[str] = []
     if isinstance(problem.known, ScannedSurface):
-        mesh, notes = drop_stray(mesh, problem.known.points.numpy())
+        mesh, notes = drop_stray_components(mesh, problem.known.points.numpy())
     if not options.curvature:
         return mesh, notes
     mean, gauss = curvatures(learned.field.gradient(mesh.vertices), learned.field.hessian(mesh.vertices))
@@ -167,7 +177,7 @@ def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> tup
 
 
 def _write(output: Path, report: Path | None, mesh: Mesh, facts: dict[str, Any], overwrite: bool) -> list[str]:
-    """Write the mesh, and with it the report; both or neither."""
+    """Write the mesh and the report; both or neither."""
     bordered = not facts["mesh"]["closed"]
 
     def verified(path: Path) -> None:
@@ -185,12 +195,16 @@ def _report(
     options: LearnOptions,
     learned: Learned,
     facts: MeshFacts,
-    kept: DesignFacts | None,
+    design: DesignMeasurement | None,
     command: str | None,
 ) -> dict[str, Any]:
-    """All that is known of a run, ready for JSON; losses and Chamfer divergences first."""
+    """The report of a run, ready for JSON; losses and Chamfer distances first."""
     history = learned.history
-    guarantee = CLOSED if facts.closed else OPEN
+    guarantee = (
+        "closed, oriented 2-manifold"
+        if facts.closed
+        else "oriented edge-manifold with borders: the surface is clipped to its problem's box, and bounds no solid"
+    )
     values: dict[str, Any] = plain(
         {
             "problem": problem.name,
@@ -217,7 +231,7 @@ def _report(
                 "activation": problem.network.activation.name,
                 "parameters": problem.network.layout.count,
             },
-            "design": None if kept is None else kept.as_dict(),
+            "design": None if design is None else design.as_dict(),
             "mesh": {**facts.as_dict(), "guarantee": guarantee},
             "versions": versions(),
         }

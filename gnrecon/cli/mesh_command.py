@@ -8,59 +8,83 @@ from typing import Annotated
 import typer
 
 from gnrecon.cli.option_parameters import table_option
-from gnrecon.cli.shared_parameters import Curvature, Debug, Output, Overwrite, Quiet, Threads
+from gnrecon.cli.shared_parameters import (
+    CurvatureOption,
+    DebugOption,
+    OutputOption,
+    OverwriteOption,
+    QuietOption,
+    ThreadsOption,
+)
 from gnrecon.option_table import OptionTable, Panel
+
+ModelArgument = Annotated[Path, typer.Argument(help="Fitted field, a .gnr file that --save wrote.")]
+ResolutionOption = Annotated[int | None, table_option("resolution")]
+EdgeLengthOption = Annotated[str | None, table_option("edge_length")]
+MaxErrorOption = Annotated[str | None, table_option("max_error")]
+CropOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is then that of the box, "
+        "and cuts are closed by flat caps.",
+        rich_help_panel=Panel.MESH,
+    ),
+]
+OffsetOption = Annotated[
+    str,
+    typer.Option(
+        help="Move the surface outward, inward if negative: 0.5, or 2mm with --units.", rich_help_panel=Panel.MESH
+    ),
+]
+ShellOption = Annotated[
+    str | None,
+    typer.Option(help="Hollow the solid to a wall of this thickness, measured inward.", rich_help_panel=Panel.MESH),
+]
+UnitsOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Unit of the file (um, mm, cm, m, km, in, ft); lengths may then have a unit, such as 2mm.",
+        rich_help_panel=Panel.MESH,
+    ),
+]
+KeepHandlesOption = Annotated[bool, table_option("keep_handles")]
+RemeshOption = Annotated[float | None, table_option("remesh")]
+AdaptiveOption = Annotated[bool, table_option("adaptive")]
+SimplifyOption = Annotated[float | None, table_option("simplify")]
+FacesOption = Annotated[int | None, table_option("faces")]
+FeatureAngleOption = Annotated[float, table_option("feature_angle")]
+AttributesOption = Annotated[
+    str,
+    typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=Panel.MESH),
+]
+DeviceOption = Annotated[
+    str, typer.Option(help="Where the field is evaluated: cpu or cuda.", rich_help_panel=Panel.MESH)
+]
 
 
 def mesh_command(
-    model: Annotated[Path, typer.Argument(help="Fitted field, a .gnr file that --save wrote.")],
-    output: Output,
-    resolution: Annotated[int | None, table_option("resolution")] = None,
-    edge_length: Annotated[str | None, table_option("edge_length")] = None,
-    max_error: Annotated[str | None, table_option("max_error")] = None,
-    crop: Annotated[
-        str | None,
-        typer.Option(
-            help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is then that of the box, "
-            "and cuts are closed by flat caps.",
-            rich_help_panel=Panel.MESH,
-        ),
-    ] = None,
-    offset: Annotated[
-        str,
-        typer.Option(
-            help="Move the surface outward, inward if negative: 0.5, or 2mm with --units.", rich_help_panel=Panel.MESH
-        ),
-    ] = "0",
-    shell: Annotated[
-        str | None,
-        typer.Option(help="Hollow the solid to a wall of this thickness, measured inward.", rich_help_panel=Panel.MESH),
-    ] = None,
-    units: Annotated[
-        str | None,
-        typer.Option(
-            help="Unit of the file (um, mm, cm, m, km, in, ft); lengths may then have a unit, such as 2mm.",
-            rich_help_panel=Panel.MESH,
-        ),
-    ] = None,
-    keep_handles: Annotated[bool, table_option("keep_handles")] = False,
-    remesh: Annotated[float | None, table_option("remesh")] = None,
-    adaptive: Annotated[bool, table_option("adaptive")] = False,
-    simplify: Annotated[float | None, table_option("simplify")] = None,
-    faces: Annotated[int | None, table_option("faces")] = None,
-    feature_angle: Annotated[float, table_option("feature_angle")] = OptionTable.feature_angle,
-    attributes: Annotated[
-        str,
-        typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=Panel.MESH),
-    ] = "auto",
-    curvature: Curvature = False,
-    device: Annotated[
-        str, typer.Option(help="Where the field is evaluated: cpu or cuda.", rich_help_panel=Panel.MESH)
-    ] = "cpu",
-    threads: Threads = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    model: ModelArgument,
+    output: OutputOption,
+    resolution: ResolutionOption = None,
+    edge_length: EdgeLengthOption = None,
+    max_error: MaxErrorOption = None,
+    crop: CropOption = None,
+    offset: OffsetOption = "0",
+    shell: ShellOption = None,
+    units: UnitsOption = None,
+    keep_handles: KeepHandlesOption = False,
+    remesh: RemeshOption = None,
+    adaptive: AdaptiveOption = False,
+    simplify: SimplifyOption = None,
+    faces: FacesOption = None,
+    feature_angle: FeatureAngleOption = OptionTable.feature_angle,
+    attributes: AttributesOption = "auto",
+    curvature: CurvatureOption = False,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
 ) -> None:
     """Mesh a fitted field again, without refitting: at another resolution, cropped, offset, or as a hollow shell."""
     import numpy as np

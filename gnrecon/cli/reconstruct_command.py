@@ -8,78 +8,95 @@ from typing import Annotated, Any
 import typer
 
 from gnrecon.cli.option_parameters import given_options, with_table_options
-from gnrecon.cli.shared_parameters import Config, Debug, Format, Output, Overwrite, Quiet, SetOption
+from gnrecon.cli.shared_parameters import (
+    ConfigOption,
+    DebugOption,
+    FormatOption,
+    OutputOption,
+    OverwriteOption,
+    QuietOption,
+    SetOption,
+)
 from gnrecon.option_table import Panel
+
+ScansArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        help="One or more scans of an object, merged by the poses that they hold: PLY, PCD, XYZ, PTS, TXT, CSV, "
+        "LAS, LAZ, E57, PTX, VTK, VTP, OBJ, OFF, STL, glTF, GLB or 3MF, compressed by gzip or not; CONF names "
+        "scans with their poses; - is standard input."
+    ),
+]
+ReferenceOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Mesh or cloud to measure the result against; distances are printed to stdout.",
+        rich_help_panel=Panel.OUTPUT,
+    ),
+]
+ReportOption = Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=Panel.OUTPUT)]
+PreviewOption = Annotated[
+    Path | None,
+    typer.Option(help="PNG picture to write: the scan, and the mesh from four sides.", rich_help_panel=Panel.OUTPUT),
+]
+SaveOption = Annotated[
+    Path | None,
+    typer.Option(help="Fitted field to write, a .gnr file that gnrecon mesh reads.", rich_help_panel=Panel.OUTPUT),
+]
+HtmlOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Interactive page to write: the model in 3-D and its report, in one HTML file.",
+        rich_help_panel=Panel.OUTPUT,
+    ),
+]
+SaveConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Configuration to write, with all options in effect, for --config.", rich_help_panel=Panel.OUTPUT
+    ),
+]
+LogOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to append a log to: all that -v prints and more, with times.", rich_help_panel=Panel.OUTPUT
+    ),
+]
+DryRunOption = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Print what a run would do, and write nothing.", rich_help_panel=Panel.OUTPUT),
+]
+VerboseOption = Annotated[
+    bool,
+    typer.Option(
+        "-v",
+        "--verbose",
+        help="Print choices, counts, and a line for each stage and step.",
+        rich_help_panel=Panel.OUTPUT,
+    ),
+]
 
 
 @with_table_options(batch=False)
 def reconstruct_command(
     context: typer.Context,
-    scans: Annotated[
-        list[Path],
-        typer.Argument(
-            help="One or more scans of an object, merged by the poses that they hold: PLY, PCD, XYZ, PTS, TXT, CSV, "
-            "LAS, LAZ, E57, PTX, VTK, VTP, OBJ, OFF, STL, glTF, GLB or 3MF, compressed by gzip or not; CONF names "
-            "scans with their poses; - is standard input."
-        ),
-    ],
-    output: Output,
-    format: Format = None,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            help="Mesh or cloud to measure the result against; distances are printed to stdout.",
-            rich_help_panel=Panel.OUTPUT,
-        ),
-    ] = None,
-    report: Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=Panel.OUTPUT)] = None,
-    preview: Annotated[
-        Path | None,
-        typer.Option(
-            help="PNG picture to write: the scan, and the mesh from four sides.", rich_help_panel=Panel.OUTPUT
-        ),
-    ] = None,
-    save: Annotated[
-        Path | None,
-        typer.Option(help="Fitted field to write, a .gnr file that gnrecon mesh reads.", rich_help_panel=Panel.OUTPUT),
-    ] = None,
-    html: Annotated[
-        Path | None,
-        typer.Option(
-            help="Interactive page to write: the model in 3-D and its report, in one HTML file.",
-            rich_help_panel=Panel.OUTPUT,
-        ),
-    ] = None,
-    config: Config = None,
+    scans: ScansArgument,
+    output: OutputOption,
+    format: FormatOption = None,
+    reference: ReferenceOption = None,
+    report: ReportOption = None,
+    preview: PreviewOption = None,
+    save: SaveOption = None,
+    html: HtmlOption = None,
+    config: ConfigOption = None,
     words: SetOption = None,
-    save_config: Annotated[
-        Path | None,
-        typer.Option(
-            help="Configuration to write, with all options in effect, for --config.", rich_help_panel=Panel.OUTPUT
-        ),
-    ] = None,
-    log: Annotated[
-        Path | None,
-        typer.Option(
-            help="File to append a log to: all that -v prints and more, with times.", rich_help_panel=Panel.OUTPUT
-        ),
-    ] = None,
-    dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Print what a run would do, and write nothing.", rich_help_panel=Panel.OUTPUT),
-    ] = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "-v",
-            "--verbose",
-            help="Print choices, counts, and a line for each stage and step.",
-            rich_help_panel=Panel.OUTPUT,
-        ),
-    ] = False,
-    debug: Debug = False,
+    save_config: SaveConfigOption = None,
+    log: LogOption = None,
+    dry_run: DryRunOption = False,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    verbose: VerboseOption = False,
+    debug: DebugOption = False,
     **options: Any,
 ) -> None:
     """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""

@@ -1,4 +1,4 @@
-"""``gnrecon mesh MODEL -o MESH``: mesh a fitted field again without refitting: finer, cropped, offset, hollowed."""
+"""Meshes a saved field for ``gnrecon mesh``: finer, cropped, offset or hollow, without refitting."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import check_writable, supports_attribute, write_mesh
 from gnrecon.options import Options
 from gnrecon.report.report import Stages
-from gnrecon.run import shown, summarise
+from gnrecon.run import progress_bar, summarise
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import require_files
 from gnrecon.solid import Shape, shaped
-from gnrecon.vertex_attributes import curvature_of, wanted
+from gnrecon.vertex_attributes import curvature_attributes, requested_names
 
 
 def remesh_model(
@@ -35,7 +35,7 @@ def remesh_model(
     options : of the meshing, by their names in `Options`; the field is evaluated on the device
     shape : offset, shell and crop, in file units
     overwrite : whether an existing mesh may be replaced
-    quiet : say nothing but failures
+    quiet : print failures only
 
     Raises
     ------
@@ -46,18 +46,18 @@ def remesh_model(
     require_files([model], [output], overwrite)
     chosen = Options.of(**options)
     require_device(chosen.device)
-    wanted(PointCloud(np.empty((0, 3))), chosen.attributes)  # a misspelt name is refused before the work
+    requested_names(PointCloud(np.empty((0, 3))), chosen.attributes)  # a misspelt name is refused before the work
     console = Console(stderr=True, quiet=quiet)
-    with shown(console, verbose=False) as progress, limited(chosen.threads):
+    with progress_bar(console, verbose=False) as progress, limited(chosen.threads):
         stages = Stages(progress.stage, chosen.device)
         with stages("read"):
             sdf = NeuralSDF.load(model, chosen.device)
         mesh, remarks = shaped(sdf, chosen, shape, stages=stages, advance=progress.advance)
         with stages("verify"):
             facts = require_sound(mesh)
-        if shape.levels == (0.0,):  # elsewhere, neither the points nor the field say anything of the surface
+        if shape.levels == (0.0,):  # distances and curvatures are those of the zero level
             with stages("attributes"):
-                mesh = _adorned(mesh, sdf, chosen, output)
+                mesh = _with_attributes(mesh, sdf, chosen, output)
         progress.stage("write")
         losses = write_mesh(mesh, output, overwrite, verify=_verify)
     summary = summarise(output, facts.as_dict(), stages.resources())
@@ -66,12 +66,12 @@ def remesh_model(
     return ExitCode.OK
 
 
-def _adorned(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path) -> Mesh:
-    """Tell each vertex how far it lies from the model's points, and how the field is curved there, where asked for.
+def _with_attributes(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path) -> Mesh:
+    """Return a mesh with distances to the model's points and with curvatures, as the options request.
 
-    Distances that nobody asked for by name are left out where the format has no place for them.
+    With ``auto``, distances are left out where the format cannot hold them.
     """
-    made = {one.name: one.values for one in (curvature_of(mesh, sdf) if options.curvature else [])}
+    made = {one.name: one.values for one in (curvature_attributes(mesh, sdf) if options.curvature else [])}
     if options.attributes != "none" and sdf.data is not None:
         distances = Neighbourhood(sdf.data).distances(mesh.vertices)
         if options.attributes != "auto" or supports_attribute(output, "distance", distances):

@@ -19,15 +19,6 @@ from gnrecon.report.estimate import estimate
 from gnrecon.report.run_report import scan_facts
 from gnrecon.runtime.errors import ExitCode, InputError
 
-_NORMALS = {
-    "missing": "missing; they will be estimated",
-    "zero": "zero for most points; they will be estimated",
-    "unnormalised": "good, of other lengths than one",
-    "inconsistent": "inconsistent: neighbours often face opposite ways",
-    "inward": "consistent, but inward; they will be flipped",
-    "good": "good",
-}
-
 
 def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = None, *, as_json: bool = False) -> int:
     """Print the facts of a scan and what a run with these options would do, and return the exit code 0.
@@ -44,7 +35,7 @@ def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = No
     plan, layers = _plan(cloud, reading, chosen)
     facts = scan_facts(survey(cloud), layers, reading)
     if facts is None:
-        raise InputError("The scan holds fewer than 25 finite and distinct points, so that nothing can be told of it.")
+        raise InputError("The scan holds fewer than 25 finite and distinct points, too few to describe it.")
     if as_json:
         attributes = {name: list(values.shape[1:]) for name, values in cloud.attributes.items()}
         print(json.dumps({"reading": reading.as_dict(), **facts, "attributes": attributes, "plan": plan}, indent=2))
@@ -90,7 +81,7 @@ def _describe(facts: Mapping[str, Any], cloud: PointCloud, units: str | None) ->
         "spacing": f"{facts['spacing']:.4g} in the median, {thick}",
         "density": f"varies by a factor of {facts['density_variation']:.3g}",
         "noise": _noise(facts),
-        "normals": _NORMALS[facts["normals"]],
+        "normals": _normals(facts["normals"]),
         "outliers": f"{facts['outliers']} of up to 10,000 points",
         "surface": _surface(facts),
         "layers": "one" if facts["layers"] is None else f"two, about {facts['layers']['offset']:.3g} apart",
@@ -100,34 +91,45 @@ def _describe(facts: Mapping[str, Any], cloud: PointCloud, units: str | None) ->
     return [f"{name + ':':12} {text}" for name, text in lines.items()]
 
 
+def _normals(quality: str) -> str:
+    return {
+        "missing": "missing; they will be estimated",
+        "zero": "zero for most points; they will be estimated",
+        "unnormalised": "good, but not of length one",
+        "inconsistent": "inconsistent: neighbours often face opposite ways",
+        "inward": "consistent, but inward; they will be flipped",
+        "good": "good",
+    }[quality]
+
+
 def _unit(facts: Mapping[str, Any], units: str | None) -> str:
     if units is not None:
-        return f"{units}, as was told"
+        return f"{units}, as given"
     if facts["units_guess"] is None:
-        return f"not to be guessed: {facts['units_reason']}"
+        return f"unknown: {facts['units_reason']}"
     return f"perhaps {facts['units_guess']}, a guess: {facts['units_reason']}"
 
 
 def _surface(facts: Mapping[str, Any]) -> str:
     if facts["noise"] is None:
-        return "too few points to tell borders"
+        return "too few points to find borders"
     if not facts["open"]:
         return "closed"
     return f"open, or with holes: {facts['border_share']:.1%} of the points lie at a border"
 
 
 def _noise(facts: Mapping[str, Any]) -> str:
-    """The noise along the normal, or what can be said of it."""
+    """The noise along the normal, or its upper limit where it cannot be separated from the surface's curvature."""
     if facts["noise"] is None:
-        return f"not to be told from the surface's own bends, at most {facts['noise_limit']:.3g}"
+        return f"not separable from the curvature of the surface, at most {facts['noise_limit']:.3g}"
     if facts["noise"] == 0:
-        return f"none that can be told from the surface's own bends, at most {facts['noise_limit']:.2g}"
+        return f"none beyond the curvature of the surface, at most {facts['noise_limit']:.2g}"
     return f"{facts['noise']:.3g} along the normal, {facts['noise'] / facts['spacing']:.2g} of the spacing"
 
 
 def _sentences(plan: Mapping[str, Any], layers: Layers | None) -> list[str]:
     if plan["widths"] is None:
-        network = f"a smooth global field and local detail of {plan['detail_features']:,} sines a cube"
+        network = f"a smooth global field and local detail of {plan['detail_features']:,} sines per cube"
     else:
         network = f"layers of {', '.join(map(str, plan['widths']))} sines, in {plan['steps']} steps"
     sentence = f"A run would fit {plan['points']:,} points with {network}."

@@ -10,22 +10,22 @@ import typer
 from gnrecon.cli.option_parameters import table_option
 from gnrecon.option_table import Panel
 
-Output = Annotated[
+OutputOption = Annotated[
     Path,
     typer.Option(
         "-o", "--output", help="Mesh to write: .obj, .ply, .stl, .off, .glb or .3mf.", rich_help_panel=Panel.OUTPUT
     ),
 ]
-Format = Annotated[
+FormatOption = Annotated[
     str | None,
     typer.Option(
         help="Format of the scan, such as ply; by default its file's extension.", rich_help_panel=Panel.POINTS
     ),
 ]
-Curvature = Annotated[bool, table_option("curvature")]
-Seed = Annotated[int, table_option("seed")]
-Threads = Annotated[int | None, table_option("threads")]
-Config = Annotated[
+CurvatureOption = Annotated[bool, table_option("curvature")]
+SeedOption = Annotated[int, table_option("seed")]
+ThreadsOption = Annotated[int | None, table_option("threads")]
+ConfigOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
@@ -39,7 +39,7 @@ SetOption = Annotated[
         "--set", metavar="NAME=VALUE", help="Set an option by name; may be repeated.", rich_help_panel=Panel.OUTPUT
     ),
 ]
-Overwrite = Annotated[
+OverwriteOption = Annotated[
     bool,
     typer.Option(
         "--overwrite",
@@ -48,5 +48,7 @@ Overwrite = Annotated[
         rich_help_panel=Panel.OUTPUT,
     ),
 ]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print failures only.", rich_help_panel=Panel.OUTPUT)]
-Debug = Annotated[bool, typer.Option("--debug", help="Print a traceback on failure.", rich_help_panel=Panel.OUTPUT)]
+QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="Print failures only.", rich_help_panel=Panel.OUTPUT)]
+DebugOption = Annotated[
+    bool, typer.Option("--debug", help="Print a traceback on failure.", rich_help_panel=Panel.OUTPUT)
+]

@@ -1,8 +1,8 @@
 """System libraries that Python wheels expect from the machine, and the Debian packages that bring them.
 
-Whether a library is there is asked of the loader itself, so that one from another source than Debian counts as well.
-Only the standard library is imported and the file can be run by its path (``python3 -I gnrecon/cli/system_packages.py``
-prints the missing packages, one a line): the first set-up asks it before anything has been installed.
+The loader itself is tried, so that a library from another source than Debian counts as well. Only the standard library
+is imported, because the first set-up runs the file by its path before anything is installed: ``python3 -I
+gnrecon/cli/system_packages.py`` prints the missing packages, one per line.
 """
 
 from __future__ import annotations

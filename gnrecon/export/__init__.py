@@ -1,25 +1,24 @@
 """From a field to a verified mesh: extract, project, refine, repair, cut, verify, measure, draw, and attributes."""
 
-from gnrecon.export.attributes import Attribute, Neighbourhood, carry
-from gnrecon.export.curvature import curvatures, sparsely
+from gnrecon.export.attributes import Attribute, Neighbourhood, transfer_attributes
+from gnrecon.export.curvature import curvatures, interpolate_from_samples
 from gnrecon.export.handles import remove_handles
 from gnrecon.export.marching_cubes import extract
 from gnrecon.export.mesh_statistics import MeshQuality, quality
 from gnrecon.export.metrics import DISTANCES, Metrics, measure, vertex_error
 from gnrecon.export.project import SignedDistance, project
-from gnrecon.export.remeshing.decimate import decimate, lighten, simplify
+from gnrecon.export.remeshing.decimate import decimate, decimate_by_clustering, simplify
 from gnrecon.export.remeshing.refine import RefineOptions, refine
 from gnrecon.export.remeshing.remesh import remesh
 from gnrecon.export.remeshing.sharpen import sharpen
-from gnrecon.export.repair import drop_stray, remove_stray, repair
-from gnrecon.export.trim import Invented, Trimming, invented, trim
+from gnrecon.export.repair import drop_stray_components, remove_stray, repair
+from gnrecon.export.trim import Trimming, UnsupportedArea, trim, unsupported_area
 from gnrecon.export.verify import Findings, MeshFacts, examine, require_bordered, require_sound, verify, verify_file
 
 __all__ = [
     "DISTANCES",
     "Attribute",
     "Findings",
-    "Invented",
     "MeshFacts",
     "MeshQuality",
     "Metrics",
@@ -27,14 +26,14 @@ __all__ = [
     "RefineOptions",
     "SignedDistance",
     "Trimming",
-    "carry",
+    "UnsupportedArea",
     "curvatures",
     "decimate",
-    "drop_stray",
+    "decimate_by_clustering",
+    "drop_stray_components",
     "examine",
     "extract",
-    "invented",
-    "lighten",
+    "interpolate_from_samples",
     "measure",
     "project",
     "quality",
@@ -47,8 +46,9 @@ __all__ = [
     "require_sound",
     "sharpen",
     "simplify",
-    "sparsely",
+    "transfer_attributes",
     "trim",
+    "unsupported_area",
     "verify",
     "verify_file",
     "vertex_error",

@@ -1,8 +1,8 @@
-"""Carry a scan's colours, labels and measured values over to the vertices of its mesh.
+"""Transfers a scan's colours, labels and measured values to the vertices of its mesh.
 
-Every vertex asks the scanned points around it, with the weights of `neighbours`. What is measured is averaged; colours
-are, in linear light. Labels have no mean: the value with the greatest weight wins, and the nearer one of two equals.
-Values that are not finite do not count.
+Each vertex averages the scanned points around it, with the weights of `Neighbourhood.near`. Measured values are
+averaged, and so are colours, in linear light. For labels the value with the greatest weight wins, and the nearer one of
+two equals. Values that are not finite do not count. The entry is `transfer_attributes`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb
 from gnrecon.geometry.point_cloud import PointCloud
@@ -22,21 +23,18 @@ from gnrecon.runtime.chunks import slices
 MEASURED = ("amplitude", "confidence", "intensity", "quality", "reflectance")
 """Names of measured values, which are averaged even where a file holds whole numbers."""
 
-FEW = 64
-"""A floating-point column of at most so many different whole numbers holds labels, as text files have them."""
-
 
 @dataclass(frozen=True)
-class _Way:
-    """How an attribute is carried: made ready, of shape (N, C); mixed, of shapes (V, K, C) and (V, K); turned back."""
+class _Transfer:
+    """How an attribute is transferred: values, of shape (N, C), are prepared, averaged over K, and converted back."""
 
-    how: str
-    ready: Callable[[Values], Values]
-    mix: Callable[[Values, Float], Values]
-    back: Callable[[Values], Values]
+    name: str
+    prepare: Callable[[Values], Values]
+    average: Callable[[Values, Float], Values]
+    restore: Callable[[Values], Values]
 
 
-def carry(
+def transfer_attributes(
     vertices: Float, cloud: PointCloud, names: Sequence[str], around: Neighbourhood
 ) -> tuple[list[Attribute], list[str]]:
     """Return attributes of a cloud for the vertices of a mesh.
@@ -59,42 +57,41 @@ def carry(
     """
     numeric = [name for name in names if cloud.attributes[name].dtype.kind in "biuf"]
     lost = [
-        f"The points' attribute {name!r} holds no numbers, so it is not carried over."
-        for name in names
-        if name not in numeric
+        f"The points' attribute {name!r} holds no numbers and was left out." for name in names if name not in numeric
     ]
-    ways = {name: _way(name, cloud.attributes[name]) for name in numeric}
-    sources = {name: way.ready(cloud.attributes[name].reshape(len(cloud), -1)) for name, way in ways.items()}
+    methods = {name: _transfer(name, cloud.attributes[name]) for name in numeric}
+    sources = {name: method.prepare(cloud.attributes[name].reshape(len(cloud), -1)) for name, method in methods.items()}
     mixed = {name: np.empty((len(vertices), source.shape[1]), source.dtype) for name, source in sources.items()}
-    for near in around.near(vertices) if ways else ():
-        for name, way in ways.items():
-            mixed[name][near.places] = way.mix(sources[name][near.rows], near.weights)
-    return [_attribute(name, way, mixed[name], cloud.attributes[name]) for name, way in ways.items()], lost
+    for near in around.near(vertices) if methods else ():
+        for name, method in methods.items():
+            mixed[name][near.places] = method.average(sources[name][near.rows], near.weights)
+    return [_attribute(name, method, mixed[name], cloud.attributes[name]) for name, method in methods.items()], lost
 
 
-def _attribute(name: str, way: _Way, mixed: Values, source: Values) -> Attribute:
-    values = way.back(mixed)
+def _attribute(name: str, method: _Transfer, mixed: Values, source: Values) -> Attribute:
+    count = ExportParameters.attributes.nearest_points
+    values = method.restore(mixed)
     shaped = values if name == "colors" else values.reshape(len(values), *source.shape[1:])
-    return Attribute(name, shaped, f"{way.how} of the {COUNT} nearest points")
+    return Attribute(name, shaped, f"{method.name} of the {count} nearest points")
 
 
-def _way(name: str, values: Values) -> _Way:
+def _transfer(name: str, values: Values) -> _Transfer:
     kind = values.dtype
     if name == "colors" and values.ndim == 2 and values.shape[1] in (3, 4):
-        return _Way("weighted mean in linear light", lambda v: to_linear(as_bytes(v)), _mean, _srgb)
+        return _Transfer("weighted mean in linear light", lambda v: to_linear(as_bytes(v)), _mean, _srgb)
     if _is_label(name, values):
-        return _Way("greatest weight", lambda v: v, _vote, lambda v: v)
-    return _Way("weighted mean", lambda v: v.astype(np.float64), _mean, lambda v: _rounded(v, kind))
+        return _Transfer("greatest weight", lambda v: v, _vote, lambda v: v)
+    return _Transfer("weighted mean", lambda v: v.astype(np.float64), _mean, lambda v: _rounded(v, kind))
 
 
-def _is_label(name: str, values: Values) -> bool:
-    """Whether values are names in the guise of numbers."""
+def _is_label(name: str, values: Values, *, most_labels: int = 64) -> bool:
+    """Whether numbers are labels: integers, or at most `most_labels` different whole numbers, as in text files."""
     if name.lower() in MEASURED:
         return False
     if not np.issubdtype(values.dtype, np.floating):
         return True
     finite = values[np.isfinite(values)]
-    return bool((finite == np.rint(finite)).all()) and len(np.unique(finite)) <= FEW
+    return bool((finite == np.rint(finite)).all()) and len(np.unique(finite)) <= most_labels
 
 
 def _mean(values: Values, weights: Float) -> Values:
@@ -120,19 +117,16 @@ def _rounded(values: Values, kind: np.dtype[np.generic]) -> Values:
     return values.astype(kind) if np.issubdtype(kind, np.floating) else np.rint(values.astype(np.float64)).astype(kind)
 
 
-# What is known of each vertex besides its place, and how it was found.
-
-
 @dataclass(frozen=True)
 class Attribute:
-    """Values for the vertices of a mesh.
+    """Per-vertex values of a mesh.
 
     Parameters
     ----------
     name : str
     values : array of shape (V,) or (V, C)
     origin : str
-        How they were found, for the report: no sentence, no stop.
+        How they were computed, for the report: not a sentence.
     """
 
     name: str
@@ -140,31 +134,18 @@ class Attribute:
     origin: str
 
 
-COUNT = 8
-"""Points that are averaged: about the first ring around a point of an even scan."""
-
-_RING = 6
-"""Points whose circle tells the spacing."""
-
-_QUERIES = 20_000
-
-BATCH = 100_000
-"""Places that are asked for at once."""
-
-
-# The scanned points around each vertex, with weights that fade out smoothly.
-#
-# Of the K + 1 nearest points at distances d_0 <= ... <= d_K, the first K count, by
+# The weights of the scanned points around a vertex. Of the K + 1 nearest points at distances d_0 <= ... <= d_K, the
+# first K count, by
 #
 #     w_j = (d_K^2 - d_j^2) exp(-(d_j^2 - d_0^2) / (2 h^2)),    h^2 = mean of (d_j^2 - d_0^2) / 4,
 #
 # divided by their sum. For a place on an evenly scanned surface h is 0.6 of the spacing of the points; far from it the
-# weights depend on the directions of the points alone. The first factor lets a point lose its weight before it drops
-# out of the K nearest, so that an average is continuous over space wherever no two points coincide.
+# weights depend on the directions of the points only. The first factor makes a point's weight zero before it drops out
+# of the K nearest, so that an average is continuous over space wherever no two points coincide.
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class NearestPoints:
     """Nearest points of some places, with weights.
 
     Parameters
@@ -183,7 +164,7 @@ class Neighbours:
 
 
 class Neighbourhood:
-    """A search tree over scanned points; rows that are not finite are left out, but keep their numbers.
+    """A search tree over scanned points; rows that are not finite are skipped, without renumbering the others.
 
     Parameters
     ----------
@@ -193,7 +174,7 @@ class Neighbourhood:
     def __init__(self, points: Float) -> None:
         self._rows: Int = np.flatnonzero(np.isfinite(points).all(axis=1))
         finite = points[self._rows]
-        # Far-off coordinates would cancel in the squares of differences.
+        # Large coordinates would cancel in the squares of differences.
         self._centre = finite.mean(axis=0)
         self._tree: Any = cKDTree(finite - self._centre)
 
@@ -201,29 +182,31 @@ class Neighbourhood:
         """Distance to the nearest point, of shape (V,), from places of shape (V, 3); file units."""
         return np.asarray(self._tree.query(places - self._centre)[0], dtype=np.float64)
 
-    def spacing(self) -> float:
+    def spacing(self, *, ring_points: int = 6, most_queries: int = 20_000) -> float:
         """Typical distance between neighbouring points, in file units; 0 for a single one.
 
-        It is the side of the square that a point has to itself on a surface, by the circle around it that holds its
-        nearest others: the median over at most 20,000 evenly chosen points. On an even grid it is the grid's step.
+        It is the square root of the area per point, by the circle around a point that holds its `ring_points` nearest:
+        the median over at most `most_queries` evenly chosen points. On an even grid it is the grid's step.
         """
-        count = min(_RING, self._tree.n - 1)
+        count = min(ring_points, self._tree.n - 1)
         if not count:
             return 0.0
-        some = self._tree.data[:: -(-self._tree.n // _QUERIES)]
+        some = self._tree.data[:: -(-self._tree.n // most_queries)]
         radii = self._tree.query(some, [count + 1])[0][:, 0]
-        # A point that has others at its very place says nothing of the distance to the next.
-        apart = radii[radii > 0]
-        return float(np.sqrt(np.pi / count) * np.median(apart)) if len(apart) else 0.0
+        # Coincident points have no distance to their neighbours.
+        distinct = radii[radii > 0]
+        return float(np.sqrt(np.pi / count) * np.median(distinct)) if len(distinct) else 0.0
 
-    def near(self, places: Float, count: int = COUNT) -> Iterator[Neighbours]:
-        """Yield the nearest points of places, of shape (V, 3), some places at a time."""
+    def near(
+        self, places: Float, count: int = ExportParameters.attributes.nearest_points, *, batch_places: int = 100_000
+    ) -> Iterator[NearestPoints]:
+        """Yield the `count` nearest points of places, of shape (V, 3), for at most `batch_places` at a time."""
         most = self._tree.n
-        for batch in slices(len(places), BATCH):
+        for batch in slices(len(places), batch_places):
             found = self._tree.query(places[batch] - self._centre, list(range(1, min(count + 1, most) + 1)))
             distances, rows = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
             kept = slice(None, min(count, most))
-            yield Neighbours(batch, self._rows[rows[:, kept]].astype(np.int64), _weights(distances, count))
+            yield NearestPoints(batch, self._rows[rows[:, kept]].astype(np.int64), _weights(distances, count))
 
 
 def _weights(distances: Float, count: int) -> Float:

@@ -1,7 +1,7 @@
-"""Exact operations on solids by manifold3d: cutting a box out of one, and taking one away from another.
+"""Boolean operations on solids by manifold3d, and the conversions to it and to pymeshlab.
 
 Unlike a surface extracted from the intersection of fields, the result keeps the vertices of the solids, its cuts are
-flat, and its rims are sharp.
+flat, and its rims are sharp. The entries are `crop` and `subtract`.
 """
 
 from __future__ import annotations
@@ -11,15 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
-SNAP = 1e-9
-"""Vertices within this share of the mesh's size from a cut are put onto it exactly."""
 
-
-def crop(mesh: Mesh, box: Float) -> Mesh:
+def crop(mesh: Mesh, box: Float, *, snap_sizes: float = 1e-9) -> Mesh:
     """Return the part of a solid within a box, closed by flat caps.
 
     Parameters
@@ -28,6 +25,8 @@ def crop(mesh: Mesh, box: Float) -> Mesh:
         Sound, in file units.
     box : array of shape (2, 3), file units
         Lower and upper corner.
+    snap_sizes : float, halves of the mesh's longest side
+        Vertices nearer to a cut are put onto it exactly; far more than rounding, far less than an edge.
 
     Returns
     -------
@@ -49,18 +48,19 @@ def crop(mesh: Mesh, box: Float) -> Mesh:
     block = manifold3d.Manifold.cube(sides.tolist()).translate(corner.tolist())
     part = _mesh_of(to_solid(mesh, merge=False) ^ block, mesh)
     if part is None:
-        raise MeshError("Nothing of the shape lies in the box that it is cropped to.")
+        raise MeshError("Nothing of the shape lies in the crop box.")
+    # Scaling back rounds: vertices of the cut are put onto the sides of the box exactly.
     vertices = part.vertices.copy()
     on_cap = np.zeros(len(vertices), dtype=bool)
     for side in (low, high):
-        near = np.abs(vertices - side) <= SNAP * size
+        near = np.abs(vertices - side) <= snap_sizes * size
         vertices = np.where(near, side, vertices)
         on_cap |= near.any(axis=1)
-    return _with_normals(part.with_vertices(vertices), mesh, ~on_cap)
+    return with_nearest_normals(part.with_vertices(vertices), mesh, ~on_cap)
 
 
 def subtract(outer: Mesh, inner: Mesh) -> Mesh:
-    """Return a solid without what another one takes up; both sound and in file units.
+    """Return the difference of two solids, both sound and in file units.
 
     Raises
     ------
@@ -68,18 +68,20 @@ def subtract(outer: Mesh, inner: Mesh) -> Mesh:
         When nothing is left.
     """
     centre, size = centre_and_size(outer)
+    # Both solids in the outer one's centred coordinates.
     moved = to_solid(inner, merge=False)
     inner_centre, inner_size = centre_and_size(inner)
     moved = moved.scale([inner_size / size] * 3).translate(((inner_centre - centre) / size).tolist())
     rest = _mesh_of(to_solid(outer, merge=False) - moved, outer)
     if rest is None:
         raise MeshError("Nothing is left of the solid.")
+    # Inner walls face the other way once the inner solid is taken away.
     walls = Mesh(
         np.concatenate([outer.vertices, inner.vertices]),
         np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]),
         np.concatenate([outer.vertex_normals(), -inner.vertex_normals()]),
     )
-    return _with_normals(rest, walls, np.ones(len(rest.vertices), dtype=bool))
+    return with_nearest_normals(rest, walls)
 
 
 def _mesh_of(solid: object, like: Mesh) -> Mesh | None:
@@ -88,24 +90,29 @@ def _mesh_of(solid: object, like: Mesh) -> Mesh | None:
     Raises
     ------
     MeshError
-        When manifold3d could not do what it was asked.
+        When manifold3d fails.
     """
-    error = refusal(solid)
+    error = manifold_error(solid)
     if error is not None:
-        raise MeshError(f"The solid could not be cut: manifold3d says {error}.")
+        raise MeshError(f"manifold3d could not cut the solid ({error}).")
     mesh = from_solid(solid, like)
     return mesh if len(mesh.faces) else None
 
 
-def _with_normals(mesh: Mesh, source: Mesh, old: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Mesh:
-    """Give vertices of the old surface the normal of the source's nearest vertex, and all others their faces' mean."""
+def with_nearest_normals(mesh: Mesh, source: Mesh, where: Mask | None = None) -> Mesh:
+    """Give vertices, all or those of a mask, the normal of the source's nearest vertex, and others their faces' mean.
+
+    A normal that points to the other side than the faces is not taken either: that of a patch, or of a reversed mesh.
+    """
     by_faces = mesh.vertex_normals()
     normals = source.vertex_normals()[cKDTree(source.vertices).query(mesh.vertices)[1]]
-    fits = old & (np.einsum("ij,ij->i", normals, by_faces) > 0)
+    fits = np.einsum("ij,ij->i", normals, by_faces) > 0
+    if where is not None:
+        fits &= where
     return Mesh(mesh.vertices, mesh.faces, np.where(fits[:, None], normals, by_faces))
 
 
-# The mesh as manifold3d sees it: positions relative to the mesh's own centre and size, in float64.
+# Conversions: positions are relative to the mesh's own centre and size, in float64.
 
 
 def centre_and_size(mesh: Mesh) -> tuple[Float, float]:
@@ -115,10 +122,10 @@ def centre_and_size(mesh: Mesh) -> tuple[Float, float]:
 
 
 def to_solid(mesh: Mesh, *, merge: bool) -> Any:
-    """Hand a non-empty mesh to manifold3d; the result's ``status()`` tells whether it is an oriented 2-manifold.
+    """Convert a non-empty mesh for manifold3d; `manifold_error` says whether it is an oriented 2-manifold.
 
     Coordinates are centred and scaled to one, because manifold3d's tolerances are relative to the largest coordinate.
-    `merge` lets it sew open edges whose ends coincide.
+    With `merge`, open edges whose ends coincide are joined.
     """
     import manifold3d
 
@@ -130,13 +137,13 @@ def to_solid(mesh: Mesh, *, merge: bool) -> Any:
 
 
 def from_solid(solid: Any, like: Mesh) -> Mesh:
-    """Bring a solid back into the place and size of the mesh that it was made from."""
+    """Convert a solid back, to the position and size of the mesh that it was made from."""
     centre, size = centre_and_size(like)
     data = solid.to_mesh64()
     return Mesh(centre + size * data.vert_properties[:, :3], data.tri_verts.astype(np.int64))
 
 
-def refusal(solid: Any) -> str | None:
+def manifold_error(solid: Any) -> str | None:
     """Name of manifold3d's error, or None where it accepts the solid."""
     import manifold3d
 
@@ -144,11 +151,8 @@ def refusal(solid: Any) -> str | None:
     return None if status == manifold3d.Error.NoError else str(status.name)
 
 
-# The mesh as pymeshlab sees it: positions relative to the mesh's own centre and size, in float64.
-
-
 def to_meshlab(mesh: Mesh) -> Any:
-    """Return a `pymeshlab.MeshSet` of a non-empty mesh's vertices and faces alone.
+    """Return a `pymeshlab.MeshSet` of a non-empty mesh's vertices and faces.
 
     Coordinates are centred and scaled to one, because some of pymeshlab's thresholds are lengths.
     """
@@ -161,7 +165,7 @@ def to_meshlab(mesh: Mesh) -> Any:
 
 
 def from_meshlab(meshes: Any, like: Mesh) -> Mesh:
-    """Bring the current mesh back into the place and size of the mesh that it was made from."""
+    """Convert the current mesh back, to the position and size of the mesh that it was made from."""
     centre, size = centre_and_size(like)
     result = meshes.current_mesh()
     return Mesh(centre + size * result.vertex_matrix(), result.face_matrix().astype(np.int64))

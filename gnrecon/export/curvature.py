@@ -9,6 +9,9 @@ sphere of radius r is 1/r: it is the mean of the two principal curvatures, each 
 from the outward normal. They follow as mean +- sqrt(mean^2 - Gauss).
 
 Source: Goldman, Curvature formulas for implicit curves and surfaces, Computer Aided Geometric Design 22 (2005).
+
+`curvatures` computes them. `diffuse` smooths values over a surface, and `interpolate_from_samples` spreads a costly
+quantity over one.
 """
 
 from __future__ import annotations
@@ -36,40 +39,37 @@ def curvatures(gradient: Float, hessian: Float) -> tuple[Float, Float]:
     """
     length = np.linalg.norm(gradient, axis=1)
     bend = np.einsum("ni,nij,nj->n", gradient, hessian, gradient)
-    spread = np.einsum("nii->n", hessian)
+    trace = np.einsum("nii->n", hessian)
     rows = np.roll(hessian, -1, axis=1), np.roll(hessian, -2, axis=1)
     # The cofactors of a row are the cross product of the two that follow it; the matrix is symmetric, so they are adj.
     adjugate = np.cross(*rows)
     twist = np.einsum("ni,nij,nj->n", gradient, adjugate, gradient)
     defined = length > 0
     mean, gauss = np.full((2, len(length)), np.nan)
-    np.divide(length**2 * spread - bend, 2 * length**3, out=mean, where=defined)
+    np.divide(length**2 * trace - bend, 2 * length**3, out=mean, where=defined)
     np.divide(twist, length**4, out=gauss, where=defined)
     return mean, gauss
 
 
-TOLERANCE, MOST_STEPS = 1e-6, 500
-"""Of conjugate gradients: relative residual, and most steps."""
-
-
-# Smooth values over a surface by diffusion.
-#
-# One implicit step of the heat equation, (M + t L) u = M u_0, with the cotangent Laplacian L and the vertices' areas M.
-# Unlike means over neighbours it does not depend on how the surface is cut into triangles: on a plane it leaves linear
-# values as they are. A step of t averages over about a Gaussian with the variance 2 t along each direction.
+# Smoothing by diffusion: one implicit step of the heat equation, (M + t L) u = M u_0, with the cotangent Laplacian L
+# and the vertices' areas M. Unlike means over neighbours it does not depend on the triangulation: on a plane it leaves
+# linear values unchanged. A step of t averages over about a Gaussian with the variance 2 t along each direction.
 #
 # Source: Desbrun, Meyer, Schroeder and Barr, Implicit fairing of irregular meshes (SIGGRAPH 1999).
 
 
-def diffused(mesh: Mesh, values: Float, width: float) -> Float:
-    """Return values, of shape (V,), averaged over a width, in units of the vertices, along the surface."""
+def diffuse(mesh: Mesh, values: Float, width: float, *, tolerance: float = 1e-6, most_steps: int = 500) -> Float:
+    """Return values, of shape (V,), averaged over a width, in units of the vertices, along the surface.
+
+    `tolerance` is the relative residual of conjugate gradients, and `most_steps` their number; few of these are needed.
+    """
     areas = vertex_areas(mesh)
-    # A vertex without area would be tied to nothing.
+    # A vertex without area would make the matrix singular.
     mass = np.maximum(areas, 1e-9 * areas.mean())
     matrix = diags_array(mass) + 0.5 * width**2 * _cotangent_laplacian(mesh)
     scale = 1 / matrix.diagonal()
     scaling: Any = LinearOperator(matrix.shape, matvec=lambda residual: scale * residual.reshape(-1))
-    smooth = cg(matrix, mass * values, x0=values, rtol=TOLERANCE, maxiter=MOST_STEPS, M=scaling)[0]
+    smooth = cg(matrix, mass * values, x0=values, rtol=tolerance, maxiter=most_steps, M=scaling)[0]
     return np.asarray(smooth, dtype=np.float64)
 
 
@@ -98,33 +98,33 @@ def _cotangent_laplacian(mesh: Mesh) -> Any:
     return coo_array(entries, shape=(size, size)).tocsr()
 
 
-MOST = 20_000
-"""Vertices at which the quantity is computed."""
+def interpolate_from_samples(
+    quantity: Callable[[Float], Float],
+    mesh: Mesh,
+    most: int = 20_000,
+    seed: int = 0,
+    *,
+    neighbours: int = 4,
+    radian_spacings: float = 4.0,
+) -> Float:
+    """Return a positive, smooth and costly quantity at all vertices, of shape (V,), from its values at some of them.
 
-NEAREST = 4
-
-TURN = 4.0
-"""Normals a radian apart are as far from each other as so many spacings of the chosen vertices."""
-
-
-# A costly quantity that varies smoothly over a surface, computed at some vertices and interpolated at the others.
-#
-# Near means near in position and in normal, so that the two sides of a thin sheet do not mix. Interpolation is the
-# inverse-distance mean of the four nearest, of logarithms, because the quantity is positive and may span decades.
-# Source: Shepard, A two-dimensional interpolation function for irregularly-spaced data (1968).
-
-
-def sparsely(quantity: Callable[[Float], Float], mesh: Mesh, most: int = MOST, seed: int = 0) -> Float:
-    """Return a positive quantity at all vertices of a mesh, of shape (V,).
+    Values are inverse-distance means of the nearest samples' logarithms, because the quantity may span decades. The
+    distance counts positions and normals, so that the two sides of a thin sheet do not mix.
+    Source: Shepard, A two-dimensional interpolation function for irregularly-spaced data (1968).
 
     Parameters
     ----------
     quantity : function of points, of shape (N, 3), to positive values, of shape (N,)
     mesh : Mesh
     most : int
-        Vertices at which it is called; all where the mesh has no more.
+        Vertices at which it is evaluated; all where the mesh has no more.
     seed : int
         Of their choice.
+    neighbours : int
+        Samples that a vertex averages.
+    radian_spacings : float
+        Distance of normals one radian apart, in spacings of the samples.
     """
     if len(mesh.vertices) <= most:
         return quantity(mesh.vertices)
@@ -132,8 +132,8 @@ def sparsely(quantity: Callable[[Float], Float], mesh: Mesh, most: int = MOST, s
     known = np.log(np.maximum(quantity(mesh.vertices[chosen]), np.finfo(np.float64).tiny))
     centred = mesh.vertices - mesh.vertices.mean(axis=0)
     spacing = np.median(cKDTree(centred[chosen]).query(centred[chosen], 2)[0][:, 1])
-    places = np.concatenate([centred, TURN * spacing * mesh.vertex_normals()], axis=1)
-    distances, near = cKDTree(places[chosen]).query(places, NEAREST)
+    places = np.concatenate([centred, radian_spacings * spacing * mesh.vertex_normals()], axis=1)
+    distances, near = cKDTree(places[chosen]).query(places, neighbours)
     weights = 1 / np.maximum(distances, 1e-6 * max(spacing, np.finfo(np.float64).tiny)) ** 2
     values: Float = np.exp((weights * known[near]).sum(axis=1) / weights.sum(axis=1))
     return values

@@ -1,14 +1,15 @@
-"""Short closed paths on a surface that do not take it apart: one around each handle, one through each tunnel.
+"""Short non-separating loops on a surface: one around each handle, one through each tunnel.
 
-A closed path takes a surface apart if and only if it crosses every other closed path an even number of times (homology
+A closed path separates a surface if and only if it crosses every other closed path an even number of times (homology
 with coefficients in Z/2). A spanning tree of the edges and a spanning tree of the faces that crosses none of them leave
-2 g edges over, of which each closes one path over faces. Each of these paths gets a random word of 64 bits, and each
-edge the exclusive or of the words of those that cross it. Then the exclusive or along any closed path of edges is its
-class: zero where it takes the surface apart, and for any other with a chance of 2^-64. The words of all edges come in
-one pass from the leaves of the faces' tree to its root, whatever the genus.
+2 g edges over, each of which closes one path over faces. Each of these paths gets a random word of 64 bits, and each
+edge a signature: the exclusive or of the words of the paths that cross it. Then the exclusive or along any closed path
+of edges is its homology class: zero where it separates the surface, and for any other with a chance of 2^-64. One pass
+from the leaves of the faces' tree to its root gives the signatures of all edges, whatever the genus.
 
-A path that does not take the surface apart crosses one of those over faces. So the shortest ones are looked for from
-vertices along these alone, by Dijkstra's algorithm within half the longest length, many at once.
+A path that does not separate the surface crosses one of those over faces. So the shortest ones are searched from the
+vertices along these only, by Dijkstra's algorithm within half the longest length, many at once. The entry is
+`short_loops`.
 Sources: Eppstein, Dynamic generators of topologically embedded graphs (2003); Erickson and Whittlesey, Greedy optimal
 homotopy and homology generators (2005).
 """
@@ -29,13 +30,7 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.chunks import slices
 
-Words = npt.NDArray[np.uint64]
-
-APART = 1 / 5
-"""How far apart paths are looked for, as a share of the longest length: a shorter one is not far from one of them."""
-
-TOGETHER = 200
-"""Vertices from which paths are looked for at once."""
+Signatures = npt.NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
@@ -48,12 +43,12 @@ class Loop:
         In order.
     length : float
     word : int
-        Its class: loops are independent where no exclusive or of some of their words is zero.
+        Its homology class: loops are independent where no exclusive or of some of their signatures is zero.
     """
 
     vertices: Int
     length: float
-    word: int
+    signature: int
 
 
 @dataclass(frozen=True)
@@ -65,13 +60,13 @@ class _Graph:
     vertices : of shape (V, 3)
     ends : of shape (E, 2), lower and higher vertex of each edge
     lengths : of shape (E,)
-    words : of shape (E,)
+    signatures : of shape (E,)
     """
 
     vertices: Float
     ends: Int
     lengths: Float
-    words: Words
+    signatures: Signatures
 
     @classmethod
     def of(cls, mesh: Mesh, rng: np.random.Generator) -> _Graph:
@@ -80,7 +75,7 @@ class _Graph:
         ends = edges.ends[edges.first]
         faces = np.stack([edges.corner[edges.first], edges.corner[edges.first + 1]], axis=1) // 3
         lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
-        return cls(mesh.vertices, ends, lengths, _words(mesh, ends, faces, rng))
+        return cls(mesh.vertices, ends, lengths, _edge_signatures(mesh, ends, faces, rng))
 
     @cached_property
     def _around(self) -> csr_array:
@@ -95,29 +90,45 @@ class _Graph:
         return position, table.indices[slot].astype(np.int64), table.data[slot].astype(np.int64) - 1
 
 
-def short_loops(mesh: Mesh, longest: Float, sought: Mask, rng: np.random.Generator) -> list[Loop]:
-    """Return loops that do not take the surface apart, shortest first.
+def short_loops(
+    mesh: Mesh,
+    longest: Float,
+    sought: Mask,
+    rng: np.random.Generator,
+    *,
+    source_spacing: float = 1 / 5,
+    sources_at_once: int = 200,
+) -> list[Loop]:
+    """Return loops that do not separate the surface, shortest first.
 
-    Each is what is left of the shortest one through some vertex without the way there and back.
+    Each is the shortest one through some vertex, without the part that is walked there and back.
 
     Parameters
     ----------
     mesh : a closed, oriented 2-manifold
-    longest : of shape (V,), the length up to which a loop through each vertex is looked for
-    sought : mask of shape (V,), of the vertices through which they are looked for
-    rng : source of the words
+    longest : of shape (V,), the length up to which a loop through each vertex is searched
+    sought : mask of shape (V,), of the vertices through which loops are searched
+    rng : source of the random words
+    source_spacing : between vertices that are searched from, in longest lengths: a loop near one is found from it
+    sources_at_once : vertices that are searched from at once, which bounds the memory
     """
     graph = _Graph.of(mesh, rng)
-    crossed = np.unique(graph.ends[graph.words != 0])
-    sources = _thinned(graph.vertices, crossed[sought[crossed]], longest)
+    crossed = np.unique(graph.ends[graph.signatures != 0])
+    sources = _thin(graph.vertices, crossed[sought[crossed]], longest, source_spacing)
     tree = cKDTree(graph.vertices)
-    found = [loop for some in slices(len(sources), TOGETHER) for loop in _from(graph, tree, sources[some], longest)]
+    found = [
+        loop
+        for some in slices(len(sources), sources_at_once)
+        for loop in _shortest_through(graph, tree, sources[some], longest)
+    ]
     return sorted(found, key=lambda loop: loop.length)
 
 
-def _words(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator) -> Words:
-    """Return each edge's word, of shape (E,), from its ends and its two faces, each of shape (E, 2)."""
+def _edge_signatures(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator) -> Signatures:
+    """Return each edge's signature, of shape (E,), from its ends and its two faces, each of shape (E, 2)."""
     count, size = len(mesh.vertices), len(mesh.faces)
+    # A spanning tree of the vertices first, and then one of the faces that crosses none of its edges. What is left are
+    # the 2 g edges that close the generators. Edges are numbered from 1, because 0 means no entry in a sparse matrix.
     left: Mask = np.ones(len(ends), dtype=bool)
     left[minimum_spanning_tree(_links(ends, count)).tocoo().data.astype(np.int64) - 1] = False
     across = _links(np.where(left[:, None], faces, 0), size)
@@ -128,18 +139,19 @@ def _words(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator) -> Words
         edge[1:] = np.asarray(across[order[1:], parent[order[1:]]]).reshape(-1) - 1
         left[edge[1:]] = False
         walks.append((order, parent[order], edge))
+    # Each edge that is left crosses its own generator only: its signature is that generator's random word.
     rows = np.flatnonzero(left)
-    words = np.zeros(len(ends), dtype=np.uint64)
-    words[rows] = rng.integers(1, 2**64, len(rows), dtype=np.uint64)
+    signatures = np.zeros(len(ends), dtype=np.uint64)
+    signatures[rows] = rng.integers(1, 2**64, len(rows), dtype=np.uint64)
     gathered = np.zeros(size, dtype=np.uint64)
-    np.bitwise_xor.at(gathered, faces[rows].reshape(-1), np.repeat(words[rows], 2))
-    # From the leaves on: a face hands on to its parent what its own children have handed to it.
-    hand = gathered.tolist()
+    np.bitwise_xor.at(gathered, faces[rows].reshape(-1), np.repeat(signatures[rows], 2))
+    # From the leaves up: a face passes on to its parent what it has gathered from its children.
+    passed = gathered.tolist()
     for order, parent, edge in walks:
         for face, above in zip(order[:0:-1].tolist(), parent[:0:-1].tolist(), strict=True):
-            hand[above] ^= hand[face]
-        words[edge[1:]] = np.array(hand, dtype=np.uint64)[order[1:]]
-    return words
+            passed[above] ^= passed[face]
+        signatures[edge[1:]] = np.array(passed, dtype=np.uint64)[order[1:]]
+    return signatures
 
 
 def _links(pairs: Int, count: int) -> csr_array:
@@ -150,15 +162,17 @@ def _links(pairs: Int, count: int) -> csr_array:
     return csr_array((numbers, (np.concatenate([low, high]), np.concatenate([high, low]))), shape=(count, count))
 
 
-def _thinned(places: Float, rows: Int, longest: Float) -> Int:
-    """Return some of the rows, one in each cube, whose edge goes with the longest length."""
-    octave = np.floor(np.log2(APART * longest[rows]))
+def _thin(places: Float, rows: Int, longest: Float, spacing: float) -> Int:
+    """Return some of the rows, one in each cube, whose edge is about `spacing` longest lengths."""
+    # The cubes' edges are powers of two, so that neighbouring vertices with similar lengths share one grid.
+    octave = np.floor(np.log2(spacing * longest[rows]))
     cube = np.floor(places[rows] / np.exp2(octave)[:, None])
     return rows[np.unique(np.column_stack([octave, cube]), axis=0, return_index=True)[1]]
 
 
-def _from(graph: _Graph, tree: cKDTree, sources: Int, longest: Float) -> list[Loop]:
-    """Return the shortest loop through each source that does not take the surface apart, where there is one."""
+def _shortest_through(graph: _Graph, tree: cKDTree, sources: Int, longest: Float) -> list[Loop]:
+    """Return the shortest loop through each source that does not separate the surface, where there is one."""
+    # No vertex of a loop is farther from its source, in a straight line, than half the loop's length.
     near = tree.query_ball_point(graph.vertices[sources], longest[sources] / 2)
     block = np.repeat(np.arange(len(sources)), [len(rows) for rows in near])
     vertex = np.concatenate([np.sort(rows) for rows in near]).astype(np.int64)
@@ -173,28 +187,34 @@ def _from(graph: _Graph, tree: cKDTree, sources: Int, longest: Float) -> list[Lo
     starts = np.searchsorted(names, np.arange(len(sources)) * len(graph.vertices) + sources)
     far, before, _ = dijkstra(links, indices=starts, min_only=True, return_predecessors=True)
     reached = np.isfinite(far)
-    words = _along(copy, other, graph.words[edge], before)
+    signatures = _path_signatures(copy, other, graph.signatures[edge], before)
     length = far[copy] + far[other] + graph.lengths[edge]
+    # An edge between two paths of one source closes a loop. It does not separate the surface where the signatures along
+    # it do not cancel.
     closes = (
-        reached[copy] & (words[copy] ^ words[other] != graph.words[edge]) & (length <= longest[sources[block[copy]]])
+        reached[copy]
+        & (signatures[copy] ^ signatures[other] != graph.signatures[edge])
+        & (length <= longest[sources[block[copy]]])
     )
     rows = np.flatnonzero(closes)
+    # The shortest of each source.
     rows = rows[np.lexsort([length[rows], block[copy[rows]]])]
     rows = rows[np.unique(block[copy[rows]], return_index=True)[1]]
-    crossed = words[copy[rows]] ^ words[other[rows]] ^ graph.words[edge[rows]]
+    crossed = signatures[copy[rows]] ^ signatures[other[rows]] ^ graph.signatures[edge[rows]]
     found = []
-    for row, word in zip(rows, crossed, strict=True):
-        ring = vertex[_closed(before, int(copy[row]), int(other[row]))]
+    for row, signature in zip(rows, crossed, strict=True):
+        ring = vertex[_simple_cycle(before, int(copy[row]), int(other[row]))]
         steps = graph.vertices[ring] - graph.vertices[np.roll(ring, -1)]
-        found.append(Loop(ring, float(np.linalg.norm(steps, axis=1).sum()), int(word)))
+        found.append(Loop(ring, float(np.linalg.norm(steps, axis=1).sum()), int(signature)))
     return found
 
 
-def _along(copy: Int, other: Int, words: Words, before: Int) -> Words:
-    """Return the exclusive or of the words along the way from each node's start; a start has itself before it."""
+def _path_signatures(copy: Int, other: Int, signatures: Signatures, before: Int) -> Signatures:
+    """Return the exclusive or of the signatures along the path from its start to each node."""
     found = np.zeros(len(before), dtype=np.uint64)
     last = before[other] == copy
-    found[other[last]] = words[last]
+    found[other[last]] = signatures[last]
+    # Pointer jumping: each pass doubles the part of the path that is summed, so that a few passes are enough.
     jump = np.where(before < 0, np.arange(len(before)), before)
     while True:
         further = jump[jump]
@@ -203,17 +223,17 @@ def _along(copy: Int, other: Int, words: Words, before: Int) -> Words:
         found, jump = found ^ found[jump], further
 
 
-def _closed(before: Int, one: int, other: int) -> list[int]:
-    """Return the nodes of the closed path by the ways from one start to two neighbours, without what both share."""
-    first, second = _way(before, one), _way(before, other)
+def _simple_cycle(before: Int, one: int, other: int) -> list[int]:
+    """Return the nodes of the closed path through two neighbours, without what their paths from the start share."""
+    first, second = _path_from_source(before, one), _path_from_source(before, other)
     while len(first) > 1 and len(second) > 1 and first[-2] == second[-2]:
         first.pop()
         second.pop()
     return first + second[-2::-1]
 
 
-def _way(before: Int, node: int) -> list[int]:
-    way = [node]
-    while before[way[-1]] >= 0:
-        way.append(int(before[way[-1]]))
-    return way
+def _path_from_source(before: Int, node: int) -> list[int]:
+    path = [node]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return path

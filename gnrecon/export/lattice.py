@@ -1,7 +1,7 @@
 """The regular lattice on which a field is sampled, closed at the border of its box.
 
-Nodes are integer triples. The lattice lives in unit coordinates, where the shape has radius one, so that a far-off
-origin (projected coordinates in metres) costs no digits; only the field itself is asked in file coordinates.
+Nodes are integer triples. The lattice is in unit coordinates, where the shape has radius one, so that a distant
+origin (projected coordinates in metres) costs no digits; only the field itself takes file coordinates.
 """
 
 from __future__ import annotations
@@ -11,14 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export.project import SignedDistance, knows_blocks, sdf_around
+from gnrecon.export.project import SignedDistance, evaluates_blocks, sdf_around
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
-
-PER_BLOCK = 8
-"""Points that a block counts as for a field that knows blocks: the more at once, the more they share."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +25,7 @@ class Lattice:
     Parameters
     ----------
     field : SignedDistance
-        What is sampled.
+        The field to sample.
     origin : array of shape (3,), unit coordinates
         Position of node (0, 0, 0).
     cell : float, unit coordinates
@@ -36,7 +33,7 @@ class Lattice:
     cells : integer array of shape (3,)
         Number of cells along each axis; there is one node more.
     batch : int
-        Most points to ask the field for at once.
+        Most points to evaluate at once.
     """
 
     field: SignedDistance
@@ -89,14 +86,17 @@ class Lattice:
         MeshError
             When the field is not finite somewhere.
         """
-        return self._closed(self._asked(np.clip(nodes, 0, self.cells), advance), nodes, slope)
+        return self._closed_at_box(self._evaluate(np.clip(nodes, 0, self.cells), advance), nodes, slope)
 
-    def together(self, nodes: int) -> int:
-        """Return how many blocks of so many nodes the field is asked for at once."""
-        return max(1, self.batch // (PER_BLOCK if knows_blocks(self.field) else nodes))
+    def blocks_per_batch(self, nodes: int, *, points_per_block: int = 8) -> int:
+        """Return how many blocks of so many nodes the field is evaluated in at once.
+
+        A field that evaluates whole blocks shares work between them, so that a block counts as `points_per_block`.
+        """
+        return max(1, self.batch // (points_per_block if evaluates_blocks(self.field) else nodes))
 
     def values_of_blocks(self, corners: Int, offsets: Int, slope: float) -> Float:
-        """Return what `values` does, of shape (N, K), at K offsets from the corners of blocks, as many as `together`.
+        """Return what `values` does, of shape (N, K), at K offsets from N corners, at most `blocks_per_batch` of them.
 
         Parameters
         ----------
@@ -113,16 +113,16 @@ class Lattice:
         """
         nodes = corners[:, None] + offsets
         out = np.empty(nodes.shape[:2])
-        # The field is not asked beyond its box.
+        # The field is not evaluated beyond its box.
         within = (nodes <= self.cells).all(axis=(1, 2))
-        apart = self.cell * self.field.frame.scale * offsets.astype(np.float64)
-        out[within] = sdf_around(self.field, self.world(corners[within]), apart)
+        relative = self.cell * self.field.frame.scale * offsets.astype(np.float64)
+        out[within] = sdf_around(self.field, self.world(corners[within]), relative)
         if not within.all():
             clipped = np.minimum(nodes[~within], self.cells).reshape(-1, 3)
-            out[~within] = self._asked(clipped).reshape(-1, len(offsets))
-        return self._closed(out, nodes, slope)
+            out[~within] = self._evaluate(clipped).reshape(-1, len(offsets))
+        return self._closed_at_box(out, nodes, slope)
 
-    def _asked(self, nodes: npt.NDArray[np.floating] | Int, advance: ProgressCallback = ignore_progress) -> Float:
+    def _evaluate(self, nodes: npt.NDArray[np.floating] | Int, advance: ProgressCallback = ignore_progress) -> Float:
         """Return the field in file units, of shape (N,), at lattice coordinates of shape (N, 3)."""
         out = np.empty(len(nodes))
         for rows in slices(len(nodes), self.batch):
@@ -130,17 +130,19 @@ class Lattice:
             advance(rows.stop / len(nodes))
         return out
 
-    def _closed(self, values: Float, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
+    def _closed_at_box(self, values: Float, nodes: npt.NDArray[np.floating] | Int, slope: float) -> Float:
         """Return the field in cells over its slope, closed at the box, by its values in file units."""
         if not np.isfinite(values).all():
             count = np.count_nonzero(~np.isfinite(values))
             raise MeshError(f"The field is not finite at {count} of {values.size} points.")
+        # Cells to the nearest side of the box; negative beyond it.
         depth = np.minimum(nodes, self.cells - nodes).min(axis=-1)
         closed: Float = np.maximum(values / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
         return closed
 
     def gradients(self, nodes: npt.NDArray[np.floating] | Int) -> Float:
         """Gradient of the field, of shape (N, 3), at lattice coordinates of shape (N, 3)."""
+        # Centres of border blocks may be beyond the box, where the field is not evaluated.
         inside = np.clip(nodes, 0, self.cells)
         out = np.empty((len(nodes), 3))
         for rows in slices(len(nodes), self.batch):

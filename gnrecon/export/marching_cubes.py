@@ -2,9 +2,12 @@
 
 Lewiner's marching cubes (scikit-image) runs on chunks of 32 cells. It puts a vertex on each lattice edge whose ends
 differ in sign, and in some ambiguous cells one more within the cell. A vertex is therefore named by an integer: the
-lower node of its edge and the edge's axis (or the cell and axis 3). Chunks that share a face name the vertices on it
-alike, so that equal names, and never a tolerance, sew the mesh together. Positions are interpolated afresh in float64
-from the values at the edge's two ends.
+lower node of its edge and the edge's axis (or the cell and axis 3). Chunks that share a face give the vertices on it
+the same names, so that the mesh is joined by equal names and never by a tolerance. Positions are interpolated again in
+float64 from the values at the edge's two ends. The entry is `extract`.
+
+Source: Lewiner, Lopes, Vieira and Tavares, Efficient implementation of marching cubes' cases with topological
+guarantees, Journal of Graphics Tools 8 (2003).
 """
 
 from __future__ import annotations
@@ -15,17 +18,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.export.export_parameters import ExtractionParameters
 from gnrecon.export.lattice import Lattice
-from gnrecon.export.leaf_storage import CHUNK, Values
+from gnrecon.export.leaf_storage import Values
 from gnrecon.export.project import SignedDistance
-from gnrecon.export.sparse_grid import Band, narrow_band
+from gnrecon.export.sparse_grid import NarrowBand, narrow_band
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
-
-EVALUATED = 0.9
-"""About which share of the time has passed when the field is known; marching cubes takes the rest."""
 
 
 def extract(
@@ -36,6 +37,7 @@ def extract(
     data: Float | None = None,
     batch: int = 65536,
     advance: ProgressCallback = ignore_progress,
+    parameters: ExtractionParameters | None = None,
 ) -> Mesh:
     """Mesh the zero level of a field.
 
@@ -47,12 +49,14 @@ def extract(
     bounds : array of shape (2, 3), file units, optional
         The box; by default the field's own. A shape that reaches beyond it is closed by a flat cap.
     data : array of shape (N, 3), file units, optional
-        What the field was fitted to. Sheets that no data is near, and that do not hang together with one that is, may
-        then be left out, which saves most of the work where the field is steep in free space.
+        What the field was fitted to. Sheets without data nearby that are not connected to one with data may then be
+        left out, which saves most of the work where the field is steep in free space.
     batch : int
-        Most points to ask the field for at once.
+        Most points to evaluate at once.
     advance : callable
-        Told of the share that is done after each batch, and after each chunk that the surface passes.
+        Receives the share that is done, after each batch and after each chunk that the surface passes.
+    parameters : ExtractionParameters, optional
+        By default ``ExtractionParameters()``.
 
     Returns
     -------
@@ -65,22 +69,28 @@ def extract(
     MeshError
         When the field has no zero level in the box, or is not finite.
     UsageError
-        When the resolution, the bounds or the batch make no sense.
+        When the resolution, the bounds or the batch are out of range.
     """
     lattice = Lattice.over(field, resolution, bounds, batch)
-    band = narrow_band(lattice, None if data is None else lattice.nodes(data), subrange(advance, 0.0, EVALUATED))
-    pieces = _march_all(band, subrange(advance, EVALUATED, 1.0))
+    # Evaluating the field takes about nine tenths of the time.
+    band = narrow_band(
+        lattice,
+        None if data is None else lattice.nodes(data),
+        subrange(advance, 0.0, 0.9),
+        parameters=parameters or ExtractionParameters(),
+    )
+    pieces = _march_all(band, subrange(advance, 0.9, 1.0))
     del band
     if not pieces:
         raise MeshError(
             f"The field has no zero level among the {' x '.join(str(n + 1) for n in lattice.cells)} points of its box, "
             f"so there is no surface to mesh."
         )
-    return _stitched(lattice, pieces)
+    return _stitch(lattice, pieces)
 
 
 @dataclass(frozen=True)
-class Piece:
+class ChunkMesh:
     """The surface within one chunk.
 
     Parameters
@@ -93,11 +103,11 @@ class Piece:
     """
 
     names: Int
-    places: Float
+    positions: Float
     faces: npt.NDArray[np.int32]
 
 
-def _march_all(band: Band, advance: ProgressCallback) -> list[Piece]:
+def _march_all(band: NarrowBand, advance: ProgressCallback) -> list[ChunkMesh]:
     pieces = []
     chunks = band.leaves.mixed_chunks()
     for number, chunk in enumerate(chunks, 1):
@@ -109,26 +119,30 @@ def _march_all(band: Band, advance: ProgressCallback) -> list[Piece]:
     return pieces
 
 
-def _march(band: Band, chunk: Int) -> Piece | None:
+def _march(band: NarrowBand, chunk: Int) -> ChunkMesh | None:
     """Run marching cubes on one chunk; None where nothing crosses."""
     from skimage import measure
 
     values = band.leaves.nodes(band.leaves.rows(chunk))
+    # Values are never zero, see `NarrowBand.clamp`, so that a chunk of one sign has no surface.
     if not (values.min() < 0 < values.max()):
         return None
     marching_cubes: Any = measure.marching_cubes
     rough, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent", method="lewiner")
+    # A vertex on a lattice edge has one coordinate that is not a whole number; one within a cell has more.
     on_axis = rough != np.round(rough)
     # Rounding along the edge's own axis must go down, across it to the node that the coordinate already is.
     nodes = np.floor(rough).astype(np.int64)
     axis = np.where(on_axis.sum(axis=1) == 1, on_axis.argmax(axis=1), 3)
-    places = rough.astype(np.float64)
+    positions = rough.astype(np.float64)
     edges = np.flatnonzero(axis < 3)
-    places[edges, axis[edges]] = nodes[edges, axis[edges]] + _crossings(values, nodes[edges], axis[edges])
-    nodes += chunk * CHUNK
+    positions[edges, axis[edges]] = nodes[edges, axis[edges]] + _crossings(values, nodes[edges], axis[edges])
+    origin = chunk * band.parameters.chunk_cells
+    nodes += origin
+    # Mixed radix: three node coordinates and one of four axes in one integer.
     sides = band.lattice.cells + 1
     names = ((nodes[:, 0] * sides[1] + nodes[:, 1]) * sides[2] + nodes[:, 2]) * 4 + axis
-    return Piece(names, places + chunk * CHUNK, faces.astype(np.int32))
+    return ChunkMesh(names, positions + origin, faces.astype(np.int32))
 
 
 def _crossings(values: Values, nodes: Int, axis: Int) -> Float:
@@ -139,7 +153,7 @@ def _crossings(values: Values, nodes: Int, axis: Int) -> Float:
     return crossings
 
 
-def _stitched(lattice: Lattice, pieces: list[Piece]) -> Mesh:
+def _stitch(lattice: Lattice, pieces: list[ChunkMesh]) -> Mesh:
     """Join the pieces by the names of their vertices; the list is emptied, because both would take twice the memory."""
     _, first, inverse = np.unique(
         np.concatenate([piece.names for piece in pieces]), return_index=True, return_inverse=True
@@ -150,7 +164,7 @@ def _stitched(lattice: Lattice, pieces: list[Piece]) -> Mesh:
     while pieces:
         piece = pieces.pop(0)
         rows = slice(start, start + len(piece.names))
-        vertices[inverse[rows]] = lattice.world(piece.places)
+        vertices[inverse[rows]] = lattice.world(piece.positions)
         faces[done : done + len(piece.faces)] = inverse[rows][piece.faces]
         done, start = done + len(piece.faces), rows.stop
     return Mesh(vertices, faces)

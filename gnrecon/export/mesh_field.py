@@ -1,43 +1,41 @@
-"""From a fitted field to a mesh in file units: extract, drop what no data supports, project, refine, repair, cut.
+"""Meshes a fitted field in file units: extract, drop unsupported parts, project, refine, repair, remove handles.
 
-A reconstruction and `gnrecon mesh`, which meshes a saved field again, both do their meshing here.
+`mesh_field` does the meshing of a reconstruction and of `gnrecon mesh`, which meshes a saved field again; `MeshOptions`
+says how.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.project import sdf_and_gradient
-from gnrecon.export.resolution import MOST_REFINED, Fineness, error_once_projected, finer, measure_fineness
+from gnrecon.export.remeshing.refine import RefineOptions
+from gnrecon.export.resolution import (
+    Fineness,
+    cells_for_edges,
+    measure_fineness,
+    projected_chord_error,
+    refined_resolution,
+)
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 _log = logging.getLogger(__name__)
 
-SAFE = 0.95
-"""Share of the wanted chord error at which a mesh is fine enough: projected as a whole, it may differ a little."""
-
-MOST_SHIFTED, MOST_TILTED = 0.2, 1e-3
-"""Errors of single precision that are put up with: in cells, and of gradients, as a share of themselves."""
-
-CHORD = 0.07
-"""Mean distance of a mesh's faces from the surface, over its curvature and the square of a cell: 0.072 on spheres."""
-
-MOST_SMOOTH, ASKED = 224, 2000
-"""Most cells that a smooth shape gets for its faces' sake, and points at which its curvature is asked for."""
-
 StageTimer = Callable[[str], AbstractContextManager[None]]
-"""Gives the context in which a stage of a name runs, such as `gnrecon.report.report.Stages`."""
+"""Returns the context in which a named stage runs, such as `gnrecon.report.report.Stages`."""
 
 
 def untimed(name: str) -> AbstractContextManager[None]:
@@ -47,35 +45,107 @@ def untimed(name: str) -> AbstractContextManager[None]:
 
 
 class MeshedField(SignedDistance, Protocol):
-    """A field that can also be had in single precision, which is several times as fast."""
+    """A field that also has a version in single precision, which is several times as fast."""
 
     def single(self) -> SignedDistance:
         """Return the same field in single precision."""
         ...
 
 
-def fine_enough(sdf: NeuralSDF, cells: int) -> int:
-    """Return the cells, or up to 224 so that faces are no farther off the surface than the field itself may be.
+@dataclass(frozen=True)
+class MeshOptions:
+    """Options of `mesh_field`.
 
-    How much of the shape the smooth global field leaves over to the detail at the data tells how far it is off between
-    them at most. That is far more than faces are off, but on smooth shapes that were scanned without noise.
+    Parameters
+    ----------
+    resolution : int, optional
+        Cells along the longest side of the box; by default `default_cells`.
+    edge_length : float, file units, optional
+        Mean length of the mesh's edges, from which the number of cells follows.
+    max_error : float, file units, optional
+        Distance from the field's surface that 99.9 % of face centres and edge midpoints stay within; the mesh is made
+        finer until they do, up to 1,024 cells.
+    keep_handles : bool
+        Whether handles and tunnels without supporting points stay, see `gnrecon.export.remove_handles`.
+    refine : RefineOptions
+        Remeshing and decimation.
+    default_cells : int
+        Cells where neither a resolution nor an edge length is given.
+
+    Raises
+    ------
+    UsageError
+        When a value is out of its range.
+    """
+
+    resolution: int | None = None
+    edge_length: float | None = None
+    max_error: float | None = None
+    keep_handles: bool = False
+    refine: RefineOptions = field(default_factory=RefineOptions)
+    default_cells: int = 256
+
+    def __post_init__(self) -> None:
+        if self.resolution is not None and self.edge_length is not None:
+            raise UsageError("An edge length sets the resolution. Give only one of the two.")
+        least = ExportParameters.resolution.least_cells
+        if self.resolution is not None and self.resolution < least:
+            raise UsageError(f"The resolution must be at least {least} cells, not {self.resolution}.")
+        for name, value in (("edge length", self.edge_length), ("greatest error", self.max_error)):
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"The {name} must be a positive length, not {value:g}.")
+
+    def cells(self, bounds: Float) -> int:
+        """Return the cells along the longest side of a box, of shape (2, 3) in file units, to begin with.
+
+        Raises
+        ------
+        UsageError
+            When the edge length would need too few or too many.
+        """
+        if self.edge_length is not None:
+            return cells_for_edges(self.edge_length, bounds)
+        return self.resolution or self.default_cells
+
+
+def cells_for_curvature(
+    sdf: NeuralSDF, cells: int, *, most_cells: int = 224, samples: int = 2000, chord_ratio: float = 0.07
+) -> int:
+    """Return the cells, or more, so that a smooth shape's faces are no farther off the surface than its field.
+
+    The amplitude of the detail field at the data bounds the error of the smooth global field between them. It is far
+    more than the distance of the faces, except on smooth shapes that were scanned without noise.
+
+    Parameters
+    ----------
+    sdf : NeuralSDF
+    cells : int
+        Least to return.
+    most_cells : int
+        Most to return for the faces' sake.
+    samples : int
+        Most points at which the curvature is evaluated.
+    chord_ratio : float
+        Mean distance of faces from the surface over its curvature and the square of a cell; 0.072 on spheres.
     """
     data = sdf.data
-    if sdf.detail is None or data is None or cells >= MOST_SMOOTH:
+    if sdf.detail is None or data is None or cells >= most_cells:
         return cells
-    some = data[:: max(1, len(data) // ASKED)]
+    # The coarse field at the data is the detail that the smooth field does not represent.
+    some = data[:: max(1, len(data) // samples)]
     off = float(np.sqrt(np.mean(sdf.coarse().sdf(some) ** 2)))
     mean, gauss = curvatures(sdf.gradient(some), sdf.hessian(some))
+    # sqrt(k1^2 + k2^2) from the mean and the Gauss curvature.
     bend = float(np.nanmean(np.sqrt((4 * mean**2 - 2 * gauss).clip(0.0))))
     longest = float(np.ptp(sdf.bounds, axis=0).max())
-    # off = CHORD bend (longest / wanted)^2
-    wanted = longest * np.sqrt(CHORD * bend / max(off, np.finfo(np.float64).tiny))
-    return int(np.clip(np.ceil(wanted), cells, MOST_SMOOTH))
+    # off = chord_ratio bend (longest / wanted)^2
+    wanted = longest * np.sqrt(chord_ratio * bend / max(off, np.finfo(np.float64).tiny))
+    return int(np.clip(np.ceil(wanted), cells, most_cells))
 
 
 @dataclass(frozen=True)
 class Meshed:
-    """What became of a field.
+    """A meshed field.
 
     Parameters
     ----------
@@ -83,7 +153,7 @@ class Meshed:
         Closed, with normals; `gnrecon.export.require_sound` has accepted it.
     fineness : Fineness
     actions : list of str
-        A sentence for each thing that was dropped, refined, repaired or cut, and for what was asked of the fineness.
+        A sentence for each change, and for the fineness where an edge length or error was requested.
     """
 
     mesh: Mesh
@@ -99,6 +169,7 @@ def mesh_field(
     bounds: Float | None = None,
     stages: StageTimer = untimed,
     advance: ProgressCallback = ignore_progress,
+    parameters: ExportParameters = ExportParameters(),
 ) -> Meshed:
     """Mesh the zero level of a field as the options ask.
 
@@ -107,14 +178,15 @@ def mesh_field(
     field : MeshedField
     options : MeshOptions
     data : array of shape (N, 3), file units, or None
-        Points that the field was fitted to, which tell surface from sheets and handles that were invented; with None
-        all is kept.
+        Points that the field was fitted to. Components and handles that they do not support are removed; with None
+        all are kept.
     bounds : array of shape (2, 3), file units, optional
         The box to mesh in; by default the field's own.
     stages : callable
         Times the stages ``extract``, ``project``, ``refine`` where the options ask for it, and ``repair``.
     advance : callable
-        Told of the share that is done of each stage.
+        Receives the share of each stage that is done.
+    parameters : ExportParameters
 
     Raises
     ------
@@ -125,67 +197,92 @@ def mesh_field(
     """
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
-        mesh, fast, cells, dropped = _extracted(field, options, data, box, advance)
+        mesh, fast, cells, dropped = _extract_until_accurate(field, options, data, box, advance, parameters)
+    # Two Newton steps bring a smooth field to rounding; gradients may come from the cheaper field.
     with stages("project"):
         mesh = project(mesh, field, steps=2, rough=None if fast is field else fast, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []
     if options.refine.anything:
         with stages("refine"):
-            mesh, refined = refine(mesh, field, options.refine, advance=advance)
+            mesh, refined = refine(mesh, field, options.refine, advance=advance, parameters=parameters.remesh)
     with stages("repair"):
         mesh, repaired = repair(mesh)
         cut: list[str] = []
         if data is not None and not options.keep_handles:
-            mesh, cut = remove_handles(mesh, data)
-        fineness = measure_fineness(mesh, field, cells, box)
-    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *_said(fineness, options)])
+            mesh, cut = remove_handles(mesh, data, parameters=parameters.handles)
+        fineness = measure_fineness(mesh, field, cells, box, parameters=parameters.resolution)
+    sentences = _resolution_sentences(fineness, options, parameters.resolution.most_refined_cells)
+    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *sentences])
 
 
-def _extracted(
-    field: MeshedField, options: MeshOptions, data: Float | None, box: Float, advance: ProgressCallback
+def _extract_until_accurate(
+    field: MeshedField,
+    options: MeshOptions,
+    data: Float | None,
+    box: Float,
+    advance: ProgressCallback,
+    parameters: ExportParameters,
 ) -> tuple[Mesh, SignedDistance, int, list[str]]:
     """Extract, and again with more cells until the error is small enough.
 
-    Returns the field that was good enough for it, the cells, and what was dropped.
+    Returns the mesh, the field that was precise enough for it, the cells, and sentences on dropped components.
     """
-    cells, begin = options.cells(box), 0.0
+    cells, begin, most_cells = options.cells(box), 0.0, parameters.resolution.most_refined_cells
     while True:
-        # How often is not known before: each attempt gets half of what is left of the stage.
+        # The number of attempts is unknown: each gets half of what is left of the stage's progress.
         end = 1.0 if options.max_error is None else (begin + 1.0) / 2
-        fast = field if data is None else _coarse(field, data, cells)
-        mesh = extract(fast, resolution=cells, bounds=box, data=data, advance=subrange(advance, begin, end))
+        fast = field if data is None else _single_precision_field(field, data, cells)
+        mesh = extract(
+            fast,
+            resolution=cells,
+            bounds=box,
+            data=data,
+            advance=subrange(advance, begin, end),
+            parameters=parameters.extraction,
+        )
+        # Before the error is measured, so that ghost sheets do not count.
         mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
-        if options.max_error is None or cells >= MOST_REFINED:
+        if options.max_error is None or cells >= most_cells:
             return mesh, fast, cells, dropped
-        error = error_once_projected(mesh, field, cells, box)
-        if error <= SAFE * options.max_error:
+        error = projected_chord_error(mesh, field, cells, box, parameters=parameters.resolution)
+        accepted = parameters.resolution.accepted_error_share * options.max_error
+        if error <= accepted:
             return mesh, fast, cells, dropped
-        cells, begin = min(finer(cells, error, SAFE * options.max_error), MOST_REFINED), end
+        cells, begin = min(refined_resolution(cells, error, accepted), most_cells), end
 
 
-def _said(fineness: Fineness, options: MeshOptions) -> list[str]:
-    """Tell what became of an edge length or a greatest error that was asked for."""
+def _resolution_sentences(fineness: Fineness, options: MeshOptions, most_cells: int) -> list[str]:
+    """Sentences on an edge length or a greatest error that was requested."""
     if options.edge_length is None and options.max_error is None:
         return []
-    said = [fineness.describe()]
+    sentences = [fineness.describe()]
     if options.max_error is not None and fineness.chord_error > options.max_error:
-        reason = f": the limit of {MOST_REFINED} cells was reached." if fineness.resolution >= MOST_REFINED else "."
-        said.append(f"That is not within {options.max_error:g}{reason}")
-    return said
+        reason = f": the limit of {most_cells} cells was reached." if fineness.resolution >= most_cells else "."
+        sentences.append(f"That is not within {options.max_error:g}{reason}")
+    return sentences
 
 
-def _coarse(field: MeshedField, data: Float, resolution: int) -> SignedDistance:
-    """Return the field in single precision where vertices and normals come out well enough by it; projection by the
-    field's own values makes the vertices exact.
+def _single_precision_field(
+    field: MeshedField,
+    data: Float,
+    resolution: int,
+    *,
+    most_shift_cells: float = 0.2,
+    most_gradient_error: float = 1e-3,
+    samples: int = 2000,
+) -> SignedDistance:
+    """Return the field in single precision where that is accurate enough to extract with, else the field.
 
-    Features of high frequency with large weights cancel, so the errors are measured and not assumed.
+    Projection by the field's own values makes the vertices exact. Features of high frequency with large weights cancel,
+    so that the errors are measured: at most `samples` points of `data`, values in cells of `resolution` along the box,
+    and gradients relative to their length.
     """
-    some = data[:: max(1, len(data) // 2000)]
+    some = data[:: max(1, len(data) // samples)]
     single = field.single()
     value, gradient = sdf_and_gradient(field, some)
-    rough, slanted = sdf_and_gradient(single, some)
+    single_value, single_gradient = sdf_and_gradient(single, some)
     cell = np.ptp(field.bounds, axis=0).max() / resolution
-    shifted = np.abs(rough - value).max() / cell
-    tilted = (np.linalg.norm(slanted - gradient, axis=1) / np.linalg.norm(gradient, axis=1)).max()
-    return single if shifted < MOST_SHIFTED and tilted < MOST_TILTED else field
+    shift = np.abs(single_value - value).max() / cell
+    gradient_error = (np.linalg.norm(single_gradient - gradient, axis=1) / np.linalg.norm(gradient, axis=1)).max()
+    return single if shift < most_shift_cells and gradient_error < most_gradient_error else field

@@ -1,4 +1,4 @@
-"""How a mesh's faces hang together: its edges, its vertex fans and its components.
+"""Connectivity of a mesh (edges, vertex fans, components) and the quality of its faces (edge lengths, angles).
 
 A face (a, b, c) walks the half-edges a -> b, b -> c and c -> a. In a closed, oriented surface every edge is walked
 exactly twice, once each way. Around a vertex of a 2-manifold the faces form a single fan: linking the corners of
@@ -62,7 +62,7 @@ class Edges:
 def split_vertices(mesh: Mesh, edges: Edges) -> Int:
     """Vertices, of shape (N,), whose faces form more than one fan.
 
-    Edges with other than two half-edges link nothing, so that only vertices of closed meshes are told apart well.
+    Edges with other than two half-edges link nothing, so that the result is right for closed meshes only.
     """
     fans = corner_fans(mesh, edges)
     # A pair as one number is sorted many times as fast as a row of two.
@@ -103,13 +103,6 @@ def submesh(mesh: Mesh, faces: Mask) -> Mesh:
     return Mesh(mesh.vertices[used], inverse.reshape(-1, 3), normals)
 
 
-BIN = 5.0
-"""Width of the histogram's bins, in degrees."""
-
-
-# How well shaped a mesh's faces are: edge lengths and angles.
-
-
 @dataclass(frozen=True)
 class MeshQuality:
     """Edge lengths and angles of a mesh's faces.
@@ -134,12 +127,12 @@ class MeshQuality:
         return asdict(self)
 
 
-def quality(mesh: Mesh) -> MeshQuality:
-    """Measure the edges and angles of a mesh with at least one face."""
+def quality(mesh: Mesh, *, bin_degrees: float = 5.0) -> MeshQuality:
+    """Measure the edges and angles of a mesh with at least one face; `bin_degrees` is the histogram's bin width."""
     lengths, angles = edge_lengths(mesh), corner_angles(mesh).reshape(-1)
     percentiles = {"min": 0, "p1": 1, "p5": 5, "median": 50, "p95": 95, "p99": 99, "max": 100}
     values = np.percentile(angles, list(percentiles.values()))
-    bins = np.arange(0.0, 180.0 + BIN, BIN)
+    bins = np.arange(0.0, 180.0 + bin_degrees, bin_degrees)
     figures = {"mean": lengths.mean(), "min": lengths.min(), "max": lengths.max(), "std": lengths.std()}
     return MeshQuality(
         edge_length={name: float(value) for name, value in figures.items()},

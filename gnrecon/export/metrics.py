@@ -1,8 +1,8 @@
-"""Measuring a mesh against a reference.
+"""Measures a mesh against a reference: Chamfer and Hausdorff distances, F-score, normal consistency.
 
 Samples are drawn on each surface, uniformly by area, and measured against the other surface itself, as distances from
-point to triangle. A reference without faces is measured as it is: its own points take the samples' place, and the way
-back goes to its nearest point, which on average cannot be smaller than a share of its spacing.
+point to triangle. A reference without faces is represented by its own points: the distance to the nearest of them is on
+average at least a share of their spacing. The entries are `measure` and, for each vertex, `vertex_error`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,6 @@ from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
-F_SCORE_SHARE = 0.005
-"""Threshold of the F-score as a share of the reference's radius."""
-
 
 def measure(
     mesh: Mesh,
@@ -33,7 +30,7 @@ def measure(
     scale: float | None = None,
     advance: ProgressCallback = ignore_progress,
 ) -> Metrics:
-    """Measure a mesh against the surface, or the cloud, that it should be.
+    """Measure a mesh against a reference surface or cloud.
 
     Parameters
     ----------
@@ -45,10 +42,10 @@ def measure(
     seed : int
         Of the sampling; equal seeds give equal numbers.
     scale : float, file units, optional
-        What relative figures and the F-score's threshold refer to; by default the reference's radius, the largest
+        Unit of relative figures and of the F-score's threshold; by default the reference's radius, the largest
         distance of its vertices from their mean.
     advance : callable
-        Told of the share that is done.
+        Receives the share that is done.
 
     Raises
     ------
@@ -70,6 +67,7 @@ def measure(
     radius = float(np.linalg.norm(anchor - anchor.mean(axis=0), axis=1).max()) if scale is None else scale
     if not radius > 0:
         raise UsageError(f"Distances cannot be given relative to a scale of {radius}, which is not positive.")
+    # One generator for both, so that a seed determines all numbers.
     rng = np.random.default_rng(seed)
     on_mesh = sample_surface(mesh, samples, rng)
     if isinstance(reference, Mesh):
@@ -85,7 +83,7 @@ def measure(
 
 
 @dataclass(frozen=True)
-class Samples:
+class SurfaceSamples:
     """Points of shape (N, 3), in file units, with unit normals of the surface there, if it has any."""
 
     points: Float
@@ -93,14 +91,14 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class _Gap:
+class _Distances:
     """Distances of shape (N,) from samples to a target, and the mean |cosine| of the normals there."""
 
     distances: Float
     consistency: float | None
 
 
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Samples:
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> SurfaceSamples:
     """Draw `count` points on a mesh, uniformly by area, with the normals of their faces."""
     vectors = mesh.face_vectors
     areas = np.linalg.norm(vectors, axis=1)
@@ -111,38 +109,50 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Samples:
     root, along = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
     points = np.einsum("ij,ijk->ik", weights, mesh.corners[faces])
-    return Samples(points, vectors[faces] / areas[faces, None])
+    return SurfaceSamples(points, vectors[faces] / areas[faces, None])
 
 
-def _samples_of_cloud(cloud: PointCloud) -> Samples:
+def _samples_of_cloud(cloud: PointCloud) -> SurfaceSamples:
     if cloud.normals is None:
-        return Samples(cloud.points, None)
+        return SurfaceSamples(cloud.points, None)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return Samples(cloud.points, cloud.normals / lengths)
+    return SurfaceSamples(cloud.points, cloud.normals / lengths)
 
 
-def _to_surface(samples: Samples, mesh: Mesh) -> _Gap:
+def _to_surface(samples: SurfaceSamples, mesh: Mesh) -> _Distances:
     distances, faces = nearest_on_surface(mesh, samples.points)
     vectors = mesh.face_vectors[faces]
     lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return _Gap(distances, _consistency(samples.normals, vectors / lengths))
+    return _Distances(distances, _consistency(samples.normals, vectors / lengths))
 
 
-def _to_points(samples: Samples, target: Samples) -> _Gap:
+def _to_points(samples: SurfaceSamples, target: SurfaceSamples) -> _Distances:
     distances, rows = cKDTree(target.points).query(samples.points)
     normals = None if target.normals is None else target.normals[rows]
-    return _Gap(distances, _consistency(samples.normals, normals))
+    return _Distances(distances, _consistency(samples.normals, normals))
 
 
 def _consistency(ours: Float | None, theirs: Float | None) -> float | None:
     if ours is None or theirs is None:
         return None
+    # Absolute cosines, because references may be oriented either way.
     return float(np.abs(np.einsum("ij,ij->i", ours, theirs)).mean())
 
 
-def _summary(there: _Gap, back: _Gap, radius: float, samples: int, is_cloud: bool) -> Metrics:
-    """Put the numbers together; `there` leads from the reference to the mesh, `back` the other way."""
-    threshold = F_SCORE_SHARE * radius
+def _summary(
+    there: _Distances,
+    back: _Distances,
+    radius: float,
+    samples: int,
+    is_cloud: bool,
+    *,
+    threshold_radii: float = 0.005,
+) -> Metrics:
+    """Compute the metrics from the distances of the reference's samples (`there`) and of the mesh's (`back`).
+
+    `threshold_radii` is the F-score's threshold relative to the radius.
+    """
+    threshold = threshold_radii * radius
     precision, recall = (float((gap.distances <= threshold).mean()) for gap in (back, there))
     total = precision + recall
     means = [float(gap.distances.mean()) for gap in (there, back)]
@@ -167,10 +177,8 @@ def _summary(there: _Gap, back: _Gap, radius: float, samples: int, is_cloud: boo
     )
 
 
-# The numbers that say how far two surfaces lie apart, each with its definition.
-#
-# The definitions are printed with the numbers, because the literature calls several of them "Chamfer": the mean or the
-# root mean square, one way or both, squared or not.
+# Definitions are printed with the numbers, because the literature calls several of them "Chamfer": the mean or the root
+# mean square, one way or both, squared or not.
 
 
 @dataclass(frozen=True)
@@ -253,15 +261,11 @@ DISTANCES = {
 }
 
 
-# The error map: how far each vertex of a mesh lies from the reference, and on which side.
-#
-# The sign is told by the mesh's own normal n at the vertex p with foot q on the reference: it is that of (p - q) . n.
-# So it is positive where the mesh lies outside of the reference, whichever way the reference's faces look, whether it
-# is closed or not, and for references that are points.
-
-
 def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:
     """Return the signed distance of each vertex to the nearest place of the reference, of shape (V,), in file units.
+
+    The sign is that of (p - q) . n, with the vertex p, its foot q on the reference and the mesh's normal n. So it is
+    positive outside of the reference, whether this is closed or open, a mesh or a cloud, and oriented or not.
 
     Parameters
     ----------
@@ -271,7 +275,7 @@ def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:
         share of its spacing.
     """
     if isinstance(reference, Mesh):
-        feet = Surface(reference).nearest(mesh.vertices)[0]
+        feet = SurfaceQuery(reference).nearest(mesh.vertices)[0]
     else:
         feet = reference.points[cKDTree(reference.points).query(mesh.vertices)[1]]
     away = mesh.vertices - feet
@@ -280,15 +284,9 @@ def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:
     return signed
 
 
-RAYS = 5
-"""Rays that vote on whether a point lies inside: one alone may graze an edge and count it twice, or not at all."""
-
-
-# The nearest points of a surface, found by open3d's ray-casting tree, and which points lie inside of it.
-#
-# The tree works in float32. Positions are therefore centred and scaled to one first, and the foot point is computed
-# again in float64 from the nearest triangle and its barycentric coordinates: a rounding of 1e-7 then shifts the foot
-# along the triangle only, and changes the distance to second order.
+# Open3d's ray-casting tree uses float32. Positions are therefore centred and scaled to one first, and the foot point
+# is computed again in float64 from the nearest triangle and its barycentric coordinates: a rounding of 1e-7 then shifts
+# the foot along the triangle only, and changes the distance to second order.
 
 
 def ray_scene(vertices: Float, faces: Int) -> Any:
@@ -301,14 +299,14 @@ def ray_scene(vertices: Float, faces: Int) -> Any:
     return scene
 
 
-class Surface:
-    """A mesh with faces, ready for many queries.
+class SurfaceQuery:
+    """Nearest points of a mesh with faces, and inside tests.
 
     Parameters
     ----------
     mesh : Mesh
     batch : int
-        Most points that the tree is asked for at once.
+        Most points of a query at once.
     """
 
     def __init__(self, mesh: Mesh, batch: int = 1_000_000) -> None:
@@ -328,11 +326,14 @@ class Surface:
             feet[rows] = np.einsum("ij,ijk->ik", weights, self._corners[faces[rows]])
         return feet, faces
 
-    def inside(self, points: Float) -> Mask:
-        """Return which points, of shape (N, 3), a closed surface encloses, to about 1e-7 of its size."""
+    def inside(self, points: Float, *, rays: int = 5) -> Mask:
+        """Return which points, of shape (N, 3), a closed surface encloses, to about 1e-7 of its size.
+
+        The majority of `rays` decides: a single one may graze an edge and count it twice, or not at all.
+        """
         inside = np.empty(len(points), dtype=bool)
         for rows in slices(len(points), self._batch):
-            answer = self._scene.compute_occupancy(self._queries(points[rows]), nsamples=RAYS)
+            answer = self._scene.compute_occupancy(self._queries(points[rows]), nsamples=rays)
             inside[rows] = answer.numpy() > 0
         return inside
 
@@ -344,5 +345,5 @@ class Surface:
 
 def nearest_on_surface(mesh: Mesh, points: Float, batch: int = 1_000_000) -> tuple[Float, Int]:
     """Distance to a surface, in its units, and the nearest face, for points of shape (N, 3)."""
-    feet, faces = Surface(mesh, batch).nearest(points)
+    feet, faces = SurfaceQuery(mesh, batch).nearest(points)
     return np.linalg.norm(points - feet, axis=1), faces

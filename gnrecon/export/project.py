@@ -1,9 +1,9 @@
-"""Bring a mesh's vertices onto the zero level by Newton's method along the gradient.
+"""Moves a mesh's vertices onto the zero level by Newton's method along the gradient.
 
 Each step is x <- x - f grad f / |grad f|^2, the orthogonal Newton step of the paper (section on surface sampling). A
-vertex keeps its step only where |f| falls, and its old place where it would have to go further than a limit: there the
-linear model does not hold, or the vertex sits on the cap that closes the field at its box. Afterwards, vertices of
-faces that have turned over or collapsed go back, until none is left.
+step is kept only where it reduces |f|. A vertex that would move farther than a limit stays: there the linear model does
+not hold, or the vertex lies on the cap that closes the field at its box. Afterwards, vertices of faces that have turned
+over or collapsed are restored, until none is left. The entry is `project`.
 """
 
 from __future__ import annotations
@@ -19,18 +19,6 @@ from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
-
-TURN, COLLAPSE = 0.3, 1e-3
-"""Least cosine between a face's old and new normal, and least new area as a share of the old."""
-
-FAR = 0.05
-"""Length of a step, as a share of the limit, beyond which the gradient is asked for anew: it costs as much as two or
-three values, and over a fiftieth of a cell, which most steps are shorter than, it hardly turns."""
-
-CLOSE = 1e-8
-"""Distance, as a share of the limit, below which a vertex is on the zero level and takes no further step."""
-
-_TINY = np.finfo(np.float64).tiny
 
 
 def project(
@@ -54,14 +42,13 @@ def project(
     steps : int
         Newton steps; two bring a smooth field to rounding.
     limit : float, file units, optional
-        Longest way that a vertex may go; by default half the median edge, which is less than half a cell.
+        Largest distance that a vertex may move; by default half the median edge, which is less than half a cell.
     rough : SignedDistance, optional
-        The same field, cheaper and a little less exact. It then gives the gradients, along which steps go by the
-        field's own values.
+        The same field, cheaper and a little less accurate. It then gives the gradients; values are the field's own.
     batch : int
-        Most points to ask the field for at once.
+        Most points to evaluate at once.
     advance : callable
-        Told of the share that is done after each batch.
+        Receives the share that is done, after each batch.
 
     Returns
     -------
@@ -83,22 +70,29 @@ def project(
     value = np.empty(len(moved))
     gradient = np.empty_like(moved)
     for rows in slices(len(moved), batch):
-        moved[rows], value[rows], gradient[rows] = newton(mesh.vertices[rows], field, steps, limit, rough)
+        moved[rows], value[rows], gradient[rows] = newton_project(mesh.vertices[rows], field, steps, limit, rough)
         advance(rows.stop / len(moved))
-    back = _undo_turned(mesh, moved)
+    back = _vertices_to_restore(mesh, moved)
     moved[back] = mesh.vertices[back]
-    result = Mesh(moved, mesh.faces)
-    normals = result.vertex_normals()
-    for rows in slices(len(moved)):
-        unit = gradient[rows] / np.maximum(np.linalg.norm(gradient[rows], axis=1, keepdims=True), _TINY)
+    return _with_field_normals(Mesh(moved, mesh.faces), value, gradient, limit)
+
+
+def _with_field_normals(mesh: Mesh, value: Float, gradient: Float, limit: float) -> Mesh:
+    """The mesh with the field's unit gradients as normals where they fit, and the faces' mean elsewhere."""
+    normals = mesh.vertex_normals()
+    # By slices, because temporaries of all vertices would double the memory.
+    for rows in slices(len(normals)):
+        lengths = np.linalg.norm(gradient[rows], axis=1, keepdims=True)
+        unit = gradient[rows] / np.maximum(lengths, np.finfo(np.float64).tiny)
         # On a cap, and where the field folds, the gradient is not the surface's normal.
         fit = (np.abs(value[rows]) <= limit) & (np.einsum("ij,ij->i", unit, normals[rows]) > 0)
         normals[rows][fit] = unit[fit]
-    return Mesh(moved, mesh.faces, normals)
+    return Mesh(mesh.vertices, mesh.faces, normals)
 
 
 def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     """Lengths of the faces' sides, of shape (3 F,)."""
+    # Single precision halves the memory, and the median and the mean need no more.
     lengths = np.empty((len(mesh.faces), 3), dtype=np.float32)
     for rows in slices(len(mesh.faces)):
         corners = mesh.vertices[mesh.faces[rows]]
@@ -106,50 +100,71 @@ def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     return lengths.reshape(-1)
 
 
-def newton(
-    start: Float, field: SignedDistance, steps: int, limit: float, rough: SignedDistance | None = None
+def newton_project(
+    start: Float,
+    field: SignedDistance,
+    steps: int,
+    limit: float,
+    rough: SignedDistance | None = None,
+    *,
+    gradient_reuse_limits: float = 0.05,
 ) -> tuple[Float, Float, Float]:
-    """Points of shape (N, 3) after Newton steps no farther than `limit` from `start`, with value and gradient there.
+    """Move points of shape (N, 3) by Newton steps, and return them with the value and the gradient there.
 
-    The gradient is that of where a point came from if its step was short; with a rough field, see `project`, its own.
+    Points stay within `limit` of their start. After a step shorter than `gradient_reuse_limits`, in limits, the old
+    gradient is kept: a gradient costs as much as two or three values, and over a fiftieth of a cell, which most steps
+    are shorter than, it hardly changes. With a rough field, see `project`, gradients are that field's.
     """
     points = start.copy()
     value, gradient = sdf_and_gradient(rough or field, points)
     if rough is not None and steps:
         value = field.sdf(points)
     for _ in range(steps):
-        rows, trial = _steps(points, value, gradient, start, limit, field.bounds)
+        rows, trial = _newton_steps(points, value, gradient, start, limit, field.bounds)
         if not len(rows):
             break
         trial_value = field.sdf(trial)
+        # A step that does not reduce the field's magnitude is not taken: the linear model failed.
         better = np.abs(trial_value) < np.abs(value[rows])
         rows, trial, trial_value = rows[better], trial[better], trial_value[better]
-        far = np.linalg.norm(trial - points[rows], axis=1) > FAR * limit
-        # The slope along the step, as it turned out: where the gradient is kept the next step is a secant's.
+        far = np.linalg.norm(trial - points[rows], axis=1) > gradient_reuse_limits * limit
+        # Scaled to the slope observed along the step: where the gradient is kept, the next step is a secant step.
         gradient[rows] *= (1.0 - trial_value / value[rows])[:, None]
         points[rows], value[rows] = trial, trial_value
         gradient[rows[far]] = (rough or field).gradient(trial[far])
     return points, value, gradient
 
 
-def _steps(
-    points: Float, value: Float, gradient: Float, start: Float, limit: float, bounds: Float
+def _newton_steps(
+    points: Float,
+    value: Float,
+    gradient: Float,
+    start: Float,
+    limit: float,
+    bounds: Float,
+    *,
+    converged_limits: float = 1e-8,
 ) -> tuple[Int, Float]:
-    """Rows that may take a Newton step, of shape (S,), and where it leads them, of shape (S, 3)."""
+    """Rows that may take a Newton step, of shape (S,), and where it leads them, of shape (S, 3).
+
+    Points nearer to the zero level than `converged_limits`, in limits, take no further step.
+    """
     low, high = bounds
     slopes = np.linalg.norm(gradient, axis=1)
     # From one side of the limit to the other is twice the limit; where the field is flat there is no step.
-    rows = np.flatnonzero((np.abs(value) > CLOSE * limit * slopes) & (np.abs(value) <= 2 * limit * slopes))
+    open_rows = np.abs(value) > converged_limits * limit * slopes
+    rows = np.flatnonzero(open_rows & (np.abs(value) <= 2 * limit * slopes))
     trial = points[rows] - (value[rows] / slopes[rows])[:, None] * (gradient[rows] / slopes[rows][:, None])
     near = np.linalg.norm(trial - start[rows], axis=1) <= limit
+    # Outside its box a field is not defined by data.
     near &= ((trial >= low) & (trial <= high)).all(axis=1)
     return rows[near], trial[near]
 
 
-def _undo_turned(mesh: Mesh, moved: Float) -> Mask:
-    """Which vertices must stay, of shape (V,), so that no face turns over or collapses.
+def _vertices_to_restore(mesh: Mesh, moved: Float) -> Mask:
+    """Which vertices to restore, of shape (V,), so that no face turns over or collapses.
 
-    Every round returns at least one more vertex, and a face whose three vertices have stayed is as before, so it ends.
+    It ends, because each round restores at least one more vertex, and a face with three restored vertices is as before.
     """
     back = np.zeros(len(moved), dtype=bool)
     while True:
@@ -157,20 +172,23 @@ def _undo_turned(mesh: Mesh, moved: Float) -> Mask:
         again = np.zeros_like(back)
         for rows in slices(len(mesh.faces)):
             faces = mesh.faces[rows]
-            again[faces[_spoilt(area_vectors(mesh.vertices, faces), area_vectors(now, faces))]] = True
+            again[faces[_flipped_or_collapsed(area_vectors(mesh.vertices, faces), area_vectors(now, faces))]] = True
         if not (again & ~back).any():
             return back
         back |= again
 
 
-def _spoilt(old: Float, new: Float) -> Mask:
-    """Which faces, of shape (F,), have turned over or collapsed, by their old and new area vectors."""
+def _flipped_or_collapsed(old: Float, new: Float, *, least_cosine: float = 0.3, least_area_ratio: float = 1e-3) -> Mask:
+    """Which faces, of shape (F,), have turned over or collapsed, by their old and new area vectors.
+
+    They have where the normal's cosine to the old one is below `least_cosine`, or the area below a share of the old.
+    """
     along = np.einsum("ij,ij->i", old, new)
     before, after = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
-    return np.asarray((along < TURN * after * before) | (after < COLLAPSE * before))
+    return np.asarray((along < least_cosine * after * before) | (after < least_area_ratio * before))
 
 
-# What the exporter needs to know of a field: a signed distance with its gradient, in the file's coordinates.
+# What meshing needs of a field: a signed distance with its gradient, in the file's coordinates.
 
 
 class SignedDistance(Protocol):
@@ -198,7 +216,7 @@ class SignedDistance(Protocol):
 def sdf_and_gradient(field: SignedDistance, points: Float) -> tuple[Float, Float]:
     """Return the distance, of shape (N,), and its gradient, of shape (N, 3), at points, of shape (N, 3).
 
-    A field that can make both at once, by a method of this name, does: it costs about half.
+    A field with a method of this name computes both at once, at about half the cost.
     """
     both = getattr(field, "sdf_and_gradient", None)
     if both is None:
@@ -207,15 +225,15 @@ def sdf_and_gradient(field: SignedDistance, points: Float) -> tuple[Float, Float
     return value, gradient
 
 
-def knows_blocks(field: SignedDistance) -> bool:
-    """Return whether a field makes distances around centres faster than one by one, by a method ``sdf_around``."""
+def evaluates_blocks(field: SignedDistance) -> bool:
+    """Return whether a field has a method ``sdf_around``, which evaluates points around centres faster."""
     return hasattr(field, "sdf_around")
 
 
 def sdf_around(field: SignedDistance, centers: Float, offsets: Float) -> Float:
     """Return the distance, of shape (N, K), at K offsets, of shape (K, 3), from each of the centres, of shape (N, 3).
 
-    A field that knows blocks, see `knows_blocks`, is asked for them.
+    A field's own method is used, see `evaluates_blocks`.
     """
     around = getattr(field, "sdf_around", None)
     if around is None:
@@ -224,10 +242,10 @@ def sdf_around(field: SignedDistance, centers: Float, offsets: Float) -> Float:
     return values
 
 
-# Where a mesh of vertices on a surface is farthest from it: at the centres of its faces and the midpoints of edges.
+# A mesh with its vertices on a surface is farthest from it at the centres of faces and the midpoints of edges.
 
 
-def between(corners: Float) -> Float:
+def face_sample_points(corners: Float) -> Float:
     """Return the centres and then the sides' midpoints, of shape (4 F, 3), of faces given by corners of (F, 3, 3)."""
     midpoints = (corners + np.roll(corners, -1, axis=1)) / 2
     return np.concatenate([corners.mean(axis=1), midpoints.reshape(-1, 3)])

@@ -1,21 +1,30 @@
-"""Make a solid of a mesh that is not quite one.
+"""Repairs a mesh that is not quite a solid, and removes components that no scanned point supports.
 
-A sound mesh comes back as it is. For any other, attempts follow from the mildest to the strongest, and the first whose
-result is sound wins:
+A sound mesh is returned unchanged. For any other, three attempts follow, from the mildest to the strongest, and the
+first sound result is taken:
 
 1. collapsed, repeated and fin-like faces are dropped, vertices where several fans of faces touch are split, and an
-   inside-out mesh is turned round;
-2. manifold3d sews open edges whose ends coincide, and pairs up the faces on crowded edges;
+   inside-out mesh is reversed;
+2. manifold3d joins open edges whose ends coincide, and pairs up the faces on crowded edges;
 3. pymeshlab orients the faces coherently, cuts edges with more than two faces and closes small holes, and the first two
    are tried again.
+
+The entries are `repair` and `remove_stray`.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from gnrecon.export.boolean import from_meshlab, from_solid, refusal, to_meshlab, to_solid
+from gnrecon.export.boolean import (
+    from_meshlab,
+    from_solid,
+    manifold_error,
+    to_meshlab,
+    to_solid,
+    with_nearest_normals,
+)
+from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.mesh_statistics import Edges, corner_fans, face_components, split_vertices, submesh
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.verify import require_sound, verify
@@ -23,41 +32,37 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
-APART = 1e-3
-"""How far vertices at one place are moved apart, as a share of the way to the middle of their faces."""
-
-HOLE = 100
-"""Most edges of a hole that is closed; a larger one is missing surface, which no repair should invent."""
-
 
 def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
-    """Return a sound mesh and one sentence for each thing that was done to it (none if it was sound).
+    """Return a sound mesh and one sentence for each change (none if it was sound).
 
-    Normals are carried over from the nearest vertex of the given mesh.
+    Normals are those of the nearest vertex of the given mesh.
 
     Raises
     ------
     MeshError
-        When no attempt gives a sound mesh; the sentence names what is still wrong.
+        When no attempt gives a sound mesh; the message names the first remaining defect.
     """
-    failure = _failure(mesh)
+    failure = _soundness_error(mesh)
     if failure is None:
         return mesh, []
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
         raise MeshError(failure)
-    tidy, actions = _tidy(mesh)
-    result, sewing = _sewn(tidy)
+    tidy, actions = _clean_faces(mesh)
+    result, sewing = _sew(tidy)
     if result is None:
         patched, patching = _patch(tidy)
-        tidy, tidying = _tidy(patched)
-        result, sewing = _sewn(tidy)
+        tidy, tidying = _clean_faces(patched)
+        result, sewing = _sew(tidy)
         actions += patching + tidying
     if result is None:
-        raise MeshError(f"Repair was not enough: {str(_failure(tidy)).replace('The', 'the', 1)}")
-    return _with_normals_of(result, mesh), actions + sewing
+        raise MeshError(f"Repair was not enough: {str(_soundness_error(tidy)).replace('The', 'the', 1)}")
+    if mesh.normals is not None and result.normals is None:
+        result = with_nearest_normals(result, mesh)
+    return result, actions + sewing
 
 
-def _failure(mesh: Mesh) -> str | None:
+def _soundness_error(mesh: Mesh) -> str | None:
     """Why a mesh is not sound, or None."""
     try:
         require_sound(mesh)
@@ -66,12 +71,12 @@ def _failure(mesh: Mesh) -> str | None:
     return None
 
 
-def _tidy(mesh: Mesh) -> tuple[Mesh, list[str]]:
-    """Drop faces that bound nothing, split touching fans, turn an inside-out mesh round."""
+def _clean_faces(mesh: Mesh) -> tuple[Mesh, list[str]]:
+    """Drop faces that bound nothing, split touching fans, reverse an inside-out mesh."""
     actions = []
-    keep = _bounding(mesh)
+    keep = _useful_faces(mesh)
     if not keep.any():
-        raise MeshError("The mesh has no face that could bound anything.")
+        raise MeshError("The mesh has no face that could bound a solid.")
     if not keep.all():
         actions.append(f"Dropped {np.count_nonzero(~keep)} collapsed, repeated or fin-like faces.")
     tidy = submesh(mesh, keep)
@@ -82,13 +87,13 @@ def _tidy(mesh: Mesh) -> tuple[Mesh, list[str]]:
         tidy = _split_fans(tidy, edges)
     facts = verify(tidy)
     if facts.closed and facts.oriented and facts.volume < 0:
-        actions.append("Turned the faces round, because the mesh was inside out.")
+        actions.append("Reversed the faces, because the mesh was inside out.")
         tidy = Mesh(tidy.vertices, tidy.faces[:, ::-1], None if tidy.normals is None else -tidy.normals)
     return tidy, actions
 
 
-def _bounding(mesh: Mesh) -> Mask:
-    """Which faces, of shape (F,), are left without collapsed ones, repetitions and fins.
+def _useful_faces(mesh: Mesh) -> Mask:
+    """Which faces, of shape (F,), are neither collapsed nor repeated nor fins.
 
     A fin hangs on an edge that has two faces without it, and has an open edge itself.
     """
@@ -99,6 +104,7 @@ def _bounding(mesh: Mesh) -> Mask:
     repeated = np.ones(len(faces), dtype=bool)
     repeated[np.unique(lowest_first, axis=0, return_index=True)[1]] = False
     keep &= ~repeated
+    # Dropping a fin may turn its neighbours into fins.
     while True:
         rows = np.flatnonzero(keep)
         edges = Edges.of(Mesh(mesh.vertices, faces[rows]))
@@ -118,50 +124,57 @@ def _split_fans(mesh: Mesh, edges: Edges) -> Mesh:
     return Mesh(mesh.vertices[origin], faces.reshape(-1, 3), normals)
 
 
-def _set_apart(mesh: Mesh) -> Mesh:
-    """Move vertices that lie on one another a little into their own faces, so that no format joins them again."""
+def _separate_coincident(mesh: Mesh, *, share: float = ExportParameters.repair.separation_share) -> Mesh:
+    """Move coincident vertices a share of the way into their own faces, so that no file format joins them again."""
     _, place, count = np.unique(mesh.vertices, axis=0, return_inverse=True, return_counts=True)
     shared = count[place.reshape(-1)] > 1
     if not shared.any():
         return mesh
+    # Towards the mean of the middles of its own faces, so that vertices of touching parts move away from each other.
     middle = np.zeros_like(mesh.vertices)
     np.add.at(middle, mesh.faces.reshape(-1), np.repeat(mesh.corners.mean(axis=1), 3, axis=0))
     middle /= np.maximum(np.bincount(mesh.faces.reshape(-1), minlength=len(middle)), 1)[:, None]
     return mesh.with_vertices(
-        np.where(shared[:, None], mesh.vertices + APART * (middle - mesh.vertices), mesh.vertices)
+        np.where(shared[:, None], mesh.vertices + share * (middle - mesh.vertices), mesh.vertices)
     )
 
 
-def _sewn(mesh: Mesh) -> tuple[Mesh | None, list[str]]:
-    """A mesh as it is if it is sound, else with its edges sewn and paired by manifold3d; None where that fails too."""
-    apart = _set_apart(mesh)
-    if _failure(apart) is None:
-        return apart, []
+def _sew(mesh: Mesh) -> tuple[Mesh | None, list[str]]:
+    """The mesh if it is sound, else with its edges joined and paired by manifold3d; None where that fails too."""
+    separate = _separate_coincident(mesh)
+    if _soundness_error(separate) is None:
+        return separate, []
     solid = to_solid(mesh, merge=True)
-    if refusal(solid) is not None or solid.is_empty():
+    if manifold_error(solid) is not None or solid.is_empty():
         return None, []
-    sewn, tidying = _tidy(from_solid(solid, mesh))
-    sewn = _set_apart(sewn)
-    if _failure(sewn) is not None:
+    sewn, tidying = _clean_faces(from_solid(solid, mesh))
+    sewn = _separate_coincident(sewn)
+    if _soundness_error(sewn) is not None:
         return None, []
     change = f"{len(mesh.faces)} faces became {len(sewn.faces)}"
-    return sewn, [f"Sewed open and crowded edges with manifold3d; {change}.", *tidying]
+    return sewn, [f"Joined open and crowded edges with manifold3d: {change}.", *tidying]
 
 
-def _patch(mesh: Mesh) -> tuple[Mesh, list[str]]:
+def _patch(
+    mesh: Mesh,
+    *,
+    share: float = ExportParameters.repair.separation_share,
+    hole_edges: int = ExportParameters.repair.hole_edges,
+) -> tuple[Mesh, list[str]]:
     """Cut crowded edges, close small holes and orient the faces with pymeshlab."""
     import pymeshlab
 
     work = to_meshlab(mesh)
     work.meshing_remove_duplicate_vertices()
     work.meshing_remove_duplicate_faces()
+    # Splitting vertices keeps all faces; removing faces would open further holes.
     work.meshing_repair_non_manifold_edges(method="Split Vertices")
-    work.meshing_repair_non_manifold_vertices(vertdispratio=APART)
+    work.meshing_repair_non_manifold_vertices(vertdispratio=share)
     try:
         work.meshing_re_orient_faces_coherently()
-        work.meshing_close_holes(maxholesize=HOLE, selfintersection=False)
+        work.meshing_close_holes(maxholesize=hole_edges, selfintersection=False)
     except pymeshlab.PyMeshLabException as error:
-        raise MeshError(f"The mesh could not be repaired: pymeshlab says {error}.") from error
+        raise MeshError(f"pymeshlab could not repair the mesh ({error}).") from error
     patched = from_meshlab(work, mesh)
     before, after = verify(mesh), verify(patched)
     return patched, [
@@ -171,27 +184,10 @@ def _patch(mesh: Mesh) -> tuple[Mesh, list[str]]:
     ]
 
 
-def _with_normals_of(mesh: Mesh, source: Mesh) -> Mesh:
-    if source.normals is None or mesh.normals is not None:
-        return mesh
-    _, nearest = cKDTree(source.vertices).query(mesh.vertices)
-    normals = source.normals[nearest]
-    by_faces = Mesh(mesh.vertices, mesh.faces).vertex_normals()
-    # A mesh that was turned round, or a new patch, has sides that the old normals do not know.
-    agree = np.einsum("ij,ij->i", normals, by_faces) > 0
-    return Mesh(mesh.vertices, mesh.faces, np.where(agree[:, None], normals, by_faces))
-
-
-LEAST_VOTES, LEAST_SHARE = 3, 0.005
-
-
-# Parts of a mesh that no scanned point supports.
-#
 # Where a fitted field has no data it may cross zero by chance: ghost sheets in free space, and cavities within the
-# solid. Each input point votes for the component that its nearest face belongs to. A component with fewer votes than
-# three, or than half a percent of the points, is stray and dropped; the one with the most votes always stays. Of what
-# remains, components that lie within an even number of others are made outer shells (positive volume), those within an
-# odd number cavities (negative volume): dropping a shell may have changed which of the two a component is.
+# solid. Each input point votes for the component that its nearest face belongs to, and components with few votes are
+# dropped. Of what remains, components within an even number of others are made outer shells (positive volume), those
+# within an odd number cavities (negative volume), because dropping a shell may change which of the two a component is.
 
 
 def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
@@ -211,56 +207,65 @@ def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     Mesh
         The same mesh where nothing was dropped.
     list of str
-        A sentence with counts for what was done.
+        A sentence with counts for each change.
 
     Raises
     ------
     UsageError
         When there are no points.
     """
-    labels, stays, actions = _judged(mesh, points)
+    labels, stays, actions = _vote(mesh, points)
     if stays.all():
         return mesh, []
     parts = [submesh(mesh, labels == label) for label in np.flatnonzero(stays)]
-    oriented = [_oriented(part, [other for other in parts if other is not part]) for part in parts]
+    oriented = [_orient_component(part, [other for other in parts if other is not part]) for part in parts]
     turned = sum(new is not old for new, old in zip(oriented, parts, strict=True))
     if turned:
-        actions.append(f"Turned {turned} components round, because the shell around them was dropped.")
-    return _joined(oriented), actions
+        actions.append(f"Reversed {turned} components, because the shell around them was dropped.")
+    return _concatenate(oriented), actions
 
 
-def drop_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
-    """Drop the same components of a mesh that may have borders; those that stay keep their sides.
+def drop_stray_components(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
+    """Drop the same components of a mesh that may have borders; the others keep their orientation.
 
-    Parameters, what is returned and what is raised are those of `remove_stray`.
+    Parameters, return values and errors are those of `remove_stray`.
     """
-    labels, stays, actions = _judged(mesh, points)
+    labels, stays, actions = _vote(mesh, points)
     return (mesh, []) if stays.all() else (submesh(mesh, stays[labels]), actions)
 
 
-def _judged(mesh: Mesh, points: Float) -> tuple[Int, Mask, list[str]]:
-    """Return each face's component, which components stay, and a sentence about those that do not."""
+def _vote(
+    mesh: Mesh,
+    points: Float,
+    *,
+    least_points: int = ExportParameters.repair.stray_points,
+    least_share: float = ExportParameters.repair.stray_point_share,
+) -> tuple[Int, Mask, list[str]]:
+    """Return each face's component, which components stay, and a sentence about the others.
+
+    A component stays that is nearest to `least_points` points and to `least_share` of all; the largest always stays.
+    """
     if not len(points):
-        raise UsageError("There are no points to tell stray components by.")
+        raise UsageError("There are no points, so stray components cannot be found.")
     labels = face_components(mesh)
     count = int(labels.max(initial=-1)) + 1
     if count < 2:
         return labels, np.ones(count, dtype=bool), []
     votes = np.bincount(labels[nearest_on_surface(mesh, points)[1]], minlength=count)
-    least = max(LEAST_VOTES, LEAST_SHARE * len(points))
+    least = max(least_points, least_share * len(points))
     stays = votes >= least
     stays[votes.argmax()] = True
     dropped = np.count_nonzero(~stays)
-    said = (
-        f"Dropped {dropped} of {count} components, with {np.count_nonzero(~stays[labels])} of "
-        f"{len(labels)} faces, that fewer than {least:g} of the {len(points)} points lie nearest to "
+    sentence = (
+        f"Dropped {dropped} of {count} components, with {np.count_nonzero(~stays[labels])} of {len(labels)} faces: "
+        f"fewer than {least:g} of the {len(points)} points lie nearest to each "
         f"(at most {votes[~stays].max(initial=0)})."
     )
-    return labels, stays, [said] if dropped else []
+    return labels, stays, [sentence] if dropped else []
 
 
-def _oriented(part: Mesh, others: list[Mesh]) -> Mesh:
-    """Turn a component round where its volume's sign does not fit the number of others around it."""
+def _orient_component(part: Mesh, others: list[Mesh]) -> Mesh:
+    """Reverse a component where its volume's sign does not fit the number of others around it."""
     outer = sum(_encloses(other, part.vertices[0]) for other in others) % 2 == 0
     if (part.volume > 0) == outer:
         return part
@@ -268,7 +273,7 @@ def _oriented(part: Mesh, others: list[Mesh]) -> Mesh:
 
 
 def _encloses(shell: Mesh, point: Float) -> bool:
-    """Whether a closed shell, either way round, winds about a point of shape (3,)."""
+    """Whether the winding number of a closed shell, of either orientation, about a point of shape (3,) is not zero."""
     if (point < shell.vertices.min(axis=0)).any() or (point > shell.vertices.max(axis=0)).any():
         return False
     a, b, c = np.moveaxis(shell.corners - point, 1, 0)
@@ -284,7 +289,7 @@ def _encloses(shell: Mesh, point: Float) -> bool:
     return bool(abs(half.sum() / (2 * np.pi)) > 0.5)
 
 
-def _joined(parts: list[Mesh]) -> Mesh:
+def _concatenate(parts: list[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     normals = [part.normals for part in parts if part.normals is not None]

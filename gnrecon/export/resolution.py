@@ -1,10 +1,10 @@
-"""How fine to extract: the cells for edges of a wanted length, and how far a mesh's faces lie from its field.
+"""How fine to mesh: the cells for a given edge length, and the distance of a mesh's faces from its field.
 
 Vertices lie on the zero level, faces only near it. The chord error of a point on a face is |f| / |grad f| there, which
 is its distance from the zero level to first order. It is measured where it is greatest: at the centres of faces and the
-midpoints of edges. The figure given is the value that all but one in a thousand of these points stay below, because at
-single points, where a field folds, the first order says nothing. Near a smooth surface it falls with the square of the
-cell, which tells how fine the next attempt must be.
+midpoints of edges. The reported figure is the 99.9th percentile, because at single points, where a field folds, the
+first order means nothing. Near a smooth surface it falls with the square of the cell, from which the resolution of the
+next attempt follows.
 """
 
 from __future__ import annotations
@@ -15,30 +15,16 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gnrecon.export.project import SignedDistance, between, project, side_lengths
+from gnrecon.export.export_parameters import ExportParameters, ResolutionParameters
+from gnrecon.export.project import SignedDistance, face_sample_points, project, side_lengths
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
-MEAN_EDGE = 0.97
-"""Mean length of marching cubes' edges, in cells."""
-
-LEAST_CELLS, MOST_CELLS = 16, 4096
-"""Cells along the longest side that an edge length may ask for."""
-
-MOST_REFINED = 1024
-"""Cells along the longest side up to which a mesh is refined for its chord error."""
-
-QUANTILE = 0.999
-"""Share of the points whose chord error is below the figure that is given."""
-
-_FACES = 5_000
-_SPARE = 1.1
-
 
 @dataclass(frozen=True)
 class Fineness:
-    """How fine a mesh is.
+    """Resolution, edge length and chord error of a mesh.
 
     Parameters
     ----------
@@ -55,10 +41,10 @@ class Fineness:
     chord_error: float
 
     def describe(self) -> str:
-        """Say it in a sentence."""
+        """One sentence for the user."""
         return (
-            f"With {self.resolution} cells along the box, edges are {self.edge_length:.3g} units long on average, and "
-            f"99.9 % of face centres and edge midpoints lie within {self.chord_error:.3g} of the field's surface."
+            f"{self.resolution} cells along the box: the mean edge is {self.edge_length:.3g} units, and 99.9 % of the "
+            f"mesh lies within {self.chord_error:.3g} of the fitted surface."
         )
 
     def as_dict(self) -> dict[str, int | float]:
@@ -66,7 +52,9 @@ class Fineness:
         return asdict(self)
 
 
-def cells_for_edges(length: float, bounds: Float) -> int:
+def cells_for_edges(
+    length: float, bounds: Float, *, parameters: ResolutionParameters = ExportParameters.resolution
+) -> int:
     """Return the cells along the longest side of a box, of shape (2, 3), with which edges have a mean length.
 
     Raises
@@ -75,36 +63,51 @@ def cells_for_edges(length: float, bounds: Float) -> int:
         When that needs fewer than 16 or more than 4096 cells.
     """
     longest = float(np.ptp(bounds, axis=0).max())
-    cells = round(MEAN_EDGE * longest / length)
-    if LEAST_CELLS <= cells <= MOST_CELLS:
+    cells = round(parameters.mean_edge_cells * longest / length)
+    if parameters.least_cells <= cells <= parameters.most_cells:
         return cells
-    shortest, widest = (MEAN_EDGE * longest / count for count in (MOST_CELLS, LEAST_CELLS))
+    counts = (parameters.most_cells, parameters.least_cells)
+    shortest, widest = (parameters.mean_edge_cells * longest / count for count in counts)
     raise UsageError(
-        f"Edges of length {length:g} would need {cells} cells along the {longest:.4g} units of the box, but only "
-        f"{LEAST_CELLS} to {MOST_CELLS} are possible, which is a length from {_rounded(shortest, math.ceil)} to "
+        f"Edges of length {length:g} would need {cells} cells along the box, but {parameters.least_cells} to "
+        f"{parameters.most_cells} are possible. Choose a length from {_rounded(shortest, math.ceil)} to "
         f"{_rounded(widest, math.floor)}."
     )
 
 
 def _rounded(number: float, towards: Callable[[float], int]) -> str:
-    """Three digits of a positive number, so rounded that the result is a possible length too."""
+    """Three digits of a positive number, rounded inward so that the result is a possible length too."""
     digit = 10.0 ** (math.floor(math.log10(number)) - 2)
     return f"{towards(number / digit) * digit:.3g}"
 
 
-def measure_fineness(mesh: Mesh, field: SignedDistance, resolution: int, bounds: Float) -> Fineness:
-    """Return how fine a projected mesh, extracted with `resolution` from `bounds`, of shape (2, 3), is."""
+def measure_fineness(
+    mesh: Mesh,
+    field: SignedDistance,
+    resolution: int,
+    bounds: Float,
+    *,
+    parameters: ResolutionParameters = ExportParameters.resolution,
+) -> Fineness:
+    """Return how fine a projected mesh is that was extracted with `resolution` from `bounds`, of shape (2, 3)."""
     cell = float(np.ptp(bounds, axis=0).max()) / resolution
     edge = float(side_lengths(mesh).mean(dtype=np.float64))
-    return Fineness(resolution, edge, chord_error(mesh, field, bounds, cell))
+    return Fineness(resolution, edge, chord_error(mesh, field, bounds, cell, parameters=parameters))
 
 
-def chord_error(mesh: Mesh, field: SignedDistance, bounds: Float, cell: float) -> float:
+def chord_error(
+    mesh: Mesh,
+    field: SignedDistance,
+    bounds: Float,
+    cell: float,
+    *,
+    parameters: ResolutionParameters = ExportParameters.resolution,
+) -> float:
     """Return the distance from the zero level, in file units, below which 99.9 % of a mesh's points lie.
 
     The points are the centres and edge midpoints of at most 5,000 faces, spread evenly over the list of faces. Faces
-    at the border of the box do not count, because what closes the surface there does not belong to the zero level; the
-    error is 0 where there are no others.
+    at the border of the box do not count, because the caps there are not part of the zero level; the error is 0 where
+    there are no others.
 
     Parameters
     ----------
@@ -113,32 +116,46 @@ def chord_error(mesh: Mesh, field: SignedDistance, bounds: Float, cell: float) -
     bounds : array of shape (2, 3), file units
         The box in which the mesh was extracted.
     cell : float, file units
+    parameters : ResolutionParameters
     """
-    corners = mesh.vertices[_some(mesh.faces)]
+    corners = mesh.vertices[_sampled_faces(mesh.faces, parameters.error_faces)]
     inner = ((corners > bounds[0] + cell) & (corners < bounds[1] - cell)).all(axis=(1, 2))
     corners = corners[inner]
     if not len(corners):
         return 0.0
-    points = between(corners)
+    # First order: |f| / |grad f|. A vanishing gradient gives a large error, which is right: nothing is known there.
+    points = face_sample_points(corners)
     slopes = np.linalg.norm(field.gradient(points), axis=1)
     distances = np.abs(field.sdf(points)) / np.maximum(slopes, np.finfo(np.float64).tiny)
-    return float(np.quantile(distances, QUANTILE, method="higher"))
+    return float(np.quantile(distances, parameters.error_quantile, method="higher"))
 
 
-def error_once_projected(mesh: Mesh, field: SignedDistance, resolution: int, bounds: Float) -> float:
-    """Return what the chord error will be once the mesh is projected, projecting only the faces that are looked at."""
-    used, inverse = np.unique(_some(mesh.faces), return_inverse=True)
-    part = Mesh(mesh.vertices[used], inverse.reshape(-1, 3))
-    return measure_fineness(project(part, field, steps=2), field, resolution, bounds).chord_error
+def projected_chord_error(
+    mesh: Mesh,
+    field: SignedDistance,
+    resolution: int,
+    bounds: Float,
+    *,
+    parameters: ResolutionParameters = ExportParameters.resolution,
+) -> float:
+    """Return the chord error that the mesh will have once it is projected; only the sampled faces are projected."""
+    used, inverse = np.unique(_sampled_faces(mesh.faces, parameters.error_faces), return_inverse=True)
+    # Two steps, as for the whole mesh.
+    part = project(Mesh(mesh.vertices[used], inverse.reshape(-1, 3)), field, steps=2)
+    return measure_fineness(part, field, resolution, bounds, parameters=parameters).chord_error
 
 
-def _some(faces: Int) -> Int:
-    """At most so many faces as are looked at, spread evenly over the list."""
-    return faces[:: max(1, -(-len(faces) // _FACES))]
+def _sampled_faces(faces: Int, most: int) -> Int:
+    """At most so many faces, spread evenly over the list."""
+    return faces[:: max(1, -(-len(faces) // most))]
 
 
-def finer(resolution: int, error: float, wanted: float) -> int:
-    """Return the resolution at which a chord error is expected to be below the one that is wanted."""
-    factor = _SPARE * math.sqrt(error / wanted)
-    # The square law holds once the cells are small beside the features: far leaps are not to be trusted.
+def refined_resolution(resolution: int, error: float, wanted: float, *, spare: float = 1.1) -> int:
+    """Return the resolution at which a chord error is expected to be below the one that is wanted.
+
+    `spare` times more cells than the square law asks for keep a third attempt from being needed. That law holds once
+    cells are small compared with the features, so that the factor is kept from 1.2 to 3.
+    """
+    # The chord error falls with the square of the cell.
+    factor = spare * math.sqrt(error / wanted)
     return math.ceil(resolution * min(max(factor, 1.2), 3.0))

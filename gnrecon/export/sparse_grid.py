@@ -2,48 +2,42 @@
 
 A function whose slope is at most L has no zero in a block of half diagonal d around c when |f(c)| > L d. The coarse
 blocks divide the box into some 50 to 100 along its longest side, whatever the resolution is; those that may hold a
-zero are halved until they are leaves. L is measured close by: the length of the gradient at the centre, and by how much
-the gradients of the neighbouring centres say that it varies up to the corners, with a quarter more. A place where the
-field is steep or bends costs evaluations there, then, and not everywhere. All other blocks keep nothing but the sign of
-their centre, and what a field still hides between the centres is found by propagation, see `band`.
+zero are halved until they are leaves. L is estimated locally: the length of the gradient at the centre, plus its change
+up to the corners by the gradients at neighbouring centres, times 1.25. So where the field is steep or bends, it costs
+more evaluations there only. All other blocks keep only the sign of their centre, and what a field still hides between
+the centres is found by propagation, see `NarrowBand`.
 
-Where the data is known, only coarse blocks near it are searched; what lies farther off is found by propagation, which
-follows the surface from there: sheets in free space, where a field is steep, cost little then.
+Where the data is known, only coarse blocks near it are searched. What lies farther off is found by propagation, which
+follows the surface from there, so that sheets in free space, where a field is steep, cost little. The entry is
+`narrow_band`.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from gnrecon.export.export_parameters import ExtractionParameters
 from gnrecon.export.lattice import Lattice
-from gnrecon.export.leaf_storage import CHUNK, FIRST, INSIDE, LEAF, OUTSIDE, SIDE, Leaves, Values
+from gnrecon.export.leaf_storage import LeafStore, UniformRow, Values
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
-MOST_BLOCKS = 96
-"""Most coarse blocks along the longest side."""
 
-MARGIN = 1.25
-"""Bound on the slope, as a multiple of what was measured."""
-
-REACH = 2.0
-"""How far beyond a data point the surface is searched, in cells."""
-
-BATCH = 4096
-"""Blocks that are split at once: memory does not grow with the resolution then."""
-
-_SAMPLES = 2048
-
-_CHILDREN = np.stack(np.meshgrid(*3 * [np.arange(2)], indexing="ij"), axis=-1).reshape(-1, 3)
+@functools.cache
+def cube_nodes(side: int) -> Int:
+    """Node offsets of a cube of so many nodes a side, of shape (side^3, 3), ordered along the axes; read only."""
+    return np.stack(np.meshgrid(*3 * [np.arange(side)], indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
-class Blocks:
+class CellBlocks:
     """Cubes of `size` cells a side.
 
     Parameters
@@ -66,30 +60,30 @@ class Blocks:
         """In cells."""
         return float(self.size * np.sqrt(3) / 2)
 
-    def may_vanish(self, values: Float, slopes: Float | float) -> Mask:
-        """Which may hold a zero, of shape (N,), from values at the centres, in cells, and measured slopes."""
+    def may_vanish(self, values: Float, slope_bounds: Float | float) -> Mask:
+        """Which may hold a zero, of shape (N,), from values at the centres, in cells, and bounds on the slope."""
         # The closing of the field at its box has slope one.
-        return np.asarray(np.abs(values) <= np.maximum(MARGIN * slopes, 1.0) * self.half_diagonal)
+        return np.asarray(np.abs(values) <= np.maximum(slope_bounds, 1.0) * self.half_diagonal)
 
     def within(self, lattice: Lattice) -> Mask:
         """Which have a node of the lattice, of shape (N,)."""
         return np.asarray((self.places * self.size <= lattice.cells).all(axis=1))
 
-    def split(self) -> Blocks:
+    def split(self) -> CellBlocks:
         """The eight children of each, one parent's after the other's."""
-        return Blocks(self.size // 2, (self.places[:, None] * 2 + _CHILDREN).reshape(-1, 3))
+        return CellBlocks(self.size // 2, (self.places[:, None] * 2 + cube_nodes(2)).reshape(-1, 3))
 
-    def __getitem__(self, rows: slice | Mask) -> Blocks:
-        return Blocks(self.size, self.places[rows])
+    def __getitem__(self, rows: slice | Mask) -> CellBlocks:
+        return CellBlocks(self.size, self.places[rows])
 
 
 @dataclass(frozen=True)
-class Coarse:
+class CoarseGrid:
     """The coarse blocks of a whole box.
 
     Parameters
     ----------
-    blocks : Blocks
+    blocks : CellBlocks
         In the order of a grid of shape `grid`.
     grid : tuple of three int
     values : array of shape (N,)
@@ -100,14 +94,14 @@ class Coarse:
         The median of the gradient's length where the surface may pass.
     """
 
-    blocks: Blocks
+    blocks: CellBlocks
     grid: tuple[int, ...]
     values: Float
     steepest: float
     typical: float
 
     @classmethod
-    def of(cls, lattice: Lattice) -> Coarse:
+    def of(cls, lattice: Lattice, parameters: ExtractionParameters) -> CoarseGrid:
         """Evaluate the field at the centres of coarse blocks, and its gradient at some of them.
 
         Raises
@@ -115,70 +109,74 @@ class Coarse:
         MeshError
             When the field is not finite somewhere.
         """
-        size = LEAF
-        while lattice.cells.max() > MOST_BLOCKS * size:
+        size = parameters.leaf_cells
+        while lattice.cells.max() > parameters.coarse_blocks * size:
             size *= 2
         grid = lattice.cells // size + 1
         places = np.stack(np.meshgrid(*map(np.arange, grid), indexing="ij"), axis=-1).reshape(-1, 3)
-        blocks = Blocks(size, places)
+        blocks = CellBlocks(size, places)
         values = lattice.values(blocks.centers, 1.0)
-        nearest = np.argsort(np.abs(values), kind="stable")[:_SAMPLES]
-        spread = np.arange(0, len(values), -(-len(values) // _SAMPLES))
+        nearest = np.argsort(np.abs(values), kind="stable")[: parameters.slope_samples]
+        spread = np.arange(0, len(values), -(-len(values) // parameters.slope_samples))
         samples = np.union1d(nearest, spread)
         slopes = np.linalg.norm(lattice.gradients(blocks.centers[samples]), axis=1)
         crossed = np.abs(values[samples]) <= slopes * blocks.half_diagonal
         typical = float(np.median(slopes[crossed] if crossed.any() else slopes))
-        return cls(blocks, tuple(grid), values, float(np.percentile(slopes, 99.5)), typical)
+        steepest = float(np.percentile(slopes, parameters.slope_percentile))
+        return cls(blocks, tuple(grid), values, steepest, typical)
 
 
-def search(lattice: Lattice, coarse: Coarse, leaves: Leaves, data: Float | None) -> Iterator[tuple[float, Int]]:
+def candidate_leaves(
+    lattice: Lattice, coarse: CoarseGrid, leaves: LeafStore, data: Float | None, parameters: ExtractionParameters
+) -> Iterator[tuple[float, Int]]:
     """Yield the leaves, of shape (N, 3), that may hold a zero, by parts, each with the share of the work done after it.
 
     Parameters
     ----------
     lattice : Lattice
-    coarse : Coarse
+    coarse : CoarseGrid
         Of the same lattice.
-    leaves : Leaves
+    leaves : LeafStore
         Receives the blocks without a zero whose centres are inside.
     data : array of shape (N, 3), lattice coordinates, optional
         Points near which the surface is searched; everywhere when None.
+    parameters : ExtractionParameters
 
     Raises
     ------
     MeshError
         When the field is not finite somewhere.
     """
-    blocks, values = coarse.blocks, coarse.values
-    kept = blocks.may_vanish(values, coarse.steepest)
+    blocks, values, margin = coarse.blocks, coarse.values, parameters.slope_margin
+    kept = blocks.may_vanish(values, margin * coarse.steepest)
     if data is not None:
-        kept[kept] = _near(data, blocks[kept], lattice)
+        kept[kept] = _near_data(data, blocks[kept], lattice, parameters.data_reach_cells)
     slopes = _slopes(lattice, blocks, kept, (1, *coarse.grid))
-    kept &= blocks.may_vanish(values, slopes)
+    kept &= blocks.may_vanish(values, margin * slopes)
     leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
     blocks, slopes = blocks[kept], slopes[kept]
-    for rows in slices(len(slopes), BATCH):
-        yield rows.stop / len(slopes), _descend(lattice, leaves, blocks[rows], slopes[rows])
+    for rows in slices(len(slopes), parameters.batch_blocks):
+        yield rows.stop / len(slopes), _subdivide(lattice, leaves, blocks[rows], slopes[rows], margin)
 
 
-def _descend(lattice: Lattice, leaves: Leaves, blocks: Blocks, slopes: Float) -> Int:
-    """Leaves within the given blocks, in which slopes of shape (N,) were measured."""
-    while blocks.size > LEAF:
+def _subdivide(lattice: Lattice, leaves: LeafStore, blocks: CellBlocks, slopes: Float, margin: float) -> Int:
+    """Leaves within the given blocks, in which slopes of shape (N,) were measured; bounds are `margin` times these."""
+    while blocks.size > leaves.leaf_cells:
         blocks = blocks.split()
         values = lattice.values(blocks.centers, 1.0)
-        kept = blocks.may_vanish(values, slopes.repeat(8)) & blocks.within(lattice)
-        if blocks.size > LEAF:
+        kept = blocks.may_vanish(values, margin * slopes.repeat(8)) & blocks.within(lattice)
+        if blocks.size > leaves.leaf_cells:
             slopes = _slopes(lattice, blocks, kept, (-1, 2, 2, 2))
-            kept &= blocks.may_vanish(values, slopes)
+            kept &= blocks.may_vanish(values, margin * slopes)
             slopes = slopes[kept]
         else:
-            kept &= np.abs(values) <= MARGIN * _variation(values)
+            kept &= np.abs(values) <= margin * _corner_variation(values)
         leaves.mark_inside(blocks.places[~kept & (values < 0)], blocks.size)
         blocks = blocks[kept]
     return blocks.places
 
 
-def _slopes(lattice: Lattice, blocks: Blocks, chosen: Mask, shape: tuple[int, ...]) -> Float:
+def _slopes(lattice: Lattice, blocks: CellBlocks, chosen: Mask, shape: tuple[int, ...]) -> Float:
     """Greatest slopes in the chosen blocks, of shape (N,), by the gradients at their centres and at neighbouring ones.
 
     `shape` arranges the blocks as grids of neighbours, of shape (G, A, B, C). From a centre to a corner the gradient
@@ -196,7 +194,7 @@ def _slopes(lattice: Lattice, blocks: Blocks, chosen: Mask, shape: tuple[int, ..
     return np.asarray(np.nan_to_num(slopes).reshape(-1), dtype=np.float64)
 
 
-def _variation(values: Float) -> Float:
+def _corner_variation(values: Float) -> Float:
     """By how much the field varies from the centre of a block to its corners, from the centres of eight siblings.
 
     Along each axis that is half of the greatest difference between siblings, whose centres lie a block's length apart.
@@ -206,40 +204,24 @@ def _variation(values: Float) -> Float:
     return np.asarray(0.5 * steps).repeat(8)
 
 
-def _near(data: Float, blocks: Blocks, lattice: Lattice) -> Mask:
-    """Which blocks, of shape (N,), have data within their reach, or lie at the border of the box."""
-    from scipy.spatial import cKDTree
-
+def _near_data(data: Float, blocks: CellBlocks, lattice: Lattice, reach: float) -> Mask:
+    """Which blocks, of shape (N,), have data within so many cells, or lie at the border of the box."""
     # A block at the border also holds nodes beyond it, which are outside whatever its centre is.
     outer = ((blocks.places == 0) | ((blocks.places + 1) * blocks.size >= lattice.cells)).any(axis=1)
-    distance = cKDTree(data).query(blocks.centers, distance_upper_bound=blocks.half_diagonal + REACH)[0]
+    distance = cKDTree(data).query(blocks.centers, distance_upper_bound=blocks.half_diagonal + reach)[0]
     return np.asarray(outer | np.isfinite(distance))
-
-
-NUDGE = 1e-4
-"""Least magnitude of a node's value, in cells over the slope: no vertex falls on a node and makes faces degenerate."""
-
-LIMIT = 8.0
-"""Greatest magnitude, likewise; together they keep crossings clear of nodes in scikit-image's float32."""
-
-_NODES = np.stack(np.meshgrid(*3 * [np.arange(LEAF)], indexing="ij"), axis=-1).reshape(-1, 3)
-
-_CORNERS = tuple(itertools.product((0, 1), repeat=3))
-
-LOCATED = 0.1
-"""About which share of the time has passed when the leaves to evaluate are known."""
 
 
 # The narrow band: only the lattice nodes near the zero level are evaluated.
 #
-# `search` names the leaves through which the zero level may pass; those are evaluated node by node, all others have but
-# a sign. What the search misses is found by propagation: as long as a cell with a sign change has a corner that was not
-# evaluated, the leaves of its corners are. Every node thus has exactly one sign, evaluated or not, and marching cubes
-# over all of them cannot leave a hole. Memory grows with the surface: about 6 nodes for each vertex.
+# `candidate_leaves` yields the leaves through which the zero level may pass. They are evaluated node by node; all the
+# others have only a sign. What that search misses is found by propagation: while a cell with a sign change has a corner
+# that was not evaluated, the leaves of its corners are. So every node has exactly one sign, evaluated or not, and
+# marching cubes over all of them cannot leave a hole. Memory grows with the surface: about 6 nodes for each vertex.
 
 
 @dataclass(frozen=True)
-class Band:
+class NarrowBand:
     """Node values around the zero level, in cells divided by the typical slope.
 
     Parameters
@@ -247,47 +229,65 @@ class Band:
     lattice : Lattice
     slope : float
         Slope by which values are divided.
-    leaves : Leaves
+    leaves : LeafStore
+    parameters : ExtractionParameters
     """
 
     lattice: Lattice
     slope: float
-    leaves: Leaves
+    leaves: LeafStore
+    parameters: ExtractionParameters
+
+    @property
+    def nodes(self) -> Int:
+        """Offsets of the nodes of a leaf, of shape (K, 3)."""
+        return cube_nodes(self.parameters.leaf_cells)
 
     def values(self, leaves: Int) -> Values:
-        """The field at the nodes of leaves, of shape (N, 3): clear, of shape (N, K)."""
-        return self.clear(self.lattice.values_of_blocks(leaves * LEAF, _NODES, self.slope))
+        """The field at the nodes of leaves, of shape (N, 3): clamped, of shape (N, K)."""
+        corners = leaves * self.parameters.leaf_cells
+        return self.clamp(self.lattice.values_of_blocks(corners, self.nodes, self.slope))
 
-    def clear(self, values: Float) -> Values:
-        """Return values over the slope, of any shape, clear of zero and of bounded magnitude."""
-        clear = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
-        return np.clip(clear, -LIMIT, LIMIT).astype(np.float32)
+    def clamp(self, values: Float) -> Values:
+        """Return values over the slope, of any shape, kept away from zero and bounded in magnitude."""
+        least, greatest = self.parameters.least_node_cells, self.parameters.greatest_node_cells
+        away = np.where(np.abs(values) < least, np.where(values < 0, -least, least), values)
+        return np.clip(away, -greatest, greatest).astype(np.float32)
 
     def evaluate(self, leaves: Int, advance: ProgressCallback = ignore_progress) -> None:
-        """Ask the field for all nodes of the given leaves, of shape (N, 3), and keep them."""
-        for rows in slices(len(leaves), self.lattice.together(len(_NODES))):
+        """Evaluate the field at all nodes of the given leaves, of shape (N, 3), and store the values."""
+        side = self.parameters.leaf_cells
+        for rows in slices(len(leaves), self.lattice.blocks_per_batch(len(self.nodes))):
             advance(rows.start / len(leaves))
             some = leaves[rows]
-            self.leaves.keep(some, self.values(some).reshape(-1, LEAF, LEAF, LEAF))
+            self.leaves.store(some, self.values(some).reshape(-1, side, side, side))
 
-    def missing(self, chunk: Int) -> Int:
+    def unevaluated_leaves(self, chunk: Int) -> Int:
         """Leaves, of shape (N, 3), that hold an unevaluated corner of a cell with a sign change in this chunk."""
+        side, length = self.parameters.leaf_cells, self.parameters.chunk_cells
         rows = self.leaves.rows(chunk)
-        if (rows >= FIRST).all() or (rows == OUTSIDE).all() or (rows == INSIDE).all():
+        valued = self.leaves.has_values(rows)
+        if valued.all() or any((rows == uniform).all() for uniform in UniformRow):
             return np.empty((0, 3), dtype=np.int64)
         negative = self.leaves.nodes(rows) < 0
-        unknown = (rows < FIRST).repeat(LEAF, 0).repeat(LEAF, 1).repeat(LEAF, 2)
-        unknown = unknown[: CHUNK + 1, : CHUNK + 1, : CHUNK + 1]
-        corners = [tuple(slice(o, o + CHUNK) for o in corner) for corner in _CORNERS]
+        unknown = (~valued).repeat(side, 0).repeat(side, 1).repeat(side, 2)[: length + 1, : length + 1, : length + 1]
+        corners = [tuple(slice(o, o + length) for o in corner) for corner in itertools.product((0, 1), repeat=3)]
         crossed = np.logical_or.reduce([negative[c] for c in corners])
         crossed &= ~np.logical_and.reduce([negative[c] for c in corners])
         wanted = np.zeros_like(negative)
         for corner in corners:
             wanted[corner] |= crossed & unknown[corner]
-        return np.unique(np.argwhere(wanted) // LEAF, axis=0) + chunk * SIDE
+        return np.unique(np.argwhere(wanted) // side, axis=0) + chunk * self.leaves.chunk_leaves
 
 
-def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCallback = ignore_progress) -> Band:
+def narrow_band(
+    lattice: Lattice,
+    data: Float | None = None,
+    advance: ProgressCallback = ignore_progress,
+    *,
+    search_time_share: float = 0.1,
+    parameters: ExtractionParameters = ExtractionParameters(),
+) -> NarrowBand:
     """Evaluate the field where its zero level may pass.
 
     Parameters
@@ -296,34 +296,43 @@ def narrow_band(lattice: Lattice, data: Float | None = None, advance: ProgressCa
     data : array of shape (N, 3), lattice coordinates, optional
         Points near which the surface is searched; everywhere when None.
     advance : callable
-        Told of the share that is done after each batch of points.
+        Receives the share that is done after each batch of points.
+    search_time_share : float
+        About which share of the time the coarse grid takes, for `advance` only.
+    parameters : ExtractionParameters
 
     Raises
     ------
     MeshError
         When the field is not finite somewhere.
     """
-    coarse = Coarse.of(lattice)
-    advance(LOCATED)
+    coarse = CoarseGrid.of(lattice, parameters)
+    advance(search_time_share)
+    leaves = LeafStore(
+        -(-(lattice.cells + 1) // parameters.chunk_cells),
+        parameters.greatest_node_cells,
+        leaf_cells=parameters.leaf_cells,
+        chunk_cells=parameters.chunk_cells,
+    )
     # A field that is constant at all samples has no slope there; any positive number keeps the division defined.
-    band = Band(lattice, max(coarse.typical, 1e-6), Leaves(-(-(lattice.cells + 1) // CHUNK), LIMIT))
-    done = LOCATED
-    for share, leaves in search(lattice, coarse, band.leaves, data):
-        begin, done = done, LOCATED + (1.0 - LOCATED) * share
-        band.evaluate(leaves, subrange(advance, begin, done))
+    band = NarrowBand(lattice, max(coarse.typical, 1e-6), leaves, parameters)
+    done = search_time_share
+    for share, found in candidate_leaves(lattice, coarse, leaves, data, parameters):
+        begin, done = done, search_time_share + (1.0 - search_time_share) * share
+        band.evaluate(found, subrange(advance, begin, done))
     _propagate(band)
     return band
 
 
-def _propagate(band: Band) -> None:
+def _propagate(band: NarrowBand) -> None:
     """Evaluate further leaves until every corner of every cell with a sign change has its own value."""
     queue = band.leaves.mixed_chunks()
     while len(queue):
-        found = [band.missing(chunk) for chunk in queue]
+        found = [band.unevaluated_leaves(chunk) for chunk in queue]
         leaves = np.unique(np.concatenate(found), axis=0)
         if not len(leaves):
             return
         band.evaluate(leaves)
         # A new value also changes cells of the lower neighbours, whose upper corners it is.
-        touched = ((leaves[:, None] - np.array(_CORNERS)) // SIDE).reshape(-1, 3)
+        touched = ((leaves[:, None] - cube_nodes(2)) // band.leaves.chunk_leaves).reshape(-1, 3)
         queue = np.unique(touched[(touched >= 0).all(axis=1)], axis=0)

@@ -1,14 +1,14 @@
-"""Cut a surface off where no data supports it.
+"""Trims a surface where no data supports it, and clips one to a box; both leave it open there.
 
 Vertices farther than a reach D from every scanned point are cut away, and faces that the border crosses are cut along
 the line where the distance, interpolated linearly along edges, is D. The distance is smoothed over the surface first,
-over a third of D, because a line at a distance from single points is ragged. A crossing keeps a tenth of its edge away
-from both ends, so that no face becomes a sliver. Two kinds of small change are not made: a patch that would leave a
-hole of less than D^2 stays, because the points around it support it well enough; and a piece of less than 4 pi D^2, a
-disc of radius 2 D, that would be left over by itself goes too: the crumb around a few stray points.
+over a third of D, because a line at a distance from single points is ragged. A crossing stays a tenth of its edge away
+from both ends, so that no face becomes a sliver. Two kinds of small changes are not made: a hole of less than D^2 is
+not cut, because the points around it support it well enough; and a leftover piece of less than 4 pi D^2, a disc of
+radius 2 D, is removed too: it surrounds a few outliers.
 
 A closed, oriented 2-manifold cut in this way is an oriented 2-manifold with borders: every vertex that stays keeps all
-its faces, and every new one lies on an edge between two.
+its faces, and every new one lies on an edge between two. The entries are `trim`, `clip_to_box` and `unsupported_area`.
 """
 
 from __future__ import annotations
@@ -21,19 +21,11 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gnrecon.export.curvature import diffused, vertex_areas
+from gnrecon.export.curvature import diffuse, vertex_areas
+from gnrecon.export.export_parameters import ExportParameters, TrimParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
-
-CLEAR = 0.1
-"""How far a crossing stays from the ends of its edge, as a share of the edge."""
-
-WIDTH = 1 / 3
-"""Standard deviation of the smoothing, in reaches."""
-
-HOLE, CRUMB = 1.0, 4 * np.pi
-"""Areas, in squared reaches, below which a hole is not cut and a piece not kept."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +37,9 @@ class Trimming:
     distance : float
         The reach, in file units.
     area_share : float
-        Of the whole surface, that was cut off.
+        Share of the whole surface that was cut off.
     crumbs, filled : int
-        Small pieces that went too; small holes that were not cut.
+        Small leftover pieces that were removed; small holes that were not cut.
     """
 
     distance: float
@@ -62,17 +54,19 @@ class Trimming:
     def describe(self) -> list[str]:
         """Sentences for the user."""
         if not self.area_share:
-            return [f"Nothing was cut: no part of the surface lies farther than {self.distance:.6g} from every point."]
+            return [f"Nothing was cut off: all of the surface lies within {self.distance:.6g} of a point."]
         crumbs = f", with {self.crumbs} small leftover pieces" if self.crumbs else ""
-        filled = f" {self.filled} smaller gaps were left closed." if self.filled else ""
+        filled = f" {self.filled} small gaps were left closed." if self.filled else ""
         return [
-            f"Cut off {self.area_share:.1%} of the surface, farther than {self.distance:.6g} from every "
+            f"Cut off {self.area_share:.1%} of the surface: the parts farther than {self.distance:.6g} from every "
             f"point{crumbs}.{filled}",
-            "The mesh is open: an oriented edge-manifold with borders, which bounds no solid.",
+            "The mesh is open: an oriented edge-manifold with borders, not a solid.",
         ]
 
 
-def trim(mesh: Mesh, distances: Float, reach: float) -> tuple[Mesh, Trimming]:
+def trim(
+    mesh: Mesh, distances: Float, reach: float, *, parameters: TrimParameters | None = None
+) -> tuple[Mesh, Trimming]:
     """Cut off what is farther than `reach` from data; return the same mesh where nothing is.
 
     Parameters
@@ -83,31 +77,40 @@ def trim(mesh: Mesh, distances: Float, reach: float) -> tuple[Mesh, Trimming]:
         From each vertex to the nearest scanned point, in file units.
     reach : float
         Positive, in file units.
+    parameters : TrimParameters, optional
+        By default ``TrimParameters()``.
 
     Raises
     ------
     UsageError
         When nothing would be left.
     """
+    parameters = parameters or ExportParameters.trim
     areas = vertex_areas(mesh)
-    smooth = diffused(mesh, distances, WIDTH * reach)
-    near, filled = _without_small(mesh, smooth <= reach, areas, HOLE * reach**2, of=False)
-    near, crumbs = _without_small(mesh, near, areas, CRUMB * reach**2, of=True)
+    # Small holes first: a piece counts as small only with its own holes filled.
+    smooth = diffuse(mesh, distances, parameters.smoothing_reaches * reach)
+    least_hole, least_piece = (
+        share * reach**2 for share in (parameters.hole_squared_reaches, parameters.crumb_squared_reaches)
+    )
+    near, filled = _absorb_small_patches(mesh, smooth <= reach, areas, least_hole, of=False)
+    near, crumbs = _absorb_small_patches(mesh, near, areas, least_piece, of=True)
     if not near.any():
         raise UsageError(
-            f"Trimming at {reach:.6g} leaves nothing: the surface lies {distances.min():.6g} or more from every point."
+            f"Trimming at {reach:.6g} leaves nothing: every point is at least {distances.min():.6g} away. "
+            f"Choose a larger distance."
         )
     if near.all():
         return mesh, Trimming(reach, 0.0, 0, filled)
-    result = cut_along(mesh, near, smooth, reach)
+    result = cut_at_level(mesh, near, smooth, reach, clearance=parameters.edge_clearance)
     return result, Trimming(reach, 1 - result.area / mesh.area, crumbs, filled)
 
 
-def _without_small(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:
-    """Change sides of vertex patches on the side `of` with less than an area; whole components and the largest stay."""
+def _absorb_small_patches(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:
+    """Move vertex patches below an area from the side `of` to the other; whole components and the largest stay."""
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     same = near[start] == near[end]
     size = len(near)
+    # Patches are the components of the graph of edges that do not cross the border.
     links = coo_array((np.ones(same.sum(), dtype=np.int8), (start[same], end[same])), shape=(size, size))
     count, labels = connected_components(links, directed=False)
     area = np.bincount(labels, areas, minlength=count)
@@ -117,26 +120,39 @@ def _without_small(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool)
     side = np.zeros(count, dtype=bool)
     side[labels] = near == of
     small = side & bordered & (area < least)
+    # Something must be left: if every piece is small, the largest stays.
     if of and not (side & ~small).any() and small.any():
         small[np.flatnonzero(small)[area[small].argmax()]] = False
     return np.where(small[labels], not of, near), int(small.sum())
 
 
-def cut_along(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
-    """The part of a mesh around its near vertices, ending where the distance is the reach."""
+def cut_at_level(
+    mesh: Mesh,
+    near: Mask,
+    distances: Float,
+    reach: float,
+    *,
+    clearance: float = ExportParameters.trim.edge_clearance,
+) -> Mesh:
+    """The part of a mesh around its near vertices, ending where the distance is the reach.
+
+    Crossings stay a share `clearance` of their edge away from its ends.
+    """
     flags = near[mesh.faces]
     count = flags.sum(axis=1)
-    # The one corner that is alone on its side comes first.
+    # The one corner that differs from the two others comes first.
     single = np.flatnonzero((count == 1) | (count == 2))
     alone = np.where(count[single] == 1, flags[single].argmax(axis=1), flags[single].argmin(axis=1))
     a, b, c = np.take_along_axis(mesh.faces[single], (alone[:, None] + np.arange(3)) % 3, axis=1).T
+    # Each crossed edge gets one new vertex, which its two faces share.
     ends, which = np.unique(np.sort(np.stack([a, b, a, c], axis=1).reshape(-1, 2), axis=1), axis=0, return_inverse=True)
     low, high = ends.T
-    share = np.clip((reach - distances[low]) / (distances[high] - distances[low]), CLEAR, 1 - CLEAR)
-    full = _with_points_between(mesh, low, high, share)
+    share = np.clip((reach - distances[low]) / (distances[high] - distances[low]), clearance, 1 - clearance)
+    full = _with_edge_points(mesh, low, high, share)
     ab, ac = (len(near) + which.reshape(-1, 2)).T
     tip = count[single] == 1
     corners = full.vertices
+    # The quadrilateral that is left of a face with one far corner is cut along its shorter diagonal.
     shorter = np.linalg.norm(corners[ab] - corners[c], axis=1) < np.linalg.norm(corners[b] - corners[ac], axis=1)
     one, other = ~tip & shorter, ~tip & ~shorter
     pieces = [
@@ -147,21 +163,21 @@ def cut_along(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Mesh:
         np.stack([ab, b, ac], axis=1)[other],
         np.stack([b, c, ac], axis=1)[other],
     ]
-    return used(full, np.concatenate(pieces))
+    return extract_faces(full, np.concatenate(pieces))
 
 
-def _with_points_between(mesh: Mesh, low: Int, high: Int, share: Float) -> Mesh:
+def _with_edge_points(mesh: Mesh, low: Int, high: Int, share: Float) -> Mesh:
     """The mesh with further vertices, each at a share of the way between two."""
-    vertices = _between(mesh.vertices, low, high, share)
+    vertices = _interpolated_rows(mesh.vertices, low, high, share)
     normals = None
     if mesh.normals is not None:
-        normals = _between(mesh.normals, low, high, share)
+        normals = _interpolated_rows(mesh.normals, low, high, share)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    attributes = {name: _between(values, low, high, share) for name, values in mesh.attributes.items()}
+    attributes = {name: _interpolated_rows(values, low, high, share) for name, values in mesh.attributes.items()}
     return Mesh(vertices, mesh.faces, normals, attributes)
 
 
-def _between(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt.NDArray[Any]:
+def _interpolated_rows(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt.NDArray[Any]:
     """The values followed by those between two rows: interpolated numbers, and the nearer row of what is no number."""
     if values.dtype.kind == "f":
         weight = share.reshape(-1, *[1] * (values.ndim - 1))
@@ -171,7 +187,7 @@ def _between(values: npt.NDArray[Any], low: Int, high: Int, share: Float) -> npt
     return np.concatenate([values, mixed.astype(values.dtype)])
 
 
-def used(mesh: Mesh, faces: Int) -> Mesh:
+def extract_faces(mesh: Mesh, faces: Int) -> Mesh:
     """The given faces with the vertices that they use."""
     used, corners = np.unique(faces, return_inverse=True)
     normals = None if mesh.normals is None else mesh.normals[used]
@@ -179,19 +195,11 @@ def used(mesh: Mesh, faces: Int) -> Mesh:
     return Mesh(mesh.vertices[used], corners.reshape(-1, 3), normals, attributes)
 
 
-ON = 1e-9
-"""Distance, as a share of the box's diagonal, at which a vertex is on a side."""
-
-
-# Cut a mesh off at the sides of a box, and leave it open there.
-#
-# Faces that cross a side are cut along it, by linear interpolation along their edges; a crossing keeps a tenth of its
-# edge away from both ends, as in `trim`, so that no face becomes a sliver. Where the sides are planes of the lattice
-# that the mesh was extracted on, no face crosses them and the border lies in them exactly.
-
-
-def clip(mesh: Mesh, bounds: Float) -> Mesh:
+def clip_to_box(mesh: Mesh, bounds: Float, *, tolerance_diagonals: float = 1e-9) -> Mesh:
     """Return the part of an oriented 2-manifold within a box; it has no faces where nothing is inside.
+
+    Faces that cross a side are cut along it, by linear interpolation along their edges, as in `trim`. Where the sides
+    are planes of the lattice that the mesh was extracted on, no face crosses them and the border lies in them exactly.
 
     Parameters
     ----------
@@ -199,42 +207,31 @@ def clip(mesh: Mesh, bounds: Float) -> Mesh:
         Normals and attributes are interpolated at the cut.
     bounds : array of shape (2, 3)
         Lower and upper corner.
+    tolerance_diagonals : float, diagonals of the box
+        Distance at which a vertex counts as on a side: above rounding only.
     """
-    tolerance = ON * float(np.linalg.norm(bounds[1] - bounds[0]))
+    tolerance = tolerance_diagonals * float(np.linalg.norm(bounds[1] - bounds[0]))
     for axis in range(3):
         for side, sign in ((0, -1.0), (1, 1.0)):
             beyond = sign * (mesh.vertices[:, axis] - bounds[side, axis])
-            # A face that merely touches the side from beyond is none of the part, though its corners there are.
-            mesh = used(mesh, mesh.faces[(beyond[mesh.faces] < -tolerance).any(axis=1)])
+            # A face beyond that only touches the side is dropped, though its corners on the side count as near.
+            mesh = extract_faces(mesh, mesh.faces[(beyond[mesh.faces] < -tolerance).any(axis=1)])
             beyond = sign * (mesh.vertices[:, axis] - bounds[side, axis])
             near = beyond <= tolerance
             if not near.all():
-                mesh = cut_along(mesh, near, beyond, 0.0)
+                mesh = cut_at_level(mesh, near, beyond, 0.0)
     return mesh
 
 
-SPACINGS = 3.0
-
-NOTABLE = 0.03
-"""Share of the surface from which on a user is told."""
-
-
-# How much of a surface no data supports.
-#
-# A closed surface must go on where a scan has holes or ends; what lies there was invented. Surface counts as invented
-# where it is farther from every scanned point than three times their spacing. On points thrown evenly at random onto a
-# surface, less than one part in 10^12 of it is as far as that from all of them.
-
-
 @dataclass(frozen=True)
-class Invented:
-    """The part of a surface that no data supports.
+class UnsupportedArea:
+    """The part of a closed surface that no data supports: where a scan has holes or ends.
 
     Parameters
     ----------
     invented_area_share : float from 0 to 1
     invented_beyond : float, file units
-        Distance from the nearest point from which on surface counts as invented.
+        Distance from the nearest point beyond which surface counts as unsupported.
     """
 
     invented_area_share: float
@@ -244,18 +241,18 @@ class Invented:
         """Both by name, ready for JSON."""
         return asdict(self)
 
-    def describe(self) -> list[str]:
-        """A sentence for the user where the share is notable."""
-        if self.invented_area_share < NOTABLE:
+    def describe(self, *, notable_share: float = 0.03) -> list[str]:
+        """A sentence for the user from a notable share of the surface on."""
+        if self.invented_area_share < notable_share:
             return []
         return [
-            f"{self.invented_area_share:.1%} of the surface is invented: it lies farther than "
-            f"{self.invented_beyond:.6g}, three times the points' spacing, from every point; --trim 3s cuts it off."
+            f"{self.invented_area_share:.1%} of the surface is invented: it is farther than {self.invented_beyond:.6g} "
+            f"(three point spacings) from every point. Use --trim 3s to cut it off."
         ]
 
 
-def invented(mesh: Mesh, distances: Float, spacing: float) -> Invented:
-    """Return which share of a surface is invented.
+def unsupported_area(mesh: Mesh, distances: Float, spacing: float, *, reach_spacings: float = 3.0) -> UnsupportedArea:
+    """Return which share of a surface no data supports.
 
     Parameters
     ----------
@@ -264,8 +261,11 @@ def invented(mesh: Mesh, distances: Float, spacing: float) -> Invented:
         From each vertex to the nearest scanned point, in file units.
     spacing : float
         Of the points, in file units.
+    reach_spacings : float
+        Distance from the nearest point beyond which surface counts. Of points spread at random over a surface, less
+        than one part in 10^12 of it is three spacings away from all of them.
     """
-    beyond = SPACINGS * spacing
+    beyond = reach_spacings * spacing
     areas = np.linalg.norm(mesh.face_vectors, axis=1)
     far = distances[mesh.faces].mean(axis=1) > beyond
-    return Invented(float(areas[far].sum() / max(areas.sum(), np.finfo(np.float64).tiny)), beyond)
+    return UnsupportedArea(float(areas[far].sum() / max(areas.sum(), np.finfo(np.float64).tiny)), beyond)

@@ -1,7 +1,9 @@
-"""What a mesh is, in numbers, and whether it bounds a solid.
+"""Counts and sizes of a mesh, and whether it bounds a solid.
 
 A mesh is sound when it is not empty, every edge is shared by exactly two faces that walk it in opposite directions, the
-faces around each vertex form one fan, its total volume is positive, and manifold3d takes it as a solid.
+faces around each vertex form one fan, its total volume is positive, and manifold3d accepts it as a solid.
+`verify` counts, `require_sound` requires, and `examine` also lists what a sound mesh may have but some uses forbid:
+faces that intersect or repeat others or have no area, vertices that coincide or that no face uses.
 """
 
 from __future__ import annotations
@@ -11,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.export.boolean import refusal, to_meshlab, to_solid
+from gnrecon.export.boolean import manifold_error, to_meshlab, to_solid
 from gnrecon.export.mesh_statistics import Edges, face_components, split_vertices
+from gnrecon.geometry.arrays import Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError
 
@@ -61,21 +64,21 @@ class MeshFacts:
 
 
 def verify(mesh: Mesh) -> MeshFacts:
-    """Count what there is to know about a mesh; nothing is required of it."""
+    """Count and measure any mesh; nothing is required of it."""
     edges = Edges.of(mesh)
     pairs = edges.count == 2
     boundary, crowded = int((edges.count == 1).sum()), int((edges.count > 2).sum())
     turned = int((pairs & ~edges.balanced()).sum())
     split = len(split_vertices(mesh, edges))
-    faces = mesh.faces
-    degenerate = int(((faces == np.roll(faces, 1, axis=1)).any(axis=1)).sum())
-    vertices = len(np.unique(faces))
-    euler = vertices - len(edges.count) + len(faces)
+    degenerate = int(_names_twice(mesh).sum())
+    vertices = len(np.unique(mesh.faces))
+    euler = vertices - len(edges.count) + len(mesh.faces)
     components = int(face_components(mesh).max(initial=-1)) + 1
+    # For closed, oriented 2-manifolds, V - E + F = 2 (components - genus).
     closed, manifold, oriented = boundary == 0, crowded == split == degenerate == 0, turned == 0
     return MeshFacts(
         vertices=vertices,
-        faces=len(faces),
+        faces=len(mesh.faces),
         components=components,
         euler_characteristic=euler,
         genus=components - euler // 2 if closed and manifold and oriented else None,
@@ -98,12 +101,12 @@ def require_sound(mesh: Mesh) -> MeshFacts:
     Raises
     ------
     MeshError
-        Naming the first thing that is wrong.
+        Naming the first defect.
     """
     facts = _facts_of_finite(mesh)
     failed = failures(facts)
     if not failed:
-        error = refusal(to_solid(mesh, merge=False))
+        error = manifold_error(to_solid(mesh, merge=False))
         failed = [f"is refused by manifold3d ({error})"] if error else []
     if failed:
         raise MeshError(f"The mesh {failed[0]}.")
@@ -116,7 +119,7 @@ def require_bordered(mesh: Mesh) -> MeshFacts:
     Raises
     ------
     MeshError
-        Naming the first thing that is wrong.
+        Naming the first defect.
     """
     facts = _facts_of_finite(mesh)
     failed = failures(facts, bordered=True)
@@ -151,7 +154,7 @@ def _facts_of_finite(mesh: Mesh) -> MeshFacts:
 
 
 def failures(facts: MeshFacts, bordered: bool = False) -> list[str]:
-    """Say all that keeps a mesh from bounding a solid, or, where it may have borders, from being an edge-manifold.
+    """List what keeps a mesh from bounding a solid, or, where it may have borders, from being an edge-manifold.
 
     Each is the end of a sentence that begins with "The mesh".
     """
@@ -168,26 +171,15 @@ def failures(facts: MeshFacts, bordered: bool = False) -> list[str]:
     return [sentence for failed, sentence in sentences if failed]
 
 
-ROUNDING = 4 * np.finfo(np.float64).eps
-"""A face is flat when its height is not more than this share of the largest coordinate."""
-
-
-# A close look at any mesh: whether it bounds a solid, and all that is unusual about it; nothing is changed.
-#
-# What a closed, oriented 2-manifold must have is counted by `verify`. Beside it stands what does no harm to that but to
-# some uses: faces that pass through each other, lie on each other or have no area, vertices that lie on each other or
-# that no face uses.
-
-
 @dataclass(frozen=True)
 class Findings:
-    """What was found in a mesh.
+    """Defects and oddities of a mesh.
 
     Parameters
     ----------
     facts : MeshFacts
     failures : tuple of str
-        All that keeps it from bounding a solid, as ends of a sentence that begins with "The mesh"; empty if it does.
+        What keeps it from bounding a solid, as ends of a sentence that begins with "The mesh"; empty if it does.
     broken_vertices : int
         With coordinates that are not finite.
     unused_vertices : int
@@ -226,20 +218,21 @@ class Findings:
         values = self.as_dict()
         return [
             f"{name:24}{_shown(values[name]):>14}  {meaning}".rstrip()
-            for name, meaning in {"sound": _SOUND, **_FACTS, **_COUNTS}.items()
+            for name, meaning in {**_FACTS, **_COUNTS}.items()
         ]
 
 
 def examine(mesh: Mesh) -> Findings:
-    """Look at a mesh closely; nothing is required of it."""
+    """Find all defects of any mesh; nothing is changed."""
     broken = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    # Infinite and missing coordinates are a finding here, not an error.
     with np.errstate(invalid="ignore", over="ignore"):
         facts = verify(mesh)
         flat = _flat_faces(mesh)
     failed = failures(facts)
     if broken:
         failed = [f"has {broken} vertices that are not finite", *failed]
-    if not failed and (error := refusal(to_solid(mesh, merge=False))):
+    if not failed and (error := manifold_error(to_solid(mesh, merge=False))):
         failed = [f"is refused by manifold3d ({error})"]
     return Findings(
         facts=facts,
@@ -266,17 +259,19 @@ def self_intersecting_faces(mesh: Mesh) -> int:
     return int(work.current_mesh().selected_face_number())
 
 
-def _names_twice(mesh: Mesh) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _names_twice(mesh: Mesh) -> Mask:
     """Which faces name a vertex twice, of shape (F,)."""
     return np.asarray((mesh.faces == np.roll(mesh.faces, 1, axis=1)).any(axis=1))
 
 
-def _flat_faces(mesh: Mesh) -> int:
+def _flat_faces(mesh: Mesh, *, rounding: float = 4 * np.finfo(np.float64).eps) -> int:
+    """Count faces whose height is at most `rounding`, a few units in the last place, times the largest coordinate."""
     corners = mesh.corners
+    # Height times longest side is twice the area; `face_vectors` are as long as the area.
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
     heights = 2 * np.linalg.norm(mesh.face_vectors, axis=1)
     largest = np.abs(mesh.vertices).max(initial=0.0)
-    return int(((heights <= ROUNDING * largest * sides) & ~_names_twice(mesh)).sum())
+    return int(((heights <= rounding * largest * sides) & ~_names_twice(mesh)).sum())
 
 
 def _shown(value: object) -> str:
@@ -287,9 +282,8 @@ def _shown(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-_SOUND = "non-empty, closed, oriented 2-manifold around a positive volume"
-
 _FACTS = {
+    "sound": "non-empty, closed, oriented 2-manifold around a positive volume",
     "vertices": "that faces use",
     "faces": "",
     "components": "parts that share no vertex",

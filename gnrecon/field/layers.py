@@ -108,9 +108,6 @@ ACTIVATIONS = {one.name: one for one in (SINE, TANH, WAVELET)}
 """The activations by name."""
 
 
-# Where each layer's weights lie in the flat parameter vector.
-
-
 @dataclass(frozen=True)
 class Layout:
     """Layer sizes of a fully connected network, input and output included, e.g. ``(3, 32, 32, 1)``.
@@ -135,7 +132,7 @@ class Layout:
 
     @property
     def offsets(self) -> tuple[int, ...]:
-        """Where each layer begins in theta."""
+        """Index of the first parameter of each layer in theta."""
         starts = [0]
         for out, into in self.shapes[:-1]:
             starts.append(starts[-1] + out * (into + 1))

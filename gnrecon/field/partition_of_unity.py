@@ -332,6 +332,6 @@ class Detail:
 
 
 def _codes(keys: Int, extent: Int) -> Int:
-    """Return one number for each key, of shape (N, 3), of a lattice of so many cells along each axis."""
+    """Return one number for each key, of shape (N, 3), of a lattice with `extent` cells along each axis."""
     codes: Int = (keys[:, 0] * extent[1] + keys[:, 1]) * extent[2] + keys[:, 2]
     return codes

@@ -70,7 +70,7 @@ class Features:
         return self.local(x, center, length) @ self._affine
 
     def stencil(self, offsets: Float) -> Stencil:
-        """Return the stencil for offsets over the length, of shape (K, 3), see `gnrecon.field.random_features`."""
+        """Return the stencil for offsets over the length, of shape (K, 3), see `Stencil`."""
         return Stencil.of(self.frequencies, torch.as_tensor(offsets).to(self.frequencies))
 
     def sums(self, amplitudes: Tensor, x: Tensor, center: Tensor, length: float, order: int) -> list[Tensor]:
@@ -85,7 +85,7 @@ class Features:
         return [part / length**k for k, part in enumerate(sums)]
 
     def sums_of(self, local: Tensor, amplitudes: Tensor, order: int) -> list[Tensor]:
-        """Return what `sums` does, with derivatives along x / length.
+        """Return the result of `sums`, with derivatives with respect to x / length.
 
         Parameters
         ----------

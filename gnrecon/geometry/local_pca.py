@@ -1,4 +1,4 @@
-"""Principal component analysis of neighbourhoods of points: tangent planes, surface variation and local coordinates.
+"""Principal component analysis of neighbourhoods: tangent planes, surface variation, local coordinates.
 
 The tangent plane of a point is taken to be the plane that fits its k nearest neighbours best (Hoppe et al., *Surface
 Reconstruction from Unorganized Points*, 1992). With centroid c = (1/k) sum_i p_i, the sum of squared distances to the
@@ -74,3 +74,8 @@ def _scatter(groups: Float) -> Float:
     centred = groups - groups.mean(axis=1, keepdims=True)
     scatter: Float = np.einsum("gki,gkj->gij", centred, centred)
     return scatter
+
+
+def quadric_terms(u: Float, v: Float) -> Float:
+    """Return 1, u, v, u^2, u v, v^2 as the last axis: the terms of a quadric height over tangent coordinates."""
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)

@@ -1,16 +1,22 @@
-"""From a cloud as read to samples in the unit ball: cleaning, orientation, thinning."""
+"""Ingest: from a cloud as read to oriented samples in the unit ball."""
 
-from gnrecon.ingest.clean import clean, isolated_clusters, require_mode
+from gnrecon.ingest.clean import clean, require_mode
 from gnrecon.ingest.counts import IngestCounts
-from gnrecon.ingest.noise import Noise, estimate_noise, mean_spacing
+from gnrecon.ingest.double_walls import Layers, layers_of
+from gnrecon.ingest.ingest_parameters import IngestParameters
+from gnrecon.ingest.isolated_clusters import isolated_clusters
+from gnrecon.ingest.noise import Noise, estimate_noise
 from gnrecon.ingest.orientation import flip_if_inward, oriented_normals
 from gnrecon.ingest.outliers import find_outliers, parse_outliers
+from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.prepare import prepare
 from gnrecon.ingest.subsample import subsample
-from gnrecon.ingest.survey import Layers, Survey, UnitsGuess, guess_units, layers_of, survey
+from gnrecon.ingest.survey import Survey, survey
+from gnrecon.ingest.unit_guess import UnitsGuess, guess_units
 
 __all__ = [
     "IngestCounts",
+    "IngestParameters",
     "Layers",
     "Noise",
     "Survey",

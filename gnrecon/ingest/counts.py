@@ -1,4 +1,4 @@
-"""What ingest did to a cloud, in numbers and in sentences."""
+"""Numbers of points that ingest dropped and changed, and the remarks about them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ class IngestCounts:
     non_finite : dropped, because a coordinate was NaN or infinite
     zero_normals : dropped, because they had no direction although most others did
     duplicates : dropped, because another point has exactly the same position
-    repeated : dropped, because they are copies of others, of a scan that is there twice
-    outliers : dropped as scattered far off the surface
-    outliers_found : found so, but left alone because they are too many or because removal is off
-    clusters : dropped, because they lie together and off all others
-    clusters_found : found so, but left alone for the same reasons
-    held_out : kept from the fit, to check it
+    repeated : dropped, because they are copies of others, as where a scan is contained twice
+    outliers : dropped, because they are scattered far off the surface
+    outliers_found : outliers that were kept, because they are too many or because removal is off
+    clusters : dropped, because they are in isolated clusters
+    clusters_found : points in isolated clusters that were kept, for the same reasons
+    held_out : validation points, which the fit does not use
     moved : root mean square distance by which smoothing moved the points, in file units; None without smoothing
-    thinned : left out by subsampling
-    kept : what remains
-    normals : how they came about, such as ``"given"``, ``"given, flipped"`` or ``"estimated"``
-    confidence : share of the points that speak for the side of their normal, see `Orientation`; None where it was given
-    flipped : share of the given normals that were turned around
+    thinned : dropped by subsampling
+    kept : number of remaining points
+    normals : their origin, such as ``"given"``, ``"given, flipped"`` or ``"estimated"``
+    confidence : share of the points that confirm the sign of their normal, see `Orientation`; None for given signs
+    flipped : share of the given normals that were flipped
     """
 
     read: int
@@ -51,30 +51,29 @@ class IngestCounts:
         return asdict(self)
 
     def remarks(self) -> list[str]:
-        """Return one sentence for everything that was not taken as it came."""
+        """Return a sentence for each change."""
         dropped = {
-            "with a coordinate that is not finite": self.non_finite,
+            "with a non-finite coordinate": self.non_finite,
             "with a zero or non-finite normal": self.zero_normals,
-            "at the position of another": self.duplicates,
-            "that repeat another to within rounding, as of a scan that is there twice": self.repeated,
+            "that duplicate another": self.duplicates,
+            "that repeat another to within rounding": self.repeated,
             "scattered far off the surface": self.outliers,
             "in isolated clusters": self.clusters,
         }
         sentences = [f"Dropped {count} of {self.read} points {why}." for why, count in dropped.items() if count]
         if self.outliers_found:
-            sentences.append(f"Left {self.outliers_found} points alone that look like outliers.")
+            sentences.append(f"Kept {self.outliers_found} points that look like outliers.")
         if self.clusters_found:
-            sentences.append(f"Left {self.clusters_found} points alone that lie in isolated clusters.")
+            sentences.append(f"Kept {self.clusters_found} points in isolated clusters.")
         if self.moved is not None:
-            sentences.append(
-                f"Smoothed the points, which moved by {self.moved:.3g} file units in the root mean square."
-            )
+            sentences.append(f"Smoothed the points; they moved by {self.moved:.3g} file units (root mean square).")
         if self.normals != "given":
-            sentences.append(f"Normals: {self.normals}{self._told()}.")
+            sentences.append(f"Normals: {self.normals}{self._sign_remark()}.")
         return sentences
 
-    def _told(self) -> str:
-        turned = f"; {100 * self.flipped:.3g} % turned around" if 0 < self.flipped < 1 else ""
+    def _sign_remark(self) -> str:
+        """Return how the signs were found, to follow the origin of the normals."""
+        flipped = f"; {100 * self.flipped:.3g} % flipped" if 0 < self.flipped < 1 else ""
         if self.confidence is None:
-            return turned
-        return f"{turned}; {100 * self.confidence:.0f} % of the points confirm their side"
+            return flipped
+        return f"{flipped}; {100 * self.confidence:.0f} % of the points confirm their sign"

@@ -1,14 +1,14 @@
-"""Directions of normals, without their sign, from neighbourhoods that suit the scan at each point.
+"""Unoriented normals, from tangent planes of neighbourhoods whose size adapts to the noise.
 
-The direction at a point is the least principal axis of its neighbours (Hoppe et al. 1992). How many of them, the scan
-decides: noise of standard deviation s along the normal turns the plane of k neighbours within a radius r by about
-2 s / (r sqrt(k)), so that the fewest are taken with which this stays small (after Mitra and Nguyen, *Estimating Surface
-Normals in Noisy Point Cloud Data*, 2003). The noise is the spread about a quadric, so that curvature is not taken for
-it, and of the neighbours' the least but two counts, because an edge or a second sheet nearby is no noise.
+The normal is the last principal axis of the neighbours (`gnrecon.geometry.local_pca`). Noise of standard deviation s
+along the normal turns the plane of k neighbours within a radius r by about 2 s / (r sqrt(k)); the smallest k is used
+for which this angle is small (after Mitra and Nguyen, *Estimating Surface Normals in Noisy Point Cloud Data*, 2003).
+The noise is the spread about a quadric, so that curvature does not count as noise, and the third smallest value among
+the neighbours', because an edge or a second sheet nearby is not noise.
 
-A plane that straddles a sharp edge fits badly where one beside it fits well. Where a neighbour's plane holds the point,
-and fits its own neighbours far better than the point's own plane does, it is taken instead (after Kuwahara's filter of
-images).
+A plane across a sharp edge fits badly, while planes on either side fit well. Where the plane of a neighbour contains
+the point, and fits its own neighbours far better than the point's plane does, it replaces that plane (after Kuwahara's
+image filter).
 """
 
 from __future__ import annotations
@@ -17,85 +17,56 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.local_pca import principal_axes, tangent_coordinates
+from gnrecon.geometry.local_pca import principal_axes, quadric_terms, tangent_coordinates
+from gnrecon.ingest.ingest_parameters import NormalParameters
 from gnrecon.runtime.chunks import slices
 
-_NEIGHBOURS = (12, 24, 48)
 
-_FIRST, _MORE = 8, 16
-"""The first of these is at most an eighth of all points, the others a sixteenth: a plane must not span the shape."""
-
-_TURN = 0.06
-"""Radians that noise may turn a normal by before more neighbours are asked."""
-
-_QUADRIC, _AROUND = 6, 24
-
-_RANK = 2
-
-_NARROW = 10
-"""Neighbours of the planes that stand in beside an edge."""
-
-_FAR_BETTER = 10.0
-
-_OFF_PLANE = 4.0
-
-_CHUNK = 50_000
-
-_LEAST = np.finfo(np.float64).tiny
-
-
-# Directions of normals, without their sign, from neighbourhoods that suit the scan at each point.
-#
-# The direction at a point is the least principal axis of its neighbours (Hoppe et al. 1992). How many of them, the scan
-# decides: noise of standard deviation s along the normal turns the plane of k neighbours within a radius r by about 2 s
-# / (r sqrt(k)), so that the fewest are taken with which this stays small (after Mitra and Nguyen, *Estimating Surface
-# Normals in Noisy Point Cloud Data*, 2003). The noise is the spread about a quadric, so that curvature is not taken for
-# it, and of the neighbours' the least but two counts, because an edge or a second sheet nearby is no noise.
-#
-# A plane that straddles a sharp edge fits badly where one beside it fits well. Where a neighbour's plane holds the
-# point, and fits its own neighbours far better than the point's own plane does, it is taken instead (after Kuwahara's
-# filter of images).
-def unoriented_normals(points: Float) -> Float:
+def unoriented_normals(points: Float, *, parameters: NormalParameters = NormalParameters()) -> Float:
     """Return unit normals of either sign, of shape (N, 3).
 
     Parameters
     ----------
     points : array of shape (N, 3), distinct, centred, N > 3
+    parameters : tuning constants
     """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points)
-    around = min(_AROUND, len(points))
-    sizes = _sizes(len(points))
+    around = min(parameters.quadric_neighbours, len(points))
+    sizes = _sizes(len(points), parameters)
     distances = np.empty((len(points), around), np.float32)
     rows = np.empty((len(points), around), np.int32)
-    for chunk in slices(len(points), _CHUNK):
+    for chunk in slices(len(points), parameters.chunk_points):
         distances[chunk], rows[chunk] = tree.query(points[chunk], around)
-    noise = _noise(points, rows, distances)
-    found, left = np.empty_like(points), np.arange(len(points))
+    noise = _noise(points, rows, distances, parameters)
+    normals, left = np.empty_like(points), np.arange(len(points))
     for size in sizes:
         last = size == sizes[-1]
-        for asked in np.array_split(left, max(1, len(left) // _CHUNK)):
-            gaps, near = (distances[asked], rows[asked]) if size <= around else tree.query(points[asked], size)
-            turn = 2 * noise[asked] / np.maximum(gaps[:, size - 1] * np.sqrt(size), _LEAST)
-            suits = (turn < _TURN) | last
-            found[asked[suits]] = _planes(points, near[suits, :size])[1]
-            left = left[~np.isin(left, asked[suits], assume_unique=True)]
-    return _beside_edges(points, rows, found)
+        for some in np.array_split(left, max(1, len(left) // parameters.chunk_points)):
+            gaps, near = (distances[some], rows[some]) if size <= around else tree.query(points[some], size)
+            turn = 2 * noise[some] / np.maximum(gaps[:, size - 1] * np.sqrt(size), np.finfo(np.float64).tiny)
+            enough = (turn < parameters.most_turn_radians) | last
+            normals[some[enough]] = _planes(points, near[enough, :size])[1]
+            left = left[~np.isin(left, some[enough], assume_unique=True)]
+    return _across_edges(points, rows, normals, parameters)
 
 
-def tangent_planes(points: Float, neighbours: int) -> Float:
-    """Return unit normals of either sign, of shape (N, 3), each of the plane of as many neighbours."""
+def tangent_planes(points: Float, neighbours: int, *, parameters: NormalParameters = NormalParameters()) -> Float:
+    """Return unit normals of either sign, of shape (N, 3), of the planes of a fixed number of neighbours."""
     from scipy.spatial import cKDTree
 
-    tree, size = cKDTree(points), min(neighbours, max(4, len(points) // _FIRST))
-    chunks = slices(len(points), _CHUNK)
+    tree = cKDTree(points)
+    size = min(neighbours, max(4, len(points) // parameters.points_per_first_neighbour))
+    chunks = slices(len(points), parameters.chunk_points)
     return np.concatenate([_planes(points, tree.query(points[chunk], size)[1])[1] for chunk in chunks])
 
 
-def _sizes(count: int) -> list[int]:
-    first = min(_NEIGHBOURS[0], max(4, count // _FIRST))
-    return [first, *(size for size in _NEIGHBOURS[1:] if size <= count // _MORE)]
+def _sizes(count: int, parameters: NormalParameters) -> list[int]:
+    """Return the numbers of neighbours to try among `count` points."""
+    smallest, *larger = parameters.neighbours
+    first = min(smallest, max(4, count // parameters.points_per_first_neighbour))
+    return [first, *(size for size in larger if size <= count // parameters.points_per_more_neighbours)]
 
 
 def _planes(points: Float, rows: Int) -> tuple[Float, Float, Float]:
@@ -105,44 +76,46 @@ def _planes(points: Float, rows: Int) -> tuple[Float, Float, Float]:
     return groups.mean(axis=1), axes[:, :, 0], np.maximum(variances, 0.0)
 
 
-def _noise(points: Float, rows: Int, distances: npt.NDArray[np.float32]) -> Float:
+def _noise(points: Float, rows: Int, distances: npt.NDArray[np.float32], parameters: NormalParameters) -> Float:
     """Return the standard deviation along the normal, of shape (N,)."""
     own = np.empty(len(points))
-    for chunk in slices(len(points), _CHUNK):
+    for chunk in slices(len(points), parameters.chunk_points):
         own[chunk] = _off_quadric(points[rows[chunk]]) * distances[chunk, -1]
     least = np.empty(len(points))
-    rank = min(_RANK, rows.shape[1] - 1)
-    for chunk in slices(len(points), _CHUNK):
+    rank = min(parameters.noise_rank, rows.shape[1] - 1)
+    for chunk in slices(len(points), parameters.chunk_points):
         least[chunk] = np.partition(own[rows[chunk]], rank, axis=1)[:, rank]
     return least
 
 
 def _off_quadric(groups: Float) -> Float:
-    """Return how far groups, of shape (G, k, 3), spread about quadrics, of shape (G,), in units of their reach."""
+    """Return the deviation of groups, of shape (G, k, 3), from quadrics, of shape (G,), in units of their reach."""
     u, v, w = np.moveaxis(tangent_coordinates(groups), 2, 0)
-    columns = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
-    # A trace on the diagonal, because points on a line leave the quadric open.
-    product = np.einsum("gka,gkb->gab", columns, columns) + 1e-9 * np.eye(_QUADRIC)
+    columns = quadric_terms(u, v)
+    count = columns.shape[2]
+    # A small diagonal, because points on a line do not determine a quadric.
+    product = np.einsum("gka,gkb->gab", columns, columns) + 1e-9 * np.eye(count)
     factors = np.linalg.solve(product, np.einsum("gka,gk->ga", columns, w)[:, :, None])[:, :, 0]
     rest = w - np.einsum("gka,ga->gk", columns, factors)
-    free = max(groups.shape[1] - _QUADRIC, 1)
-    return np.asarray(np.sqrt((rest**2).sum(axis=1) / free))
+    freedom = max(groups.shape[1] - count, 1)
+    return np.asarray(np.sqrt((rest**2).sum(axis=1) / freedom))
 
 
-def _beside_edges(points: Float, rows: Int, found: Float) -> Float:
-    """Return the directions, those beside an edge replaced by a neighbour's that does not straddle it."""
-    near = rows[:, : min(_NARROW, rows.shape[1], max(4, len(points) // _FIRST))]
+def _across_edges(points: Float, rows: Int, found: Float, parameters: NormalParameters) -> Float:
+    """Return the normals, those of planes across a sharp edge replaced by a neighbour's on one side of it."""
+    most = max(4, len(points) // parameters.points_per_first_neighbour)
+    near = rows[:, : min(parameters.edge_neighbours, rows.shape[1], most)]
     centroids, normals, variances = (np.empty(shape) for shape in (points.shape, points.shape, points.shape))
-    for chunk in slices(len(points), _CHUNK):
+    for chunk in slices(len(points), parameters.chunk_points):
         centroids[chunk], normals[chunk], variances[chunk] = _planes(points, near[chunk])
-    flatness, across = variances[:, 0], np.maximum(variances[:, 1], _LEAST)
+    flatness, across = variances[:, 0], np.maximum(variances[:, 1], np.finfo(np.float64).tiny)
     result = found.copy()
-    for chunk in slices(len(points), _CHUNK):
-        beside = near[chunk]
-        off = np.einsum("gci,gci->gc", points[chunk, None] - centroids[beside], normals[beside])
-        score = (flatness[beside] + _OFF_PLANE * off**2) / across[beside]
+    for chunk in slices(len(points), parameters.chunk_points):
+        others = near[chunk]
+        off = np.einsum("gci,gci->gc", points[chunk, None] - centroids[others], normals[others])
+        score = (flatness[others] + parameters.off_plane_weight * off**2) / across[others]
         best = score.argmin(axis=1)
         each = np.arange(len(best))
-        better = flatness[chunk] / across[chunk] > _FAR_BETTER * score[each, best]
-        result[chunk][better] = normals[beside[each, best]][better]
+        better = flatness[chunk] / across[chunk] > parameters.edge_fit_ratio * score[each, best]
+        result[chunk][better] = normals[others[each, best]][better]
     return result

@@ -1,15 +1,15 @@
-"""Outward normals for clouds that come without, a check of those that come with some, and which of them are kept.
+"""Outward normals: estimates them where a cloud has none, checks and orients given ones.
 
-Directions come from neighbourhoods (`gnrecon.ingest.normals`); what is hard is their sign. Where the scanner's position
-is known, the line of sight decides (`orient_towards_scanner`). Otherwise there are two ways:
+Unoriented normals come from neighbourhoods (`gnrecon.ingest.normals`); the difficulty is their sign. Where the position
+of the scanner is known, the line of sight decides (`orient_towards_scanner`). Otherwise there are two ways:
 
-- *propagation* along a spanning tree (`propagate_orientation`): right for dense scans, open ones included, but its
-  overall sign is open, and thin walls and sparse regions mislead it;
-- *Gauss's theorem* solved for all normals at once (`gauss_normals`), and normals that agree with the winding number
-  that they make (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by
-  construction; used on up to a few thousand points, from which the others take their sign.
+- *propagation* along a spanning tree (`propagate_orientation`): right for dense scans, open ones included; the overall
+  sign stays undetermined, and it fails at thin walls and in sparse regions;
+- *Gauss's theorem* solved for all normals at once (`gauss_normals`), and normals that agree with their own winding
+  number (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by construction; used
+  on up to a few thousand points, from which the others take their sign.
 
-The winding number of the result (`winding_on_surface`) decides between them, and says how far it can be trusted.
+The winding number of the result (`winding_at_points`) decides between them and measures the confidence.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.ingest.ingest_parameters import IngestParameters
 from gnrecon.ingest.normals import tangent_planes, unoriented_normals
 from gnrecon.ingest.orientation_methods import (
     consistent_normals,
@@ -32,34 +33,20 @@ from gnrecon.ingest.orientation_methods import (
 )
 from gnrecon.runtime.errors import InputError, UsageError
 
-_OFF_PLANE_PENALTY = 2.0
-
-_LOCAL, _SMOOTH = 12, 24
-
-_GAUSS_POINTS, _CONSISTENT_POINTS = 2000, 4000
-
-_ORDERLY = 0.25  # disorder above which a closed surface's signs are doubtful in places, or the scan is open
-
-_CLEARLY_BETTER = 0.8  # ratio of disorders that the winding number's ways must reach against propagation
-
-_INWARD = -0.75  # half a sphere with inward normals has about -0.6, and may be the scan of a bowl
-
-ESTIMATED, UNCERTAIN, BY_SIGHT = "estimated", "estimated, orientation uncertain", "estimated, oriented by origins"
-
 
 @dataclass(frozen=True)
 class Orientation:
-    """Outward normals, and how they came about.
+    """Outward normals and their origin.
 
     Parameters
     ----------
     normals : array of shape (N, 3), of unit length
     how : such as ``"estimated"``; ``"estimated, orientation uncertain"`` where the winding number is far from that of a
         closed surface; ``"estimated, oriented by origins"``
-    confidence : share in [0, 1] of the points that speak for their sign: the winding number there is that of a closed
-        surface with outward normals, or, by origins, the line of sight is clear of the tangent plane; None for signs
-        that were given
-    flipped : share in [0, 1] of the given normals that were turned around
+    confidence : share in [0, 1] of the points that confirm their sign: the winding number there is that of a closed
+        surface with outward normals or, by origins, the line of sight is clear of the tangent plane; None for given
+        signs
+    flipped : share in [0, 1] of the given normals that were flipped
     """
 
     normals: Float
@@ -69,72 +56,87 @@ class Orientation:
 
     @property
     def estimated(self) -> bool:
-        """Whether at least the sides are estimates."""
+        """Whether at least the signs are estimates."""
         return self.confidence is not None
 
 
-def oriented_normals(points: Float, origins: Float | None = None, along: Float | None = None) -> Orientation:
-    """Estimate unit normals that point outward: to the scanner where it is known, for an open sheet mostly upward (+z).
+def oriented_normals(
+    points: Float,
+    origins: Float | None = None,
+    along: Float | None = None,
+    *,
+    parameters: IngestParameters = IngestParameters(),
+) -> Orientation:
+    """Estimate outward unit normals: towards the scanner where it is known, and mostly upward (+z) for an open sheet.
 
     Parameters
     ----------
     points : array of shape (N, 3), distinct, N >= 10
     origins : array of shape (N, 3), optional
-        Where the scanner stood; rows of NaN where that is not known.
+        Positions of the scanner; rows of NaN where they are unknown.
     along : array of shape (N, 3), optional
-        Unit normals of which only the signs are to be found.
+        Unit normals of which only the signs are estimated.
+    parameters : tuning constants
 
     Raises
     ------
     InputError
-        When the points cannot be triangulated, as fewer than four.
+        When the points cannot be triangulated, for example fewer than four.
     """
     middle = points.mean(axis=0)
     centred = points - middle
     if len(points) <= 3:
         raise InputError(f"Normals cannot be estimated from {len(points)} points that span no volume.")
-    axes = unoriented_normals(centred) if along is None else along
+    axes = unoriented_normals(centred, parameters=parameters.normals) if along is None else along
     seen = orient_towards_scanner(centred, axes, None if origins is None else origins - middle)
     if seen is not None:
-        return Orientation(seen[0], BY_SIGHT, seen[1])
-    normals, unrest = _by_shape(centred, axes, free=along is None)
-    return Orientation(normals, ESTIMATED if unrest <= _ORDERLY else UNCERTAIN, winding_agreement(centred, normals))
+        return Orientation(seen[0], "estimated, oriented by origins", seen[1])
+    normals, disorder = _by_shape(centred, axes, along is None, parameters)
+    certain = disorder <= parameters.orientation.most_disorder
+    how = "estimated" if certain else "estimated, orientation uncertain"
+    return Orientation(normals, how, winding_agreement(centred, normals))
 
 
-def _by_shape(points: Float, axes: Float, free: bool) -> tuple[Float, float]:
-    """Return the normals whose winding number is most that of a closed surface, and their disorder."""
+def _by_shape(points: Float, axes: Float, free: bool, parameters: IngestParameters) -> tuple[Float, float]:
+    """Return the normals whose winding number is closest to that of a closed surface, and their disorder.
+
+    `free` says whether the axes may be replaced by better ones.
+    """
+    limits, planes = parameters.orientation, parameters.normals
     by_winding: list[Float] = []
-    if len(points) <= _GAUSS_POINTS:
-        by_winding = _by_winding(points, axes, free)
-        unrest = winding_disorder(points, by_winding[-1])
-        if unrest <= _ORDERLY:
-            return by_winding[-1], unrest
-    normals = propagate_orientation(points, axes, tangent_planes(points, _LOCAL), 0.0)
-    unrest = winding_disorder(points, normals)
-    if len(points) > _GAUSS_POINTS and unrest <= _ORDERLY:
-        return normals, unrest
-    second = propagate_orientation(points, axes, tangent_planes(points, _SMOOTH), _OFF_PLANE_PENALTY)
-    normals, unrest = min((normals, unrest), (second, winding_disorder(points, second)), key=_unrest)
-    others = [(found, winding_disorder(points, found)) for found in by_winding or _by_winding(points, axes, free)]
-    third, other = min(others, key=_unrest)
-    # An open scan stays disorderly either way, and there only propagation can be right.
-    return (third, other) if other < _CLEARLY_BETTER * unrest else (normals, unrest)
+    if len(points) <= limits.gauss_points:
+        by_winding = _by_winding(points, axes, free, parameters)
+        disorder = winding_disorder(points, by_winding[-1])
+        if disorder <= limits.most_disorder:
+            return by_winding[-1], disorder
+    local = tangent_planes(points, limits.local_neighbours, parameters=planes)
+    normals = propagate_orientation(points, axes, local, 0.0)
+    disorder = winding_disorder(points, normals)
+    if len(points) > limits.gauss_points and disorder <= limits.most_disorder:
+        return normals, disorder
+    smooth = tangent_planes(points, limits.smooth_neighbours, parameters=planes)
+    second = propagate_orientation(points, axes, smooth, limits.off_plane_penalty)
+    normals, disorder = min((normals, disorder), (second, winding_disorder(points, second)), key=_disorder)
+    others = by_winding or _by_winding(points, axes, free, parameters)
+    third, other = min(((found, winding_disorder(points, found)) for found in others), key=_disorder)
+    # An open scan is disorderly with either method, and only propagation can be right there.
+    return (third, other) if other < limits.better_disorder_ratio * disorder else (normals, disorder)
 
 
-def _unrest(candidate: tuple[Float, float]) -> float:
+def _disorder(candidate: tuple[Float, float]) -> float:
     return candidate[1]
 
 
-def _by_winding(points: Float, axes: Float, free: bool) -> list[Float]:
-    """Return unit normals signed by Gauss's theorem and by normals that agree with their winding number.
+def _by_winding(points: Float, axes: Float, free: bool, parameters: IngestParameters) -> list[Float]:
+    """Return unit normals with signs by Gauss's theorem, and by normals that agree with their winding number.
 
-    Where all points take part and directions are `free`, the latter's own come last: in sparse clouds they are better
-    than those of any neighbourhood.
+    Where all points take part and axes are `free`, the latter normals themselves come last: in sparse clouds they are
+    better than those of any neighbourhood.
     """
     from scipy.spatial import cKDTree
 
     order = np.random.default_rng(0).permutation(len(points))
-    few, some = order[:_GAUSS_POINTS], order[:_CONSISTENT_POINTS]
+    few, some = order[: parameters.orientation.gauss_points], order[: parameters.orientation.consistent_points]
     outward = gauss_normals(points[few])
     first = outward[cKDTree(points[few]).query(points[some])[1]]
     refined = consistent_normals(points[some], first)
@@ -144,48 +146,54 @@ def _by_winding(points: Float, axes: Float, free: bool) -> list[Float]:
 
 
 def _signed(axes: Float, guide: Float) -> Float:
+    """Return the axes with the signs of the guide."""
     return np.asarray(axes * np.where(np.einsum("ij,ij->i", axes, guide) < 0, -1.0, 1.0)[:, None])
 
 
-def flip_if_inward(points: Float, normals: Float) -> tuple[Float, bool]:
-    """Return the normals, all flipped where they clearly look into a nearly closed surface, and whether they were.
+def flip_if_inward(points: Float, normals: Float, *, inward_outwardness: float = -0.75) -> tuple[Float, bool]:
+    """Return the normals, all flipped if they clearly point into a nearly closed surface, and whether they were.
 
     Parameters
     ----------
     points : array of shape (N, 3), distinct
     normals : array of shape (N, 3), of unit length
+    inward_outwardness : outwardness below which they are flipped; half a sphere with inward normals has about -0.6,
+        and may be the scan of a bowl
     """
-    inward = outwardness(points - points.mean(axis=0), normals) < _INWARD
+    inward = outwardness(points - points.mean(axis=0), normals) < inward_outwardness
     return (-normals, True) if inward else (normals, False)
 
 
-MODES = {
-    "auto": "estimated where there are none; all turned around where they look into a closed surface",
-    "given": "estimated where there are none, and otherwise taken as they are",
-    "signs": "their directions kept, and the side of each found anew",
-    "estimate": "estimated anew",
+ORIENTATIONS = {
+    "auto": "estimated where missing; all flipped where they point into a closed surface",
+    "given": "estimated where missing, and otherwise unchanged",
+    "signs": "directions kept, signs estimated",
+    "estimate": "estimated from the points",
 }
 """What `with_outward_normals` does with normals."""
 
 
 def require_orientation(mode: str) -> None:
-    """Refuse a mode that is not known.
+    """Check that a mode is one of `ORIENTATIONS`.
 
     Raises
     ------
     UsageError
     """
-    if mode not in MODES:
-        raise UsageError(f"Normals can be oriented by {', '.join(MODES)}, not {mode!r}.")
+    if mode not in ORIENTATIONS:
+        raise UsageError(f"Normals can be oriented by {', '.join(ORIENTATIONS)}, not {mode!r}.")
 
 
-def with_outward_normals(cloud: PointCloud, mode: str) -> tuple[PointCloud, Orientation]:
-    """Return the cloud with outward unit normals, and how they came about.
+def with_outward_normals(
+    cloud: PointCloud, mode: str, *, parameters: IngestParameters = IngestParameters()
+) -> tuple[PointCloud, Orientation]:
+    """Return the cloud with outward unit normals, and their origin.
 
     Parameters
     ----------
     cloud : with unit normals or none
-    mode : a name of `MODES`
+    mode : one of `ORIENTATIONS`
+    parameters : tuning constants
 
     Raises
     ------
@@ -194,9 +202,9 @@ def with_outward_normals(cloud: PointCloud, mode: str) -> tuple[PointCloud, Orie
     """
     normals = cloud.normals
     if normals is None or mode == "estimate":
-        found = oriented_normals(cloud.points, cloud.origins)
+        found = oriented_normals(cloud.points, cloud.origins, parameters=parameters)
     elif mode == "signs":
-        sides = oriented_normals(cloud.points, cloud.origins, along=normals)
+        sides = oriented_normals(cloud.points, cloud.origins, along=normals, parameters=parameters)
         turned = float((np.einsum("ij,ij->i", sides.normals, normals) < 0).mean())
         found = Orientation(sides.normals, "given, sides " + sides.how, sides.confidence, turned)
     else:

@@ -1,4 +1,4 @@
-"""Voxel thinning: one real point for each occupied cube, with the cube's size searched for the wanted count."""
+"""Voxel grid: one point of the cloud for each occupied cube, with the cube's size searched for the wanted count."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int
 
-_FINEST = 2.0**-20  # of the extent: three cell numbers then fit into one 64-bit key
-_BISECTIONS = 30
-_TOLERANCE = 0.02  # of the count, within which the search stops
 
-
-def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -> Int:
+def voxel_representatives(
+    points: Float, count: int, rng: np.random.Generator, *, bisections: int = 30, tolerance: float = 0.02
+) -> Int:
     """Return `count` row indices, each the point nearest to the mean of its cube.
 
     The cubes are the largest that give at least `count`, and the surplus is cut off at random. Points closer than a
@@ -20,18 +18,20 @@ def voxel_representatives(points: Float, count: int, rng: np.random.Generator) -
     Parameters
     ----------
     points : array of shape (N, 3), distinct, N >= count >= 1
+    bisections : most steps of the search for the size: 30 halve the range of its logarithm to rounding
+    tolerance : share of surplus cubes at which the search ends
     """
     extent = float(np.ptp(points, axis=0).max())
-    low, high = np.log(_FINEST), 0.0
+    low, high = np.log(_finest()), 0.0
     cells = cells_of(points, 0.0)
-    for _ in range(_BISECTIONS):
+    for _ in range(bisections):
         middle = (low + high) / 2
         coarser = cells_of(points, extent * float(np.exp(middle)))
         if coarser.max() + 1 >= count:
             low, cells = middle, coarser
         else:
             high = middle
-        if cells.max() + 1 <= (1 + _TOLERANCE) * count:
+        if cells.max() + 1 <= (1 + tolerance) * count:
             break
     return rng.permutation(_nearest_to_means(points, cells))[:count]
 
@@ -44,7 +44,7 @@ def voxel_representatives_of_side(points: Float, side: float, rng: np.random.Gen
     points : array of shape (N, 3), distinct
     side : positive; below a millionth of the extent, cubes of that size are taken
     """
-    del rng  # nothing is left to chance
+    del rng  # the result is not random
     return _nearest_to_means(points, cells_of(points, side))
 
 
@@ -53,12 +53,17 @@ def cells_of(points: Float, size: float) -> Int:
 
     Cubes are no smaller than a millionth of the extent.
     """
-    size = max(size, float(np.ptp(points, axis=0).max()) * _FINEST)
+    size = max(size, float(np.ptp(points, axis=0).max()) * _finest())
     corner = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     sides = corner.max(axis=0) + 1
     key = (corner[:, 0] * sides[1] + corner[:, 1]) * sides[2] + corner[:, 2]
     cells: Int = np.unique(key, return_inverse=True)[1]
     return cells
+
+
+def _finest() -> float:
+    """Return the least side of cubes, as a share of the extent: three cell numbers then fit into one 64-bit key."""
+    return 2.0**-20
 
 
 def _nearest_to_means(points: Float, cells: Int) -> Int:

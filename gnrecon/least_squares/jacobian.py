@@ -21,7 +21,7 @@ Block = Sequence[LayerRows]
 
 
 class Jacobian(Protocol):
-    """J, of shape (rows, columns), as the solvers see it; vectors are in `dtype` on `device`."""
+    """J, of shape (rows, columns), as an operator; vectors are in `dtype` on `device`."""
 
     @property
     def rows(self) -> int:
@@ -40,12 +40,12 @@ class Jacobian(Protocol):
 
     @property
     def stored(self) -> torch.dtype:
-        """Precision of J's own numbers, in which products of its rows are made."""
+        """Storage precision of J, in which products of its rows are computed."""
         ...
 
     @property
     def device(self) -> torch.device:
-        """Where everything lies."""
+        """Device of all tensors."""
         ...
 
     @property
@@ -90,25 +90,25 @@ class Jacobian(Protocol):
         ...
 
     def rounded(self) -> Jacobian:
-        """Return J stored in float32, its vectors as they are, or itself where both must be of one precision."""
+        """Return J stored in float32 with unchanged vectors, or itself if both must have the same precision."""
         ...
 
     @property
-    def stretches(self) -> tuple[int, ...]:
-        """Numbers of successive rows that belong to one constraint."""
+    def constraint_rows(self) -> tuple[int, ...]:
+        """Number of rows of each constraint, in order."""
         ...
 
-    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
-        """Yield sums of runs of successive rows over the roots of their numbers, of shape (m, p), chunk by chunk.
+    def run_sums(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of successive rows over the roots of their lengths, of shape (m, p), chunk by chunk.
 
-        There is one length for each stretch; the last run of a stretch may be shorter.
+        There is one length for each constraint; the last run of a constraint may be shorter.
         """
         ...
 
 
 @dataclass(frozen=True)
 class DenseJacobian:
-    """A Jacobian that is held as a matrix of shape (M, p)."""
+    """A Jacobian stored as a matrix of shape (M, p)."""
 
     matrix: Tensor
     group_sizes: tuple[int, ...] | None = None
@@ -126,7 +126,7 @@ class DenseJacobian:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Precision of the matrix, and of all that is made of it."""
+        """Precision of the matrix and of all results."""
         return self.matrix.dtype
 
     @property
@@ -136,12 +136,12 @@ class DenseJacobian:
 
     @property
     def device(self) -> torch.device:
-        """Where the matrix lies."""
+        """Device of the matrix."""
         return self.matrix.device
 
     @property
     def groups(self) -> tuple[slice, ...]:
-        """The groups that were named, or all columns as one."""
+        """The given groups, or all columns as one."""
         return column_slices(self.group_sizes or (self.columns,))
 
     def mv(self, v: Tensor) -> Tensor:
@@ -189,12 +189,12 @@ class DenseJacobian:
         return self
 
     @property
-    def stretches(self) -> tuple[int, ...]:
-        """All rows as one stretch."""
+    def constraint_rows(self) -> tuple[int, ...]:
+        """All rows as one constraint."""
         return (self.rows,)
 
-    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
-        """Yield sums of runs of rows over the roots of their numbers, chunk by chunk."""
+    def run_sums(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of rows over the roots of their lengths, chunk by chunk."""
         for start in range(0, self.rows, self.chunk * lengths[0]):
             rows = self.matrix[start : start + self.chunk * lengths[0]]
             runs = [rows[first : first + lengths[0]] for first in range(0, len(rows), lengths[0])]

@@ -2,7 +2,7 @@
 
 Row n of a layer is vec(M_n), where M_n = l_n (i_n, 1)^T + r_n (t_n, 0)^T has shape (out, in + 1). Its block of J^T J,
 G = sum_n vec(M_n) vec(M_n)^T, is approximated by B (x) A with B (out, out) and A (in + 1, in + 1). Where one of them
-is given, the other that makes |G - B (x) A|_F least is
+is given, the other that minimises |G - B (x) A|_F is
 
     A = sum_n M_n^T B M_n / |B|_F^2,        B = sum_n M_n A M_n^T / |A|_F^2,
 
@@ -130,7 +130,7 @@ def _by_inputs(layer: LayerRows) -> Sides:
 
 
 def _contracted(blocks: list[Block], factors: list[Tensor], sides: Callable[[LayerRows], Sides]) -> list[Tensor]:
-    """Return for each layer the factor that makes |G - B (x) A|_F least, given the other one."""
+    """Return for each layer the factor that minimises |G - B (x) A|_F, given the other one."""
     sums = [factors[0].new_zeros(())] * len(factors)
     for block in blocks:
         for k, (layer, factor) in enumerate(zip(block, factors, strict=True)):

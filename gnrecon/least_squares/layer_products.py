@@ -70,7 +70,7 @@ class LayerRows:
         return _of(self.left[:, units], self.inputs, [(right[:, units], tangents) for right, tangents in self.pairs])
 
     def to(self, stored: torch.dtype) -> LayerRows:
-        """Return the rows in another precision, or as they are."""
+        """Return the rows in another precision."""
         pairs = [(right.to(stored), tangents.to(stored)) for right, tangents in self.pairs]
         return _of(self.left.to(stored), self.inputs.to(stored), pairs)
 

@@ -28,7 +28,7 @@ class LayeredJacobian:
         compute them again where storing them would take too much memory
     rows : M
     group_sizes : number of columns of each layer
-    device : where the factors lie
+    device : of the factors
     dtype : of vectors and sums, float64 or that of the factors
     stored : precision of the factors
     chunk_bytes : memory of the rows that are multiplied out at a time
@@ -156,7 +156,7 @@ class LayeredJacobian:
         return squares
 
     def sample(self, rows: Tensor) -> LayeredJacobian:
-        """Return the Jacobian of the given rows, its factors kept."""
+        """Return the Jacobian of the given rows, with stored factors."""
         blocks, start = [], 0
         for block in self.blocks():
             stop = start + len(block[0])
@@ -167,19 +167,19 @@ class LayeredJacobian:
         return replace(self, blocks=lambda: blocks, rows=len(rows))
 
     def rounded(self) -> LayeredJacobian:
-        """Return J with factors in float32, which are kept, or itself where they are."""
+        """Return J with factors stored in float32, or itself if they are."""
         if self.stored == torch.float32:
             return self
         blocks = [[layer.to(torch.float32) for layer in block] for block in self.blocks()]
         return replace(self, blocks=lambda: blocks, stored=torch.float32)
 
     @property
-    def stretches(self) -> tuple[int, ...]:
-        """The blocks' numbers of rows."""
+    def constraint_rows(self) -> tuple[int, ...]:
+        """Number of rows of each block."""
         return tuple(len(block[0]) for block in self.blocks())
 
-    def runs(self, lengths: Sequence[int]) -> Iterator[Tensor]:
-        """Yield sums of runs of rows over the roots of their numbers, in the precision of storage, never forming J."""
+    def run_sums(self, lengths: Sequence[int]) -> Iterator[Tensor]:
+        """Yield sums of runs of rows over the roots of their lengths, in storage precision, without forming J."""
         for block, length in zip(self.blocks(), lengths, strict=True):
             count = length * self._chunk(block)
             for start in range(0, len(block[0]), count):

@@ -80,17 +80,19 @@ class NeighbourSums:
     def prepare(self, jacobian: Jacobian, metric: Tensor, generator: torch.Generator) -> Prepared:  # noqa: ARG002
         """Choose the runs, sum them, and form E E^T or, if there are many runs, C^T C."""
         lengths = self._lengths(jacobian)
-        runs = sum(-(-rows // length) for rows, length in zip(jacobian.stretches, lengths, strict=True))
+        runs = sum(-(-rows // length) for rows, length in zip(jacobian.constraint_rows, lengths, strict=True))
         if runs >= jacobian.columns:
-            product = jacobian.gram() if runs == jacobian.rows else gram(jacobian.runs(lengths), len(metric), metric)
+            product = (
+                jacobian.gram() if runs == jacobian.rows else gram(jacobian.run_sums(lengths), len(metric), metric)
+            )
             return PreparedGram(product, metric)
         scale = metric.rsqrt()
-        E = torch.cat([metric.new_zeros(0, len(metric)), *jacobian.runs(lengths)]).mul_(scale)
+        E = torch.cat([metric.new_zeros(0, len(metric)), *jacobian.run_sums(lengths)]).mul_(scale)
         return PreparedSums(E, gram([E.T], len(E), E), scale)
 
     def _lengths(self, jacobian: Jacobian) -> list[int]:
         """Return the lengths of the runs, cached ones if the number of constraints is the same."""
-        if not self._found or len(self._found[-1]) != len(jacobian.stretches):
+        if not self._found or len(self._found[-1]) != len(jacobian.constraint_rows):
             found = [min(length, self.longest) for length in run_lengths(jacobian, self.least_cosine)]
             self._found[:] = [found] * self.refresh_interval
         return self._found.pop()
@@ -103,20 +105,20 @@ class NeighbourSums:
 def run_lengths(
     jacobian: Jacobian, least_cosine: float, *, candidates: tuple[int, ...] = (2, 4, 8), samples: int = 8
 ) -> list[int]:
-    """Return for each stretch of rows the longest run whose first and last row are similar; see `NeighbourSums`.
+    """Return for each constraint the longest run whose first and last row are similar; see `NeighbourSums`.
 
     Parameters
     ----------
     candidates : lengths that are tried, ascending; powers of two from one
-    samples : runs of a stretch over which the cosine is averaged
+    samples : runs of a constraint over which the cosine is averaged
     """
-    rows = torch.tensor(jacobian.stretches, dtype=torch.long)
+    rows = torch.tensor(jacobian.constraint_rows, dtype=torch.long)
     long = rows >= candidates[-1]
     lengths = [1] * len(rows)
     if not bool(long.any()):
         return lengths
     firsts = torch.linspace(0, 1, samples) * (rows[long] - candidates[-1])[:, None]
-    # The first row of each sampled run and the last row for each candidate length, of all stretches at once.
+    # The first row of each sampled run and the last row for each candidate length, of all constraint_rows at once.
     offsets = torch.tensor([0, *(length - 1 for length in candidates)])
     compared = ((rows.cumsum(0) - rows)[long, None] + firsts.long())[:, :, None] + offsets
     drawn, places = torch.unique(compared, return_inverse=True)
@@ -124,7 +126,7 @@ def run_lengths(
     first, *others = torch.nn.functional.normalize(found, dim=1)[places.to(found.device)].unbind(2)
     # Zero rows, of inactive constraints, have cosine zero with all others.
     cosines = torch.stack([(first * other).sum(2).mean(1) for other in others], 1).tolist()
-    for stretch, of in zip(long.nonzero()[:, 0].tolist(), cosines, strict=True):
-        similar = [length for length, cosine in zip(candidates, of, strict=True) if cosine >= least_cosine]
-        lengths[stretch] = max([1, *similar])
+    for number, values in zip(long.nonzero()[:, 0].tolist(), cosines, strict=True):
+        similar = [length for length, cosine in zip(candidates, values, strict=True) if cosine >= least_cosine]
+        lengths[number] = max([1, *similar])
     return lengths

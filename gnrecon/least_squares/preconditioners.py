@@ -35,7 +35,7 @@ class Preconditioner(Protocol):
         ...
 
     def describe(self) -> str:
-        """Return what it is, as a phrase to follow "preconditioned by"."""
+        """Return its name, as a phrase to follow "preconditioned by"."""
         ...
 
 
@@ -74,7 +74,7 @@ def positive(diagonal: Tensor) -> Tensor:
 
 
 def definite_factor(product: Tensor, diagonal: Tensor) -> Tensor:
-    """Return the lower Cholesky factor of `product` + diag(`diagonal`), shifted as little as makes it definite.
+    """Return the lower Cholesky factor of `product` + diag(`diagonal`), with the smallest shift that makes it definite.
 
     A preconditioner need not be accurate but must be definite; rounding can leave small negative eigenvalues.
     """

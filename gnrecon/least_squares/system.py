@@ -88,7 +88,7 @@ class Equations:
         return cls(jacobian, residual, jacobian.tmv(residual), metric(jacobian))
 
     def at(self, residual: Tensor | None) -> Equations:
-        """Return the same equations for other residuals, of shape (M,), or as they are."""
+        """Return the same equations for other residuals, of shape (M,), or themselves if there are none."""
         if residual is None:
             return self
         residual = residual.to(self.residual)
@@ -147,14 +147,14 @@ class Linearisation:
 
 
 Metric = Callable[[Jacobian], Tensor]
-"""Gives D's diagonal, of shape (p,), positive."""
+"""Returns the diagonal of D, of shape (p,), all positive."""
 
 # Diagonal metrics D of the parameters, in which the damping is measured: a damped step minimises
 # |r + J s|^2 + damping |s|_D^2  with  |s|_D^2 = s.D s.
 
 
 def identity(jacobian: Jacobian) -> Tensor:
-    """Damp every parameter alike (Levenberg), as the paper does."""
+    """Damp all parameters equally (Levenberg), as the paper does."""
     return torch.ones(jacobian.columns, dtype=jacobian.dtype, device=jacobian.device)
 
 

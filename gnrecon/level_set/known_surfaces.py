@@ -157,7 +157,7 @@ class ParametricSurface:
         return step
 
     def _starts(self, queries: Tensor, samples: int = 20_000) -> Tensor:
-        """Return the parameters, of shape (N, 2), of the nearest of so many points of the patch."""
+        """Return the parameters, of shape (N, 2), of the nearest of `samples` points of the patch."""
         from scipy.spatial import cKDTree
 
         parameters = self._lattice(samples)

@@ -15,10 +15,10 @@ from gnrecon.level_set.level_set_parameters import LevelSetParameters
 from gnrecon.runtime.chunks import slices
 
 Value = Callable[[Tensor], Tensor]
-"""Takes points, of shape (N, 3), and returns f there, of shape (N,)."""
+"""From points, of shape (N, 3), to f, of shape (N,)."""
 
 ValueAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Takes points, of shape (N, 3), and returns f, of shape (N,), and grad f, of shape (N, 3)."""
+"""From points, of shape (N, 3), to f, of shape (N,), and grad f, of shape (N, 3)."""
 
 
 @dataclass(frozen=True)

@@ -254,7 +254,7 @@ def separate_components(values: Float) -> SeparateComponents:
 
 
 def _nodes(numbers: list[Int], shape: tuple[int, ...]) -> Int:
-    """Return the nodes, of shape (..., 3), that gudhi's numbers stand for, in which the first axis runs fastest."""
+    """Return the nodes, of shape (..., 3), of gudhi's vertex numbers, in which the first axis varies fastest."""
     flat = np.concatenate([np.zeros((0,), np.int64), *(part.ravel() for part in numbers)])
     return np.stack(np.unravel_index(flat, shape, order="F"), axis=-1)
 

@@ -1,6 +1,6 @@
 """Gauss-Newton: linearise the residuals and solve the linear least-squares problem for a step.
 
-Each outer step k freezes a problem (its points may be fresh), hands J and r to the linear solver once, and lets the
+Each outer step k freezes a problem (its points may be new), passes J and r to the linear solver once, and lets the
 step control choose the step. In function space the undamped step is the natural-gradient direction of the paper (its
 section on Gauss-Newton in function space); damping and length decide how far to go along it.
 """

@@ -1,6 +1,7 @@
-"""Pictures of meshes and scans, drawn by casting rays, so that no display and no graphics card is needed.
+"""Pictures of meshes and scans by ray casting, so that no display and no graphics card is needed.
 
-Every pixel is the mean of nine samples. Surfaces are shaded by interpolated vertex normals, points as small balls.
+Every pixel is the mean of nine samples. Surfaces are shaded by interpolated vertex normals, points as small balls. The
+entries are `render` and `render_sheet`.
 """
 
 from __future__ import annotations
@@ -18,17 +19,9 @@ from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.colors import to_linear as to_light
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.rendering.rays import Camera, View, draw_points, shade, sky_share, to_bytes, to_linear
+from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, shade, to_bytes, to_linear
+from gnrecon.rendering.rendering_parameters import RenderingParameters, SheetParameters
 from gnrecon.runtime.errors import UsageError
-
-CLAY, SLATE = (230, 208, 180), (86, 120, 164)
-"""Colours of meshes and of points."""
-
-PAPER_TOP, PAPER_BOTTOM = 1.0, 0.86
-"""Linear light of the background."""
-
-SUPERSAMPLING = 3
-"""Samples along each side of a pixel."""
 
 Image = npt.NDArray[np.uint8]
 
@@ -39,9 +32,9 @@ def render(
     *,
     size: tuple[int, int] = (900, 600),
     views: Sequence[View] = ("three-quarter",),
-    color: tuple[int, int, int] = CLAY,
+    color: tuple[int, int, int] = (230, 208, 180),
     points: PointCloud | None = None,
-    point_color: tuple[int, int, int] = SLATE,
+    point_color: tuple[int, int, int] = (86, 120, 164),
     up: str = "z",
 ) -> Image:
     """Draw a mesh, a scan, or both side by side.
@@ -54,7 +47,7 @@ def render(
     size : pair of int
         Width and height of the whole picture in pixels.
     views : sequence of names or (azimuth, elevation) in degrees
-        Each is a panel; see `camera.VIEWS` for the names.
+        Each is a panel; see `rays.VIEWS` for the names.
     color, point_color : sRGB from 0 to 255
         Of a mesh without the attribute ``colors``, which is drawn where there is one, and of points.
     points : PointCloud, optional
@@ -69,7 +62,7 @@ def render(
     Raises
     ------
     UsageError
-        When there is nothing to draw, or a view or the size is senseless.
+        When there is nothing to draw, or a view or the size is invalid.
     OutputError
         When the file cannot be written.
     """
@@ -79,39 +72,53 @@ def render(
         raise UsageError("There is nothing to draw: give a mesh or points, and a view.")
     if size[0] < panels or size[1] < 1:
         raise UsageError(f"A picture of {size[0]} x {size[1]} pixels has no room for {panels} panels.")
-    # Everything is drawn about the origin and about one in size, because the ray caster works in float32.
-    places = np.concatenate([_places(part) for part in shown])
-    centre = (places.min(axis=0) + places.max(axis=0)) / 2
-    scale = float(np.linalg.norm(places - centre, axis=1).max()) or 1.0
-    edges = np.linspace(0, size[0], panels + 1).astype(int) * SUPERSAMPLING
-    height = size[1] * SUPERSAMPLING
-    strips = []
-    for index, width in enumerate(np.diff(edges)):
-        view, part = views[index // len(shown)], shown[index % len(shown)]
-        camera = Camera.framing((places - centre) / scale, view, up, int(width), height)
-        unit = (_places(part) - centre) / scale
-        if isinstance(part, Mesh):
-            strips.append(_draw_mesh(part.with_vertices(unit), camera, to_linear(color)))
-        else:
-            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, to_linear(point_color)))
+    strips = _draw_panels(shown, views, up, size, (to_linear(color), to_linear(point_color)))
+    samples = RenderingParameters.supersampling
     light = np.concatenate(strips, axis=1)
-    image: Image = to_bytes(light.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3).mean(axis=(1, 3)))
+    image: Image = to_bytes(light.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3)))
     if path is not None:
         write_image(image, Path(path))
     return image
+
+
+def _draw_panels(
+    shown: Sequence[Mesh | PointCloud],
+    views: Sequence[View],
+    up: str,
+    size: tuple[int, int],
+    colors: tuple[Float, Float],
+) -> list[Float]:
+    """Linear light of each panel, with all its samples; the colours are those of a mesh and of points."""
+    # Everything is centred and scaled to about one, because the ray caster uses float32.
+    places = np.concatenate([_places(part) for part in shown])
+    centre = (places.min(axis=0) + places.max(axis=0)) / 2
+    scale = float(np.linalg.norm(places - centre, axis=1).max()) or 1.0
+    samples = RenderingParameters.supersampling
+    edges = np.linspace(0, size[0], len(shown) * len(views) + 1).astype(int) * samples
+    strips = []
+    for index, width in enumerate(np.diff(edges)):
+        view, part = views[index // len(shown)], shown[index % len(shown)]
+        # All panels of a view share the camera, so that scan and mesh can be compared.
+        camera = Camera.framing((places - centre) / scale, view, up, int(width), size[1] * samples)
+        unit = (_places(part) - centre) / scale
+        if isinstance(part, Mesh):
+            strips.append(_draw_mesh(part.with_vertices(unit), camera, colors[0]))
+        else:
+            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, colors[1]))
+    return strips
 
 
 def _places(part: Mesh | PointCloud) -> Float:
     return part.vertices if isinstance(part, Mesh) else part.points
 
 
-def _background(camera: Camera) -> Float:
-    """Light paper, a little darker towards the bottom, of shape (H, W, 3)."""
-    rows = np.linspace(PAPER_TOP, PAPER_BOTTOM, camera.height)
+def _background(camera: Camera, *, top: float = 1.0, bottom: float = 0.86) -> Float:
+    """Linear light of a white background, a little darker towards the bottom, of shape (H, W, 3)."""
+    rows = np.linspace(top, bottom, camera.height)
     return np.broadcast_to(rows[:, None, None], (camera.height, camera.width, 3)).copy()
 
 
-def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
+def _draw_mesh(mesh: Mesh, camera: Camera, color: Float, *, samples: int = RenderingParameters.supersampling) -> Float:
     from open3d import core
 
     scene = ray_scene(mesh.vertices, mesh.faces)
@@ -120,7 +127,7 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
     distance = answer["t_hit"].numpy()
     hit = np.isfinite(distance)
     corners = mesh.faces[answer["primitive_ids"].numpy()[hit]]
-    # In single precision, which is more than a picture has: there are millions of samples.
+    # Single precision is enough for a picture, and there are millions of samples.
     u, v = answer["primitive_uvs"].numpy()[hit].T
     shares = np.stack([1 - u - v, u, v], axis=1)
     normals = np.einsum("ij,ijk->ik", shares, mesh.vertex_normals().astype(np.float32)[corners])
@@ -128,12 +135,12 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
     if "colors" in mesh.attributes:
         light = to_light(as_bytes(mesh.attributes["colors"])[:, :3])
         color = np.einsum("ij,ijk->ik", shares, light.astype(np.float32)[corners])
-    # The sky is looked for once a pixel of the picture, not once a sample: it varies slowly, and costs most.
+    # Occlusion is computed once per pixel and not per sample: it varies slowly, and costs most.
     coarse = np.zeros_like(hit)
-    coarse[::SUPERSAMPLING, ::SUPERSAMPLING] = hit[::SUPERSAMPLING, ::SUPERSAMPLING]
+    coarse[::samples, ::samples] = hit[::samples, ::samples]
     places = rays[coarse][:, :3] + distance[coarse][:, None] * rays[coarse][:, 3:]
-    small = sky_share(scene, places, normals[coarse[hit]], hit[::SUPERSAMPLING, ::SUPERSAMPLING], reach=0.7)
-    sky = small.repeat(SUPERSAMPLING, 0).repeat(SUPERSAMPLING, 1)[: hit.shape[0], : hit.shape[1]]
+    small = ambient_occlusion(scene, places, normals[coarse[hit]], hit[::samples, ::samples])
+    sky = small.repeat(samples, 0).repeat(samples, 1)[: hit.shape[0], : hit.shape[1]]
     image = _background(camera)
     image[hit] = shade(normals, color, camera.axes, sky[hit])
     return image
@@ -142,7 +149,7 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float) -> Float:
 def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
     spacing = 0.02
     if len(cloud) > 1:
-        # Two thousand points tell the spacing well enough.
+        # Two thousand points are enough for the median spacing.
         some = cloud.points[:: -(-len(cloud) // 2000)]
         spacing = float(np.median(cKDTree(cloud.points).query(some, k=2)[0][:, 1]))
     normals = cloud.normals
@@ -167,22 +174,15 @@ def write_image(image: Image, path: Path) -> None:
         Pillow.fromarray(image).save(temporary, format="PNG")
 
 
-SIDES: tuple[View, ...] = ("front", "right", "top")
-"""The smaller pictures, from the left."""
-
-WIDTH, TALL, LOW, FOOT = 1200, 524, 364, 36
-"""Width of the sheet, heights of its rows of pictures, and of the foot below each row, in pixels."""
-
-INK = (96, 96, 100)
-
-
-# A sheet of pictures: the scan and the mesh large, and the mesh from its sides, each with its name.
-
-
 def render_sheet(
-    mesh: Mesh, path: str | Path | None = None, *, points: PointCloud | None = None, up: str = "z"
+    mesh: Mesh,
+    path: str | Path | None = None,
+    *,
+    points: PointCloud | None = None,
+    up: str = "z",
+    layout: SheetParameters = RenderingParameters.sheet,
 ) -> Image:
-    """Draw a mesh from four sides, and the scan that it was made from.
+    """Draw a contact sheet: the scan and the mesh large, and the mesh from its sides, each with a label.
 
     Parameters
     ----------
@@ -193,10 +193,11 @@ def render_sheet(
         Left of the mesh, from the same place.
     up : str
         The axis that points upward, ``"y"`` or ``"z"``.
+    layout : SheetParameters
 
     Returns
     -------
-    array of shape (960, 1200, 3), uint8
+    array of shape (960, 1200, 3) by default, uint8
 
     Raises
     ------
@@ -205,25 +206,27 @@ def render_sheet(
     OutputError
         When the file cannot be written.
     """
-    top = render(mesh, size=(WIDTH, TALL), points=points, up=up)
-    bottom = render(mesh, size=(WIDTH, LOW), views=SIDES, up=up)
-    above = [f"{len(points):,} points"] if points is not None and len(points) else []
-    above.append(f"{len(mesh.faces):,} triangles")
-    sheet = np.concatenate([_labelled(top, above), _labelled(bottom, [str(side) for side in SIDES])])
+    upper = render(mesh, size=(layout.width, layout.upper_height), points=points, up=up)
+    lower = render(mesh, size=(layout.width, layout.lower_height), views=layout.lower_views, up=up)
+    labels = [f"{len(points):,} points"] if points is not None and len(points) else []
+    labels.append(f"{len(mesh.faces):,} triangles")
+    sheet = np.concatenate([_labelled(upper, labels, layout), _labelled(lower, layout.lower_views, layout)])
     if path is not None:
         write_image(sheet, Path(path))
     return sheet
 
 
-def _labelled(image: Image, labels: list[str]) -> Image:
+def _labelled(image: Image, labels: Sequence[str], layout: SheetParameters) -> Image:
     """Write a label below each of a row's panels."""
     from PIL import Image as Pillow
     from PIL import ImageDraw, ImageFont
 
-    # The last line of a picture is paper: no shape comes so near to the edge.
-    picture = Pillow.fromarray(np.concatenate([image, image[-1:].repeat(FOOT, axis=0)]))
+    height = layout.label_height
+    # The last line of a picture is background: no shape comes so near to the edge.
+    picture = Pillow.fromarray(np.concatenate([image, image[-1:].repeat(height, axis=0)]))
     pen = ImageDraw.Draw(picture)
+    font = ImageFont.load_default(layout.label_size)
     for index, label in enumerate(labels):
-        place = ((2 * index + 1) * image.shape[1] // (2 * len(labels)), image.shape[0] + FOOT / 2 - 4)
-        pen.text(place, label, fill=INK, font=ImageFont.load_default(17), anchor="mm")
+        place = ((2 * index + 1) * image.shape[1] // (2 * len(labels)), image.shape[0] + height / 2 - 4)
+        pen.text(place, label, fill=layout.label_color, font=font, anchor="mm")
     return np.asarray(picture)

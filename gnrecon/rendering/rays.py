@@ -1,4 +1,9 @@
-"""A perspective camera that frames a shape from a named direction."""
+"""A perspective camera, the shading of surfaces, ambient occlusion, and points drawn as shaded balls.
+
+`Camera` frames a shape from a named direction. `shade` lights surfaces by two lamps and a hemisphere of sky;
+`ambient_occlusion` and `vertex_ambient_occlusion` compute how much of that sky places see, and `draw_points` draws a
+cloud into a depth buffer.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +21,7 @@ from gnrecon.export.boolean import centre_and_size
 from gnrecon.export.metrics import ray_scene
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.rendering.rendering_parameters import LightParameters, RenderingParameters
 from gnrecon.runtime.errors import UsageError
 
 View = str | tuple[float, float]
@@ -33,16 +39,10 @@ VIEWS: Mapping[str, tuple[float, float]] = MappingProxyType(
     }
 )
 
-HALF_FIELD = float(np.tan(np.radians(12.0)))
-"""Half the picture's shorter side at distance one: a field of view of 24 degrees, narrow enough to look undistorted."""
-
-MARGIN = 0.92
-"""Share of the picture that the shape may fill."""
-
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the eye is and what a pixel looks at.
+    """Position, orientation and size of a picture.
 
     Parameters
     ----------
@@ -51,21 +51,26 @@ class Camera:
         Rows: right, up, and backward, towards the eye.
     width, height : int
         Of the picture in pixels.
+    field_of_view : float, degrees
+        Over the picture's shorter side.
     """
 
     eye: Float
     axes: Float
     width: int
     height: int
+    field_of_view: float = RenderingParameters.field_of_view_degrees
 
     @property
     def focal(self) -> float:
         """Pixels per unit of slope."""
-        return min(self.width, self.height) / (2 * HALF_FIELD)
+        return min(self.width, self.height) / (2 * _half_field(self.field_of_view))
 
     @classmethod
-    def framing(cls, points: Float, view: View, up: str, width: int, height: int) -> Camera:
-        """Return the camera that sees all `points`, of shape (N, 3), as large as possible.
+    def framing(
+        cls, points: Float, view: View, up: str, width: int, height: int, *, fill_share: float = 0.92
+    ) -> Camera:
+        """Return the camera that sees all `points`, of shape (N, 3), within `fill_share` of the picture.
 
         Raises
         ------
@@ -74,7 +79,7 @@ class Camera:
         """
         axes = _axes(view, up)
         right, upward, backward = axes @ points.T
-        slopes = np.array([width, height]) / min(width, height) * HALF_FIELD * MARGIN
+        slopes = np.array([width, height]) / min(width, height) * _half_field(cls.field_of_view) * fill_share
         # A point (x, y, z) is in the picture when |x - x0| <= s (d - z): each side is a plane, so the eye's distance d
         # and its offset x0 follow from the two extreme planes of the wider direction.
         planes = [
@@ -100,6 +105,11 @@ class Camera:
         return self.width / 2 - self.focal * x / z, self.height / 2 + self.focal * y / z, -z
 
 
+def _half_field(field_of_view: float) -> float:
+    """Half the picture's shorter side at distance one, from an angle in degrees."""
+    return float(np.tan(np.radians(field_of_view / 2)))
+
+
 def _axes(view: View, up: str) -> Float:
     """Right, up and backward directions, as rows, of the camera that looks from a view."""
     if isinstance(view, str) and view not in VIEWS:
@@ -114,27 +124,14 @@ def _axes(view: View, up: str) -> Float:
     return axes if up == "z" else axes[:, [0, 2, 1]] * np.array([1, 1, -1])
 
 
-KEY = (np.array([-0.65, 0.7, 0.45]), 1.45)
-
-FILL = (np.array([0.85, 0.1, 0.35]), 0.28)
-"""Directions to the two lamps in the camera's axes (right, up, backward), and their strengths."""
-
-SKY, GROUND = np.array([0.46, 0.52, 0.62]), np.array([0.20, 0.17, 0.15])
-"""Light from straight above and from straight below."""
-
-EXPOSURE = 1.5
-"""Light that a white surface gives back as white."""
-
-DIRECTIONS = 48
-"""Directions over the whole sphere in which the sky is looked for."""
-
-
-# Light on surfaces: two lamps, a hemisphere of sky, and the share of the sky that a point sees.
-#
-# All lamps are fixed to the camera, so that every view is lit alike. Colours are mixed in linear light.
-
-
-def shade(normals: Float, color: Float, axes: Float, sky: Float | float) -> Float:
+def shade(
+    normals: Float,
+    color: Float,
+    axes: Float,
+    sky: Float | float,
+    *,
+    parameters: LightParameters = RenderingParameters.light,
+) -> Float:
     """Linear light, of shape (N, 3), from surfaces with unit normals of shape (N, 3).
 
     Parameters
@@ -145,28 +142,31 @@ def shade(normals: Float, color: Float, axes: Float, sky: Float | float) -> Floa
         The camera's, as rows.
     sky : array of shape (N,), or float
         Share of the sky that is seen.
+    parameters : LightParameters
     """
+    sky_color, ground_color = np.array(parameters.sky_color), np.array(parameters.ground_color)
+    key, fill = (np.array(direction) for direction in (parameters.key_direction, parameters.fill_direction))
     # In the precision of the normals, of which there may be millions.
     kind = normals.dtype
     seen = normals @ axes.T.astype(kind)
-    # Squared, because light that bounces between close walls is missing, and hollows should read as hollows.
+    # Squared, because light reflected between close walls is missing, and hollows should look hollow.
     share = np.broadcast_to(np.square(np.asarray(sky, dtype=kind)), len(seen))[:, None]
     height = (seen[:, 1:2] + 1) / 2
-    light = (GROUND.astype(kind) + (SKY - GROUND).astype(kind) * height) * share
-    for direction, strength in (KEY, FILL):
-        # Wrapping the light a little round the form keeps the shaded side readable.
+    light = (ground_color.astype(kind) + (sky_color - ground_color).astype(kind) * height) * share
+    for direction, strength in ((key, parameters.key_strength), (fill, parameters.fill_strength)):
+        # Wrapped lighting keeps the shaded side readable.
         facing = np.clip((seen @ (direction / np.linalg.norm(direction)).astype(kind) + 0.15) / 1.15, 0, 1)
         light += strength * facing[:, None] * (0.35 + 0.65 * share)
-    half = KEY[0] / np.linalg.norm(KEY[0]) + np.array([0, 0, 1])
+    half = key / np.linalg.norm(key) + np.array([0, 0, 1])
     gloss = np.clip(seen @ (half / np.linalg.norm(half)).astype(kind), 0, 1) ** 40
-    result: Float = color.astype(kind) * light / EXPOSURE + 0.06 * gloss[:, None] * share
+    result: Float = color.astype(kind) * light / parameters.exposure + 0.06 * gloss[:, None] * share
     return result
 
 
-def open_sky(scene: Any, points: Float, normals: Float, reach: float, directions: Float) -> Float:
+def sky_visibility(scene: Any, points: Float, normals: Float, reach: float, directions: Float) -> Float:
     """Share of the sky, of shape (N,), that surface points with unit normals see in directions of shape (D, 3).
 
-    The other parameters are those of `sky_share`.
+    The other parameters are those of `ambient_occlusion`.
     """
     from open3d import core
 
@@ -185,7 +185,13 @@ def open_sky(scene: Any, points: Float, normals: Float, reach: float, directions
     return share
 
 
-def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float) -> Float:
+def ambient_occlusion(
+    scene: Any,
+    points: Float,
+    normals: Float,
+    hit: Any,
+    reach: float = RenderingParameters.light.occlusion_reach,
+) -> Float:
     """Share of the sky seen from surface points, as an image, smoothed over about a pixel.
 
     Parameters
@@ -199,16 +205,16 @@ def sky_share(scene: Any, points: Float, normals: Float, hit: Any, reach: float)
         How near something must be to cover the sky.
     """
     image = np.zeros(hit.shape)
-    image[hit] = open_sky(scene, points, normals, reach, sphere_directions())
+    image[hit] = sky_visibility(scene, points, normals, reach, sphere_directions())
     # Averaging over the surface's own pixels alone keeps the outline free of a halo.
     smooth = gaussian_filter(image, 1.2) / np.maximum(gaussian_filter(hit.astype(np.float64), 1.2), 1e-9)
     return np.asarray(smooth)
 
 
-def sphere_directions() -> Float:
+def sphere_directions(count: int = RenderingParameters.light.sky_directions) -> Float:
     """Directions spread evenly over the sphere, of shape (N, 3), on a Fibonacci spiral."""
-    z = 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(DIRECTIONS)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     radius = np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
@@ -223,62 +229,68 @@ def to_bytes(light: Float) -> Any:
     return np.uint8(np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)))
 
 
-REACH = 0.7
-"""How near something must be to cover the sky, in halves of the mesh's longest side."""
+def vertex_ambient_occlusion(
+    mesh: Mesh,
+    *,
+    reach: float = RenderingParameters.light.occlusion_reach,
+    direction_sets: int = 8,
+    smoothing_passes: int = 6,
+) -> Float:
+    """Return the share of the sky that each vertex sees, of shape (V,), for viewers that cannot cast rays.
 
-TURNS = 8
-"""Sets of directions, turned against each other: were they the same for all vertices, they would show as bands."""
-
-PASSES = 6
-"""How often a vertex takes the mean of itself and its neighbours, and so mixes their directions."""
-
-
-# How much of the sky each vertex of a mesh sees, for viewers that cannot cast rays themselves.
-
-
-def vertex_sky(mesh: Mesh) -> Float:
-    """Return the share of the sky that each vertex sees, of shape (V,), from 0 to 1, smoothed over its neighbours."""
+    Parameters
+    ----------
+    mesh : Mesh
+    reach : float, halves of the mesh's longest side
+        How near something must be to cover the sky.
+    direction_sets : int
+        Rotated sets of directions that vertices take in turn: with the same set for all, bands would show.
+    smoothing_passes : int
+        Times that a vertex takes the mean of itself and its neighbours, which mixes their directions.
+    """
     centre, size = centre_and_size(mesh)
     unit = (mesh.vertices - centre) / size
     scene, normals = ray_scene(unit, mesh.faces), mesh.vertex_normals()
     share = np.empty(len(unit))
     # Normal numbers make quaternions of uniformly distributed rotations.
-    rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(TURNS, 4)))
+    rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(direction_sets, 4)))
     for turn, rotation in enumerate(rotations):
-        part = slice(turn, None, TURNS)
-        share[part] = open_sky(scene, unit[part], normals[part], REACH, rotation.apply(sphere_directions()))
+        part = slice(turn, None, direction_sets)
+        share[part] = sky_visibility(scene, unit[part], normals[part], reach, rotation.apply(sphere_directions()))
     start, end = mesh.faces[:, [0, 1, 2]].reshape(-1), mesh.faces[:, [1, 2, 0]].reshape(-1)
     own = np.arange(len(share))
     rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])
     near = coo_array((np.ones(len(rows)), (rows, columns)), shape=2 * (len(share),)).tocsr()
     count = near.sum(axis=1)
-    for _ in range(PASSES):
+    for _ in range(smoothing_passes):
         share = near @ share / count
     return share
 
 
-FADE = 0.6
-"""Share of the background in the furthest point's colour."""
-
-
-# Point clouds as small shaded balls, drawn into a depth buffer.
-
-
 def draw_points(
-    points: Float, normals: Float | None, radius: float, camera: Camera, color: Float, background: Float
+    points: Float,
+    normals: Float | None,
+    radius: float,
+    camera: Camera,
+    color: Float,
+    background: Float,
+    *,
+    haze_share: float = 0.6,
 ) -> Float:
-    """Draw balls on a picture of linear light.
+    """Draw points as shaded balls on a picture of linear light.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3)
-        With normals, a ball is shaded half by its own form and half by the surface that it stands for, and left out
-        where that faces away. Without, balls fade with their depth.
+        With normals, a ball is shaded half by its own form and half by the surface's normal, and skipped where that
+        faces away. Without, balls fade with their depth.
     radius : float
         Of the balls.
     camera : Camera
     color : array of shape (3,), linear
     background : array of shape (H, W, 3), linear
+    haze_share : float
+        Share of the background in the farthest point's colour.
 
     Returns
     -------
@@ -307,7 +319,7 @@ def draw_points(
             form /= np.maximum(np.linalg.norm(form, axis=1, keepdims=True), 1e-9)
         light = shade(form, color, camera.axes, 1.0)
         if normals is None:
-            haze = FADE * far[drawn[visible], None]
+            haze = haze_share * far[drawn[visible], None]
             light = (1 - haze) * light + haze * background.reshape(-1, 3)[pixel[visible]]
         image[pixel[visible]] = light
     return image.reshape(background.shape)

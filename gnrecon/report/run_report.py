@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from gnrecon.export import Attribute, Invented, MeshFacts, Metrics, Neighbourhood, Trimming, quality
+from gnrecon.export import Attribute, MeshFacts, Metrics, Neighbourhood, Trimming, UnsupportedArea, quality
 from gnrecon.export.resolution import Fineness
 from gnrecon.fit import Misfit, NeuralSDF
 from gnrecon.geometry.mesh import Mesh
@@ -81,7 +81,7 @@ class FinishedMesh:
 
     mesh: Mesh
     facts: MeshFacts
-    unsupported: Invented
+    unsupported: UnsupportedArea
     attributes: list[Attribute]
     metrics: Metrics | None
 

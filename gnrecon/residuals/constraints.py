@@ -58,7 +58,7 @@ def design_region(value: Tensor, gradient: Tensor, target: Tensor | None) -> Lin
 
 
 def free_space(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
-    """The surface keeps away: f has its target's sign, and is not less in magnitude, r = min(0, sign(t) (f - t)).
+    """The surface keeps a distance: f has its target's sign and at least its magnitude, r = min(0, sign(t) (f - t)).
 
     Targets t are of shape (N,). Only points where f is nearer to zero, or has the other sign, have a residual.
     """
@@ -210,7 +210,7 @@ def _strain(value: Tensor, gradient: Tensor, hessian: Tensor, target: Tensor | N
     length, n = _unit(gradient)
     frame = tangent_frame(n)
     shape = frame.mT @ hessian @ frame / length[:, None, None]
-    # h . t_i, the part of dS that comes from the normal's turning: -(t_i . dn)(h . t_j) - (h . t_i)(t_j . dn).
+    # h . t_i, the part of dS due to the rotation of the normal: -(t_i . dn)(h . t_j) - (h . t_i)(t_j . dn).
     twist = (frame.mT @ _apply(hessian, n)[:, :, None])[:, :, 0] / length.square()[:, None]
     entries, by_gradient, by_hessian = [], [], []
     for i, j, factor in ((0, 0, 1.0), (0, 1, math.sqrt(2.0)), (1, 1, 1.0)):

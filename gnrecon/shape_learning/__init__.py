@@ -3,15 +3,16 @@
 from collections.abc import Callable
 
 from gnrecon.shape_learning.learn import OPTIMISERS, Learned, learn
+from gnrecon.shape_learning.learning_parameters import ShapeLearningParameters
 from gnrecon.shape_learning.part_problem import bracket
 from gnrecon.shape_learning.problems import catenoid, cone, developable_surface, enneper, minimal_surface
 from gnrecon.shape_learning.result import LearnedField, Measurement, mesh_of
 from gnrecon.shape_learning.scanned_shapes import ScannedSurface, scanned
 from gnrecon.shape_learning.shape_problem import (
-    Drawn,
-    Moment,
     Pretraining,
+    SampledPoints,
     ShapeProblem,
+    StepState,
     Term,
     at_points,
     circle,
@@ -26,19 +27,20 @@ from gnrecon.shape_learning.shape_problem import (
 )
 
 PROBLEMS: dict[str, Callable[[], ShapeProblem]] = {"catenoid": catenoid, "enneper": enneper, "cone": cone}
-"""Makes each of the paper's data-free problems by its name."""
+"""Creates each of the paper's data-free problems by its name."""
 
 __all__ = [
     "OPTIMISERS",
     "PROBLEMS",
-    "Drawn",
     "Learned",
     "LearnedField",
     "Measurement",
-    "Moment",
     "Pretraining",
+    "SampledPoints",
     "ScannedSurface",
+    "ShapeLearningParameters",
     "ShapeProblem",
+    "StepState",
     "Term",
     "at_points",
     "bracket",

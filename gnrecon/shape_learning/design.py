@@ -1,8 +1,8 @@
-"""A design problem from two files, in unit coordinates.
+"""A design problem from two files, in unit coordinates, and how well a mesh satisfies it.
 
-The frame is that of the design region: its box's centre is the origin and half its longest side is one. Interfaces are
-usually in the same coordinates as the region. Where a file has others, as that of the paper's bracket does
-(millimetres, while its region is normalised), a frame of its own says how they map: x = (file - origin) / scale.
+The frame is that of the design region: the centre of its box is the origin and half its longest side is one. Interfaces
+are usually in the same coordinates as the region. If not, as for the paper's bracket (millimetres, while its region is
+normalised), a separate frame maps them: x = (file - origin) / scale.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from gnrecon.export.boolean import from_solid, to_solid
 from gnrecon.export.mesh_statistics import face_components, submesh
-from gnrecon.export.metrics import Surface, nearest_on_surface, sample_surface
+from gnrecon.export.metrics import SurfaceQuery, nearest_on_surface, sample_surface
 from gnrecon.export.verify import failures, verify
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
@@ -25,15 +25,10 @@ from gnrecon.geometry.signed_distance import Box
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import InputError
 
-MARGIN = 0.1
-"""How far the problem's box reaches beyond the design region, in half its longest side."""
-
-_STRAY, _LONGEST = 0.02, 0.1
-
 
 @dataclass(frozen=True)
 class Design:
-    """A region to stay within and interfaces to be attached to, both in unit coordinates.
+    """A design region and the interfaces to which a part is attached, both in unit coordinates.
 
     Parameters
     ----------
@@ -48,14 +43,17 @@ class Design:
     frame: Frame
 
 
-def read_design(region: str | Path, interfaces: str | Path, interfaces_frame: Frame | None = None) -> Design:
+def read_design(
+    region: str | Path, interfaces: str | Path, interfaces_frame: Frame | None = None, *, margin: float = 0.1
+) -> Design:
     """Read a design problem.
 
     Parameters
     ----------
     region : file of a closed mesh: the design region
     interfaces : file of a mesh of open pieces whose faces look out of the part
-    interfaces_frame : leads from the interfaces' coordinates (as its file's) to those of the region's file
+    interfaces_frame : maps the coordinates of the interfaces' file to those of the region's file
+    margin : distance from the region to the faces of the problem's box, in half the region's longest side
 
     Raises
     ------
@@ -73,33 +71,28 @@ def read_design(region: str | Path, interfaces: str | Path, interfaces_frame: Fr
     low, high = envelope.vertices.min(axis=0), envelope.vertices.max(axis=0)
     frame = Frame((low + high) / 2, float((high - low).max()) / 2)
     walls = walls.with_vertices(frame.to_unit(walls.vertices))
-    made = DesignRegion(_cut_small(envelope.with_vertices(frame.to_unit(envelope.vertices))), MARGIN)
+    made = DesignRegion(_with_short_edges(envelope.with_vertices(frame.to_unit(envelope.vertices))), margin)
     _check_place(walls, made, interfaces)
     return Design(made, Interfaces(walls), frame)
 
 
-def _cut_small(mesh: Mesh) -> Mesh:
-    """Return the same surface with no edge longer than `_LONGEST`.
+def _with_short_edges(mesh: Mesh, *, longest_edge: float = 0.1) -> Mesh:
+    """Return the same surface with no edge longer than `longest_edge`, in unit coordinates.
 
-    The needles of which CAD systems make flat faces are too thin for the single precision of the search for the nearest
-    point, which would be off by a thousandth.
+    The needle triangles of CAD systems are too thin for the nearest-point search in single precision, whose error would
+    be a thousandth.
     """
-    return from_solid(to_solid(mesh, merge=False).refine_to_length(_LONGEST), mesh)
+    return from_solid(to_solid(mesh, merge=False).refine_to_length(longest_edge), mesh)
 
 
-def _check_place(walls: Mesh, region: DesignRegion, path: str | Path) -> None:
+def _check_place(walls: Mesh, region: DesignRegion, path: str | Path, *, tolerance: float = 0.02) -> None:
+    """Raise `InputError` if interfaces are outside of the region's box by more than `tolerance`."""
     beyond = np.maximum(region.mesh.vertices.min(axis=0) - walls.vertices, walls.vertices - region.mesh.vertices.max(0))
-    if beyond.max() > _STRAY:
+    if beyond.max() > tolerance:
         raise InputError(
-            f"{path}: the interfaces reach {beyond.max():.3g} half-lengths of the design region beyond its box; if "
-            "their coordinates are others, say which by their frame."
+            f"{path}: the interfaces reach {beyond.max():.3g} half-lengths of the design region beyond its box. If "
+            "they have other coordinates, give their frame."
         )
-
-
-# Interfaces: pieces of surface that a part must contain, with the normals that it must have there.
-#
-# They come as one mesh of separate pieces, such as the walls of bolt holes. Their faces look out of the part, as those
-# of a part do: into the hole.
 
 
 class InterfaceSample(NamedTuple):
@@ -118,12 +111,12 @@ class InterfaceSample(NamedTuple):
 
 
 class Interfaces:
-    """The interfaces of a part.
+    """The interfaces of a part: surfaces that it must contain, with their normals, such as walls of bolt holes.
 
     Parameters
     ----------
     mesh : Mesh
-        Unit coordinates; open, one connected piece for each interface.
+        Unit coordinates; open, one connected piece for each interface; faces point out of the part, into the hole.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -139,7 +132,7 @@ class Interfaces:
         return len(self.pieces)
 
     def sample(self, count: int, rng: np.random.Generator) -> InterfaceSample:
-        """Draw about `count` points, as many on each interface: a small one is held as firmly as a large one."""
+        """Draw about `count` points, the same number on each interface, so that small ones have equal weight."""
         each = max(1, round(count / len(self)))
         drawn = [sample_surface(piece, each, rng) for piece in self.pieces]
         normals = [sample.normals for sample in drawn if sample.normals is not None]
@@ -147,29 +140,17 @@ class Interfaces:
         return InterfaceSample(np.concatenate([sample.points for sample in drawn]), np.concatenate(normals), numbers)
 
 
-TOLERANCE = 1e-3
-
-_SAMPLES = 50_000
-
-_ON_EACH = 2000
-
-
-# How well a part keeps to its design: what of it is outside of the region, how far interfaces are, in how many pieces.
-#
-# All lengths are in half the region's longest side. Interfaces of holes lie on the region's own border, and a part that
-# is attached to them does, so that `violations` counts what is farther outside than a tolerance.
-
-
 @dataclass(frozen=True)
-class DesignFacts:
-    """What a part's mesh is, against its design.
+class DesignMeasurement:
+    """How well a part's mesh satisfies its design; lengths are in half the region's longest side.
 
     Parameters
     ----------
-    violations : share of its surface that lies farther than `TOLERANCE` outside of the region
-    depth : how far its farthest sampled point lies outside; 0 when none does
+    violations : share of its surface that is outside of the region by more than a tolerance; interfaces of holes, and
+        parts attached to them, lie on the region's border
+    depth : distance of the farthest sampled point outside of the region; 0 if there is none
     attachment : mean distance from the surface of the points of each interface
-    components : solid pieces; cavities within them do not count
+    components : solid pieces, without cavities
     """
 
     violations: float
@@ -179,11 +160,11 @@ class DesignFacts:
 
     @property
     def mean_attachment(self) -> float:
-        """Mean distance of all interfaces, each of the same weight."""
+        """Mean distance of all interfaces, with equal weights."""
         return float(np.mean(self.attachment))
 
     def describe(self) -> str:
-        """Say the facts in a sentence."""
+        """Return a summary in a sentence."""
         away = ", ".join(f"{distance:.1e}" for distance in self.attachment)
         pieces = "1 piece" if self.components == 1 else f"{self.components} pieces"
         return (
@@ -192,24 +173,35 @@ class DesignFacts:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """Return the facts as plain values."""
+        """Return the fields as plain values."""
         return {**asdict(self), "attachment": list(self.attachment), "mean_attachment": self.mean_attachment}
 
 
-def judge(mesh: Mesh, design: Design, rng: np.random.Generator) -> DesignFacts:
-    """Measure a part.
+def measure_design(
+    mesh: Mesh,
+    design: Design,
+    rng: np.random.Generator,
+    *,
+    tolerance: float = 1e-3,
+    surface_points: int = 50_000,
+    interface_points: int = 2000,
+) -> DesignMeasurement:
+    """Measure how well a part satisfies its design.
 
     Parameters
     ----------
     mesh : closed, in the coordinates of the region's file
-    rng : draws 50,000 points of its surface and 2,000 of each interface
+    rng : for the sampled points
+    tolerance : distance outside of the region from which on points are violations, in half its longest side
+    surface_points : points of the mesh that are compared with the region
+    interface_points : points of each interface that are compared with the mesh
     """
     part = mesh.with_vertices(design.frame.to_unit(mesh.vertices))
-    outside = design.region.distance(sample_surface(part, _SAMPLES, rng).points)
-    walls = design.interfaces.sample(_ON_EACH * len(design.interfaces), rng)
+    outside = design.region.distance(sample_surface(part, surface_points, rng).points)
+    walls = design.interfaces.sample(interface_points * len(design.interfaces), rng)
     away = nearest_on_surface(part, walls.points)[0]
-    return DesignFacts(
-        float((outside > TOLERANCE).mean()),
+    return DesignMeasurement(
+        float((outside > tolerance).mean()),
         max(0.0, float(outside.max())),
         tuple(float(away[walls.pieces == piece].mean()) for piece in range(len(design.interfaces))),
         solid_pieces(part),
@@ -217,26 +209,20 @@ def judge(mesh: Mesh, design: Design, rng: np.random.Generator) -> DesignFacts:
 
 
 def solid_pieces(mesh: Mesh) -> int:
-    """Return the number of solids that a closed, outward oriented mesh bounds: components that are no cavities."""
+    """Return the number of solids bounded by a closed, outward oriented mesh: components that are not cavities."""
     labels = face_components(mesh)
     return sum(submesh(mesh, labels == label).volume > 0 for label in range(labels.max(initial=-1) + 1))
 
 
-_NEAR_SHARE, _NEAR_SPREAD = 0.5, 0.03
-
-
-# The design region: the solid inside of a closed mesh, its signed distance, and points around it.
-
-
 class DesignRegion:
-    """The inside of a closed mesh.
+    """The solid inside a closed mesh, its signed distance, and points around it.
 
     Parameters
     ----------
     mesh : Mesh
         Closed, unit coordinates.
     margin : float
-        How far the box of the problem reaches beyond the mesh on each side.
+        Distance from the mesh to the faces of the problem's box.
     """
 
     def __init__(self, mesh: Mesh, margin: float) -> None:
@@ -244,8 +230,8 @@ class DesignRegion:
         self.box = Box.around(mesh.vertices, margin)
 
     @cached_property
-    def _surface(self) -> Surface:
-        return Surface(self.mesh)
+    def _surface(self) -> SurfaceQuery:
+        return SurfaceQuery(self.mesh)
 
     def inside(self, points: Float) -> Mask:
         """Return which points, of shape (N, 3), lie in the region, of shape (N,)."""
@@ -257,13 +243,20 @@ class DesignRegion:
         signed: Float = np.where(self.inside(points), -lengths, lengths)
         return signed
 
-    def around(self, count: int, rng: np.random.Generator) -> Float:
+    def around(
+        self, count: int, rng: np.random.Generator, *, near_share: float = 0.5, near_deviation: float = 0.03
+    ) -> Float:
         """Return points of the box, of shape (count, 3), half of them uniform, half of them near the region's border.
 
-        Most of what leaves a region does so by little, where uniform points are few.
+        Parts mostly leave a region by little, where there are few uniform points.
+
+        Parameters
+        ----------
+        near_share : fraction of the points that are near the border
+        near_deviation : standard deviation of their distance from it along each axis, in unit coordinates
         """
-        near = sample_surface(self.mesh, round(_NEAR_SHARE * count), rng).points
-        near = near + _NEAR_SPREAD * rng.standard_normal(near.shape)
+        near = sample_surface(self.mesh, round(near_share * count), rng).points
+        near = near + near_deviation * rng.standard_normal(near.shape)
         points = np.concatenate([self.box.sample(count - len(near), rng), near])
         within: Float = np.clip(points, self.box.lower, self.box.upper)
         return within

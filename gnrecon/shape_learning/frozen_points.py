@@ -1,14 +1,13 @@
-"""A problem's terms on the points of one step, as the least-squares problem that the optimisers solve.
+"""The terms of a problem on the points of one step, as the least-squares problem that the optimisers solve.
 
-Row i of a term with weight w and N points is sqrt(w / N) r_i. The points of a surface move with it: where the field
-changes, each goes along the gradient to where the field is as it was at the point (zero), and a trial's loss is that of
-the surface which the trial makes, not of the places where the old one was. A point's own velocity is -df / |grad f|
-along the normal n, so that its residual changes by
+Row i of a term with weight w and N points is sqrt(w / N) r_i. The points of a surface move with it: each goes along the
+gradient to where the changed field has the old value (zero), so the loss of a trial is that of the new surface. The
+velocity of a point is -df / |grad f| along the normal n, so its residual changes by
 
     dr - (d_n r) df / |grad f|,
 
-whose second part enters the rows as a coefficient of df (`levelset.transport`). The linear model then describes what a
-trial measures, and the ratio of both controls the steps.
+whose second part is a coefficient of df in the rows (`level_set.transport`). The linear model then agrees with the loss
+of a trial, and the ratio of actual and predicted decrease controls the steps.
 """
 
 from __future__ import annotations
@@ -26,17 +25,10 @@ from gnrecon.level_set import transported
 from gnrecon.residuals import Linearised, Residual, SecondOrder, tangents
 from gnrecon.runtime.chunks import slices
 
-CHUNK = 8192
-FOLLOWED, LONGEST = 2, 0.1
-"""Newton steps by which surface points follow a trial, and the longest one, in the coordinates' unit."""
-ASIDE = 2e-3
-"""Step of the differences that give derivatives along the normal, in the coordinates' unit: about as far as a step
-moves a surface. Where curvature changes fast, at a part's edges, what it does over that way is what counts."""
-
 
 @dataclass(frozen=True)
 class FrozenTerm:
-    """One constraint at the points of one step; `moves` where they belong to the surface and move with it."""
+    """One constraint at the points of one step; `moves` if they are on the surface and move with it."""
 
     name: str
     residual: Residual | SecondOrder
@@ -77,7 +69,7 @@ class FrozenProblem:
         return free
 
     def residual(self, free: Tensor) -> Tensor:
-        """Return the weighted residuals, of shape (M,), with surface points that have followed the surface."""
+        """Return the weighted residuals, of shape (M,), with surface points moved with the surface."""
         return torch.cat([free.new_zeros(0), *(rows for term in self.terms for rows in self._residuals(free, term))])
 
     def shares(self, free: Tensor) -> dict[str, float]:
@@ -93,7 +85,7 @@ class FrozenProblem:
         blocks: list[Block] = []
         residuals = [free.new_zeros(0)]
         for term in self.terms:
-            for points, target in self._pieces(free, term):
+            for points, target in self._batches(free, term):
                 jet = self._jet(free, term.residual, points, 1)
                 linear = self._linearised(free, term, jet, target, points)
                 residuals.append((linear.residual * term.scale).T.flatten())
@@ -103,7 +95,7 @@ class FrozenProblem:
         return LayeredJacobian(lambda: blocks, len(residual), sizes, free.device, stored=self.stored), residual
 
     def _residuals(self, free: Tensor, term: FrozenTerm) -> Iterator[Tensor]:
-        for points, target in self._pieces(free, term):
+        for points, target in self._batches(free, term):
             linear = evaluate(term.residual, self._jet(free, term.residual, points, 0), target)
             yield (linear.residual * term.scale).T.flatten()
 
@@ -117,28 +109,39 @@ class FrozenProblem:
         return transported(linear, jet.gradient, torch.zeros_like(jet.value), linear.rate(*along))
 
     def _rates_along_normals(
-        self, free: Tensor, residual: Residual | SecondOrder, jet: CurvedJet, points: Tensor
+        self,
+        free: Tensor,
+        residual: Residual | SecondOrder,
+        jet: CurvedJet,
+        points: Tensor,
+        *,
+        difference_step: float = 2e-3,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return the derivatives of f, grad f and Hess f, if the residual has it, along the normals.
 
-        By central differences: a third derivative of f in closed form would cost more. Differences of the residual
-        itself would not do, because that of the strain is in frames of its own, which may jump between two points.
-        In float32: over `ASIDE` its rounding is 1e-4 of the derivatives, which say how points move, to first order.
+        By central differences: third derivatives of f in closed form would cost more. Differences of the residual
+        itself are not possible, because the tangent frames of the strain may jump between two points. In float32:
+        over `difference_step` its rounding is 1e-4 of the derivatives.
+
+        Parameters
+        ----------
+        difference_step : in the coordinates' unit; about the motion of a surface in a step, so that where curvature
+            changes fast, at edges of a part, the difference is over that distance
         """
         slope: Tensor = torch.linalg.vector_norm(jet.gradient, dim=1)
-        beside = ASIDE * torch.nn.functional.normalize(jet.gradient, dim=1)
+        offset = difference_step * torch.nn.functional.normalize(jet.gradient, dim=1)
         directions = None if jet.directions is None else jet.directions.float()
         before, after = (
             replace(self._plain_jet(free.float(), residual, (points + side).float(), 0), directions=directions)
-            for side in (-beside, beside)
+            for side in (-offset, offset)
         )
-        turn = (after.gradient - before.gradient).to(free) / (2 * ASIDE)
+        turn = (after.gradient - before.gradient).to(free) / (2 * difference_step)
         if not isinstance(residual, SecondOrder):
             return slope, turn, None
-        return slope, turn, (after.hessian - before.hessian).to(free) / (2 * ASIDE)
+        return slope, turn, (after.hessian - before.hessian).to(free) / (2 * difference_step)
 
     def _jet(self, free: Tensor, residual: Residual | SecondOrder, points: Tensor, further: int) -> CurvedJet:
-        """Return the field with the derivatives that a residual takes, and `further` ones for its rows."""
+        """Return the field with the derivatives that a residual takes, and `further` orders for its rows."""
         jet = self._plain_jet(free, residual, points, further)
         if isinstance(residual, SecondOrder) and residual.tangential:
             return replace(jet, directions=tangents(jet.gradient))
@@ -148,23 +151,28 @@ class FrozenProblem:
         order = (2 if isinstance(residual, SecondOrder) else 1) + further
         return CurvedJet.of(self.network.layout.layers(free), self.network.activation, points, order)
 
-    def _pieces(self, free: Tensor, term: FrozenTerm) -> Iterator[tuple[Tensor, Tensor | None]]:
-        """Yield points, and targets, chunk by chunk; surface points where they have gone at `free`."""
-        for rows in slices(len(term.points), CHUNK):
+    def _batches(
+        self, free: Tensor, term: FrozenTerm, *, batch_points: int = 8192
+    ) -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Yield points and targets in batches that fit into the cache; surface points are moved to `free`."""
+        for rows in slices(len(term.points), batch_points):
             points = term.points[rows]
             if term.moves and free is not self.theta:
                 points = self._followed(free, points)
             yield points, None if term.target is None else term.target[rows]
 
-    def _followed(self, free: Tensor, points: Tensor) -> Tensor:
-        """Move points, of shape (N, 3), to where the field at `free` has the values that it had at them."""
+    def _followed(self, free: Tensor, points: Tensor, *, newton_steps: int = 2, longest_step: float = 0.1) -> Tensor:
+        """Move points, of shape (N, 3), to where the field at `free` has its old values at the points.
+
+        Each of the Newton steps is at most `longest_step` long, in the coordinates' unit.
+        """
         level = self.network.value(self.theta, points)
-        for _ in range(FOLLOWED):
+        for _ in range(newton_steps):
             value, gradient = self.network.value_and_gradient(free, points)
             square = gradient.square().sum(1).clamp_min(1e-12)
             step = ((level - value) / square)[:, None] * gradient
-            longest = torch.linalg.vector_norm(step, dim=1, keepdim=True).clamp_min(LONGEST)
-            points = points + step * (LONGEST / longest)
+            longest = torch.linalg.vector_norm(step, dim=1, keepdim=True).clamp_min(longest_step)
+            points = points + step * (longest_step / longest)
         return points
 
 

@@ -6,21 +6,21 @@ The paper's last experiment is the bracket of a jet engine. Its terms, all of th
     interface        f = 0             on the interfaces
     normal           grad f = n        there, in which the slope of one is included
     surface strain   k1^2 + k2^2       on the surface, except where it is an interface
-    connectedness    f = target        at passes between separate components (`levelset.connect`)
+    connectedness    f = target        at saddles between separate components (`level_set.topology`)
     eikonal          |grad f| = 1      in the box
 
-The paper asks for f >= 0 outside of the region, which leaves sheets far from the part that hardly go below zero, and
-whose points are few. The signed distance of a part within the region is at least that of the region, so half of that is
-no more than what the eikonal term asks for.
+The paper requires f >= 0 outside of the region, which leaves sheets far from the part where f is hardly below zero,
+with few points. The signed distance of a part within the region is at least that of the region, so half of that is less
+than the eikonal term requires.
 
-It begins as a part that the region holds and the interfaces bound: the region itself, worn off to a depth that falls
-to nothing at the interfaces. A network that is fitted to that, and to the interfaces and their normals, is far nearer
-to a feasible part than one that is fitted to the region's distance alone. The problem is posed in unit coordinates, in
-which half the longest side of the region's box is one.
+The start is a part within the region and bounded by the interfaces: the region itself, eroded to a depth that falls to
+zero at the interfaces. A network fitted to this, the interfaces and their normals is much nearer to a feasible part
+than one fitted only to the signed distance of the region. The problem is in unit coordinates, in which half the longest
+side of the region's box is one.
 
-What is outside of the region is asked of points drawn near its border as well as in the whole box, and of a layer just
-within the border too (`MARGIN`), so that what is left of the term's residual lies within the region. An interface may
-lie on the border itself; the layer is thinner there.
+The design region is enforced at points near its border and in the whole box. A thin layer just inside the border is
+kept free too, so that the remaining violation of the term is inside the region. An interface may lie on the border; the
+layer is thinner there. All numbers are in `PartParameters`.
 """
 
 from __future__ import annotations
@@ -46,14 +46,15 @@ from gnrecon.residuals import (
     surface_strain,
 )
 from gnrecon.shape_learning.design import Design, InterfaceSample
+from gnrecon.shape_learning.learning_parameters import PartParameters, ShapeLearningParameters
 from gnrecon.shape_learning.shape_problem import (
-    LAST,
-    Drawn,
-    Moment,
     Pretraining,
+    SampledPoints,
     Sampler,
     ShapeProblem,
+    StepState,
     Term,
+    Weight,
     at_points,
     falling,
     in_box,
@@ -61,161 +62,165 @@ from gnrecon.shape_learning.shape_problem import (
     rising,
 )
 
-NETWORK = Network((24, 24), WAVELET, (14.0, 4.0))
-"""The paper's has 2 x 32 wavelets; a step's cost grows with the fourth power of the width."""
-
-STRAIN, EIKONAL, NORMAL, CONNECTED = 1e-4, 0.1, 0.3, 1e3
-INTERFACE, REGION = rising(3e3, 60, 1.02, 1.5e4), rising(3e4, 60, 1.02, 1e6)
-"""Weights. The paper's are 1e-4, 1, 10, 1e3, 10 and 1e3; a slope of one everywhere costs the part its fit. The last two
-rise, as what a term leaves over where it acts falls with its weight, and at once they would tear the start apart."""
-
-ON_SURFACE, ON_INTERFACES, IN_BOX, AROUND = 600, 1000, 600, 12_000
-"""Points of each term at each step."""
-
-POOL = 100_000
-"""Points around the region and on the interfaces that each step draws from, so that distances are computed once."""
-
-MARGIN, THINNER = 0.018, 0.33
-"""Depth of the layer within the region's border that is kept free as well."""
-
-CLEARANCE = 0.5
-"""Least value of f outside of the region, as a share of the distance from it; a distance would have all of it."""
-
-ACTIVE = 0.015
-"""Points outside of the region with a larger value than this have no residual, nor will have after the step."""
-
-CLIP_START, CLIP_FALL = 100.0, 0.99
-"""How many times its end the clipping's maximum is at first, and its factor from step to step. What is clipped is not
-pulled at: creases of a part that has not found its shape yet would stay."""
-
-BESIDE = 0.02
-"""Distance from an interface within which the strain is none of the part's."""
-
-CELLS = 64
-"""Cells along the longest side of the grid on which components are found, as in the paper."""
-
-FAR = 0.08
-"""Distance from which on points are simply far from interfaces."""
-
-EROSION = 0.04
-"""Depth within the region's border at which the part begins, but for what is near to an interface, where it is less."""
-
-FIRST_STEPS, FIRST_POINTS, FIRST_INTERFACE, FIRST_NORMAL = 120, 4000, 10.0, 3e-3
-"""Of the pretraining: most steps, points of the distance, and the weights of the interfaces beside it."""
-
-KEEP, LENGTH = 0.8, 0.2
-"""Share of the former mean of J^T J in the next one, and of each step that is gone."""
-
-NECK = 0.02
-"""How far beyond zero f should be where components are joined, or removed."""
+DistanceFunction = Callable[[Float], Float]
+"""From points, of shape (N, 3), to their distances from the interfaces, of shape (N,)."""
 
 
-def bracket(design: Design, seed: int = 0, clip: float | None = None, network: Network | None = None) -> ShapeProblem:
+def bracket(
+    design: Design,
+    seed: int = 0,
+    clip: float | None = None,
+    network: Network | None = None,
+    *,
+    parameters: PartParameters = ShapeLearningParameters.part,
+) -> ShapeProblem:
     """Return the problem of a part.
 
     Parameters
     ----------
     design : its region and interfaces
-    seed : of the pools that each step's points are drawn from
+    seed : of the pools from which the points of each step are drawn
     clip : greatest strain k1^2 + k2^2 that counts, per squared unit length, or None for all of it
-    network : by default `NETWORK`
+    network : by default wavelets with the widths and frequencies of the parameters
+    parameters : weights, points and lengths
     """
     rng = np.random.default_rng(seed)
-    walls = design.interfaces.sample(POOL, rng)
-    off_walls = _off(walls.points)
-    around = design.region.around(POOL, rng)
+    walls = design.interfaces.sample(parameters.pool_points, rng)
+    interface_distance = _interface_distance(walls.points, parameters.erosion_interface_distance)
+    around = design.region.around(parameters.pool_points, rng)
     distance = design.region.distance(around)
-    strain = surface_strain if clip is None else clipped_strain(clip)
+
+    def start(x: Float) -> Float:
+        return design.region.distance(x) + _erosion_depth(interface_distance(x), parameters)
+
     return ShapeProblem(
         "bracket",
-        (
-            Term("design region", design_region, _outside(around, distance, off_walls), REGION),
-            Term("interface", interface, at_points(walls.points, count=ON_INTERFACES), INTERFACE),
-            Term("normal", normal_vector, at_points(walls.points, walls.normals, count=ON_INTERFACES), NORMAL),
-            Term("surface strain", strain, _free_surface(off_walls, clip), STRAIN),
-            Term("connectedness", signed_distance, _joints(design, walls.points), CONNECTED),
-            Term("eikonal", eikonal, in_box(IN_BOX), EIKONAL),
-        ),
+        _terms(design, clip, walls, (around, distance), interface_distance, parameters),
         design.region.box,
-        lambda x: torch.as_tensor(design.region.distance(x.numpy()) + _depth(off_walls(x.numpy()))),
-        network or NETWORK,
-        search=GainRatioDamping(initial_damping=0.1, metric=identity, length=LENGTH),
-        solver=lambda: Averaged(KEEP),
-        pretraining=_pretraining(around, distance + _depth(off_walls(around)), walls),
+        lambda x: torch.as_tensor(start(x.numpy())),
+        network or Network(parameters.widths, WAVELET, parameters.frequencies),
+        search=GainRatioDamping(
+            initial_damping=parameters.first_damping, metric=identity, length=parameters.step_length
+        ),
+        solver=lambda: Averaged(parameters.matrix_mean_memory),
+        pretraining=_pretraining(
+            around, distance + _erosion_depth(interface_distance(around), parameters), walls, parameters
+        ),
     )
 
 
-def _depth(off_walls: Float) -> Float:
-    """Return how deep the region is worn off, of shape (N,), at distances of shape (N,) from the interfaces."""
-    share = np.minimum(off_walls / FAR, 1.0)
-    depth: Float = EROSION * share**2 * (3 - 2 * share)
+def _terms(
+    design: Design,
+    clip: float | None,
+    walls: InterfaceSample,
+    pool: tuple[Float, Float],
+    interface_distance: DistanceFunction,
+    parameters: PartParameters,
+) -> tuple[Term, ...]:
+    """Return the terms; `pool` has points around the region and their distances from it."""
+
+    def rise(weight: float, most: float) -> Weight:
+        return rising(weight, parameters.weight_hold_steps, parameters.weight_growth, most)
+
+    region_weight = rise(parameters.region_weight, parameters.most_region_weight)
+    interface_weight = rise(parameters.interface_weight, parameters.most_interface_weight)
+    strain = surface_strain if clip is None else clipped_strain(clip)
+    outside = _outside(*pool, interface_distance, parameters)
+    on_walls = at_points(walls.points, count=parameters.interface_points)
+    with_normals = at_points(walls.points, walls.normals, count=parameters.interface_points)
+    free_surface = _free_surface(interface_distance, clip, parameters)
+    connections = _connections(design, walls.points, parameters)
+    return (
+        Term("design region", design_region, outside, region_weight),
+        Term("interface", interface, on_walls, interface_weight),
+        Term("normal", normal_vector, with_normals, parameters.normal_weight),
+        Term("surface strain", strain, free_surface, parameters.strain_weight),
+        Term("connectedness", signed_distance, connections, parameters.connectedness_weight),
+        Term("eikonal", eikonal, in_box(parameters.box_points), parameters.eikonal_weight),
+    )
+
+
+def _erosion_depth(interface_distances: Float, parameters: PartParameters) -> Float:
+    """Return the depth by which the region is eroded, of shape (N,), at distances of shape (N,) from the interfaces."""
+    share = np.minimum(interface_distances / parameters.erosion_interface_distance, 1.0)
+    depth: Float = parameters.erosion_depth * share**2 * (3 - 2 * share)
     return depth
 
 
-def _pretraining(points: Float, start: Float, walls: InterfaceSample) -> Pretraining:
+def _pretraining(points: Float, start: Float, walls: InterfaceSample, parameters: PartParameters) -> Pretraining:
     """Return the fit of the start's values, of shape (N,), at points of shape (N, 3), and of the interfaces."""
+    on_walls = at_points(walls.points, count=parameters.interface_points)
+    with_normals = at_points(walls.points, walls.normals, count=parameters.interface_points)
     terms = (
-        Term("start", signed_distance, at_points(points, start, FIRST_POINTS)),
-        Term("interface", interface, at_points(walls.points, count=ON_INTERFACES), FIRST_INTERFACE),
-        Term("normal", normal_vector, at_points(walls.points, walls.normals, count=ON_INTERFACES), FIRST_NORMAL),
+        Term("start", signed_distance, at_points(points, start, parameters.pretraining_points)),
+        Term("interface", interface, on_walls, parameters.pretraining_interface_weight),
+        Term("normal", normal_vector, with_normals, parameters.pretraining_normal_weight),
     )
-    # Fresh points make the loss rise and fall, which is no sign of its end.
-    return Pretraining(terms, FIRST_STEPS, tolerance=0.0, patience=FIRST_STEPS)
+    # With new points at each step the loss is not monotone, so a rising loss does not end the fit.
+    steps = parameters.pretraining_steps
+    return Pretraining(terms, steps, tolerance=0.0, patience=steps)
 
 
-def _off(walls: Float) -> Callable[[Float], Float]:
+def _interface_distance(walls: Float, farthest: float) -> DistanceFunction:
     """Return a function that gives the distances, of shape (N,), of points, (N, 3), from the interfaces' points.
 
-    Beyond `FAR` they are infinite: points on a hole's axis are as far from all of its wall, which costs the search.
+    Beyond `farthest` they are infinite. This saves time for points on the axis of a hole, which are equally far from
+    all points of its wall.
     """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(walls)
-    return lambda points: tree.query(points, distance_upper_bound=FAR)[0]
+    return lambda points: tree.query(points, distance_upper_bound=farthest)[0]
 
 
-def _outside(around: Float, distance: Float, off_walls: Callable[[Float], Float]) -> Sampler:
-    """Return a sampler of points that are to be outside of the part; those far outside of it are counted, not drawn."""
-    layer = np.minimum(MARGIN, THINNER * off_walls(around))
+def _outside(
+    around: Float, distance: Float, interface_distance: DistanceFunction, parameters: PartParameters
+) -> Sampler:
+    """Return a sampler of points that should be outside of the part; those far outside of it are only counted."""
+    layer = np.minimum(
+        parameters.layer_depth, parameters.layer_depth_per_interface_distance * interface_distance(around)
+    )
     kept = distance > -layer
-    pool, least = torch.as_tensor(around[kept]), torch.as_tensor(CLEARANCE * np.maximum(distance[kept], 0.0))
+    pool = torch.as_tensor(around[kept])
+    least = torch.as_tensor(parameters.clearance_per_distance * np.maximum(distance[kept], 0.0))
 
-    def draw(moment: Moment) -> Drawn:
-        rows = torch.as_tensor(moment.rng.integers(len(pool), size=AROUND))
+    def draw(state: StepState) -> SampledPoints:
+        rows = torch.as_tensor(state.rng.integers(len(pool), size=parameters.region_points))
         points, targets = pool[rows], least[rows]
-        active = moment.level_set.values(points) - targets < ACTIVE
-        return Drawn(points[active], targets[active], share=int(active.sum()) / AROUND)
+        active = state.level_set.values(points) - targets < parameters.active_value
+        return SampledPoints(points[active], targets[active], share=int(active.sum()) / parameters.region_points)
 
     return draw
 
 
-def _free_surface(off_walls: Callable[[Float], Float], clip: float | None) -> Sampler:
-    """Return a sampler of the surface away from the interfaces, which are given, with the most strain that counts."""
-    everywhere = on_surface(ON_SURFACE)
-    most = None if clip is None else falling(CLIP_START * clip, CLIP_FALL, clip)
+def _free_surface(interface_distance: DistanceFunction, clip: float | None, parameters: PartParameters) -> Sampler:
+    """Return a sampler of the surface away from the interfaces, with the largest strain that counts as targets."""
+    everywhere = on_surface(parameters.surface_points)
+    most = None if clip is None else falling(parameters.clip_start_factor * clip, parameters.clip_fall, clip)
 
-    def draw(moment: Moment) -> Drawn:
-        points = everywhere(moment).points
-        points = points[torch.as_tensor(off_walls(points.numpy()) > BESIDE)]
-        target = None if most is None else torch.full_like(points[:, 0], most(moment.step))
-        return Drawn(points, target, on_surface=True)
+    def draw(state: StepState) -> SampledPoints:
+        points = everywhere(state).points
+        free = interface_distance(points.numpy()) > parameters.interface_strain_distance
+        points = points[torch.as_tensor(free)]
+        target = None if most is None else torch.full_like(points[:, 0], most(state.step))
+        return SampledPoints(points, target, on_surface=True)
 
     return draw
 
 
-def _joints(design: Design, walls: Float) -> Sampler:
-    """Return a sampler of the points that join components, found beside the step from the field of one step ago."""
-    region = GridRegion.within(design.region.box, design.region.inside, CELLS)
-    anchors = walls[:: len(walls) // 2000]
+def _connections(design: Design, walls: Float, parameters: PartParameters) -> Sampler:
+    """Return a sampler of points that connect components, found in parallel from the field of the previous step."""
+    region = GridRegion.within(design.region.box, design.region.inside, parameters.component_cells)
+    anchors = walls[:: len(walls) // parameters.anchor_points]
 
-    def work(level_set: LevelSet) -> ConnectionTargets:
-        return joints(level_set, region, NECK, anchors)
+    def find(level_set: LevelSet) -> ConnectionTargets:
+        return joints(level_set, region, parameters.neck_value, anchors)
 
-    worker = LaggedWorker(work)
+    worker = LaggedWorker(find)
 
-    def draw(moment: Moment) -> Drawn:
-        # What is measured once is measured as it is.
-        found = work(moment.level_set) if moment.step == LAST else worker(moment.level_set)
-        return Drawn(found.points, found.targets)
+    def draw(state: StepState) -> SampledPoints:
+        # A measurement uses the current field.
+        found = find(state.level_set) if state.measuring else worker(state.level_set)
+        return SampledPoints(found.points, found.targets)
 
     return draw

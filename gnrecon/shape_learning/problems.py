@@ -2,10 +2,10 @@
 
 The paper's two have known solutions: the catenoid between two circles of radius cosh 1 at z = -1 and 1, and Enneper's
 surface within its boundary curve of parameter radius 0.9. Its terms are the interface, f = 0 on the curves, and the
-mean curvature on the surface within the box, both of weight one (`shapes.curves`).
+mean curvature on the surface within the box, both with weight one (see `through_curves`).
 
-Once the surface has its shape, its distance from the known one is about the residual on the curves. So the interface's
-weight rises after forty steps, to fifty; the loss that is reported has the paper's weights.
+Once the surface has its shape, its distance from the known one is about the residual on the curves. So the weight of
+the interface rises from one to fifty after forty steps. The reported loss has the paper's weights.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import SecondOrder, eikonal, gauss_curvature, interface, mean_curvature
 from gnrecon.runtime.errors import UsageError
+from gnrecon.shape_learning.learning_parameters import CurveParameters, ShapeLearningParameters
 from gnrecon.shape_learning.shape_problem import (
     ShapeProblem,
     Start,
@@ -37,12 +38,14 @@ from gnrecon.shape_learning.shape_problem import (
     z_plane,
 )
 
-RISE = 40, 1.1, 50.0
-"""Steps for which the interface keeps the weight one, its factor from step to step after them, and its most."""
-
 
 def minimal_surface(
-    curve: npt.ArrayLike, *, start: Start | None = None, box: Box | None = None, name: str = "minimal surface"
+    curve: npt.ArrayLike,
+    *,
+    start: Start | None = None,
+    box: Box | None = None,
+    name: str = "minimal surface",
+    parameters: CurveParameters = ShapeLearningParameters.curves,
 ) -> ShapeProblem:
     """Return the problem of a minimal surface through curves.
 
@@ -57,7 +60,8 @@ def minimal_surface(
     UsageError
         When there are fewer than three points, or they are not finite.
     """
-    return through_curves(name, curve, mean_curvature, start, box, rising(1.0, *RISE))
+    weight = rising(1.0, parameters.weight_hold_steps, parameters.weight_growth, parameters.most_weight)
+    return through_curves(name, curve, mean_curvature, start, box, weight, parameters=parameters)
 
 
 def catenoid() -> ShapeProblem:
@@ -81,13 +85,18 @@ def enneper(radius: float = 0.9) -> ShapeProblem:
 # Developable surfaces, k1 k2 = 0: those that unroll into the plane without stretching.
 #
 # The paper's is the mantle of a truncated cone between a circle of radius 1 at z = 0 and one of radius 0.4 at z = 1.
-# Its terms are those of `shapes.minimal` with the Gauss curvature in the place of the mean one. Where a surface is flat
-# in every direction the Gauss curvature vanishes to second order and tells a step nothing, so that the start matters
-# more: the problem has other solutions, such as two planes.
+# The terms are those of a minimal surface with the Gauss curvature instead of the mean curvature. Where a surface is
+# flat the Gauss curvature vanishes to second order and its derivative is zero, so the start matters more: the problem
+# has other solutions, such as two planes.
 
 
 def developable_surface(
-    curve: npt.ArrayLike, *, start: Start | None = None, box: Box | None = None, name: str = "developable surface"
+    curve: npt.ArrayLike,
+    *,
+    start: Start | None = None,
+    box: Box | None = None,
+    name: str = "developable surface",
+    parameters: CurveParameters = ShapeLearningParameters.curves,
 ) -> ShapeProblem:
     """Return the problem of a developable surface through curves.
 
@@ -102,7 +111,7 @@ def developable_surface(
     UsageError
         When there are fewer than three points, or they are not finite.
     """
-    return through_curves(name, curve, gauss_curvature, start, box)
+    return through_curves(name, curve, gauss_curvature, start, box, parameters=parameters)
 
 
 def cone() -> ShapeProblem:
@@ -113,21 +122,11 @@ def cone() -> ShapeProblem:
     return replace(problem, known=level_set.cone(), shown=mantle)
 
 
-ON_SURFACE, ON_CURVE, IN_BOX = 2000, 500, 300
-"""Points of each term at each step."""
-
-HOLD, FACTOR = 10, 0.7
-"""Steps for which the eikonal term keeps its weight, and its factor from step to step after them."""
-
-MARGIN = 0.25
-"""How far the box reaches beyond a curve, as a share of the curve's longest side."""
-
-
 # Surfaces through given curves: f = 0 on the curves, and one residual of curvature on the surface.
 #
-# Neither says what the field's slope is, and a field that shrinks on a curve satisfies the first without moving its
-# surface. So the eikonal term begins with a weight of one and fades over some thirty steps to nothing; the paper's
-# begins with 1e-3 and ends after 500 steps.
+# Neither determines the slope of the field, and a field whose slope vanishes on a curve satisfies the first without
+# moving the surface. So the eikonal term starts with a weight of one and fades to zero within about thirty steps; in
+# the paper it starts with 1e-3 and ends after 500 steps.
 
 
 def through_curves(
@@ -137,6 +136,8 @@ def through_curves(
     start: Start | None,
     box: Box | None,
     weight: float | Weight = 1.0,
+    *,
+    parameters: CurveParameters = ShapeLearningParameters.curves,
 ) -> ShapeProblem:
     """Return the problem of a surface through curves on which a residual of curvature vanishes.
 
@@ -147,7 +148,8 @@ def through_curves(
     curvature : the residual
     start : a function of the wanted topology, by default the distance to the plane that fits the curve best
     box : where the curvature vanishes, by default the curve's bounding box and a quarter of its longest side more
-    weight : of f = 0 on the curves; the reported loss has one
+    weight : of f = 0 on the curves; one in the reported loss
+    parameters : points, weights and margins
 
     Raises
     ------
@@ -155,12 +157,14 @@ def through_curves(
         When there are fewer than three points, or they are not finite.
     """
     points = curve_points(curve)
+    eikonal_weight = fading(1.0, parameters.eikonal_hold_steps, parameters.eikonal_factor)
     terms = (
-        Term("interface", interface, at_points(points, count=ON_CURVE), weight, reported=1.0),
-        Term(curvature.name, curvature, on_surface(ON_SURFACE)),
-        Term("eikonal", eikonal, in_box(IN_BOX), fading(1.0, HOLD, FACTOR)),
+        Term("interface", interface, at_points(points, count=parameters.curve_points), weight, reported=1.0),
+        Term(curvature.name, curvature, on_surface(parameters.surface_points)),
+        Term("eikonal", eikonal, in_box(parameters.box_points), eikonal_weight),
     )
-    return ShapeProblem(name, terms, box or box_around(points), start or plane_through(points))
+    box = box or box_around(points, parameters.box_margin_sides)
+    return ShapeProblem(name, terms, box, start or plane_through(points))
 
 
 def curve_points(curve: npt.ArrayLike) -> Float:
@@ -177,6 +181,6 @@ def curve_points(curve: npt.ArrayLike) -> Float:
     return points
 
 
-def box_around(points: Float) -> Box:
-    """Return a box around a curve."""
-    return Box.around(points, MARGIN * float((points.max(axis=0) - points.min(axis=0)).max()))
+def box_around(points: Float, margin_sides: float = CurveParameters.box_margin_sides) -> Box:
+    """Return a box around a curve, with a margin in longest sides of the curve."""
+    return Box.around(points, margin_sides * float((points.max(axis=0) - points.min(axis=0)).max()))

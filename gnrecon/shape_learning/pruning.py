@@ -1,8 +1,8 @@
-"""Taking hidden units away where that costs least: a network that began wider ends in a lower minimum than others.
+"""Removes the hidden units that cost least, because a network that starts wider ends in a lower minimum.
 
-A unit is gone once its q weights into the next layer are zero. Within the linear model of the residuals, with
-H = J^T J + shift I, that costs  q . B^-1 q / 2,  B being the block of H^-1 at q, when the other parameters move by
--H^-1[:, q] B^-1 q. Steps of the optimiser then make up for what the model did not see.
+A unit is removed by setting its q weights into the next layer to zero. In the linear model of the residuals, with
+H = J^T J + shift I, this costs  q . B^-1 q / 2,  with B the block of H^-1 at q, if the other parameters move by
+-H^-1[:, q] B^-1 q. Steps of the optimiser then correct the error of the model.
 Source: Hassibi and Stork, Second order derivatives for network pruning: optimal brain surgeon (1993), with the
 Gauss-Newton matrix in the place of the Hessian.
 """
@@ -21,19 +21,10 @@ from gnrecon.least_squares.direct import damped_factor
 from gnrecon.optim.problem import loss_of
 from gnrecon.shape_learning.frozen_points import FrozenProblem
 
-SHIFT = 1e-7
-"""Of J^T J's largest diagonal entry: less is lost in rounding where rows are stored in float32."""
-
-TRIED = 4
-"""Units of the least predicted cost whose removal is evaluated."""
-
-SHARES = 1.0, 0.5
-"""Shares of what the model says the others should move by that are tried; it reaches far beyond where it holds."""
-
 
 @dataclass(frozen=True)
 class _Removal:
-    """What taking away a hidden unit of a layer would cost, and how the other parameters, of shape (p,), would move."""
+    """The predicted cost of removing a hidden unit, and the predicted move of all parameters, of shape (p,)."""
 
     layer: int
     unit: int
@@ -42,27 +33,33 @@ class _Removal:
 
 
 def widened(network: Network, more: int) -> Network:
-    """Return the network with so many more units in each hidden layer."""
+    """Return the network with `more` additional units in each hidden layer."""
     return replace(network, widths=tuple(width + more for width in network.widths))
 
 
-def narrower(problem: FrozenProblem, goal: tuple[int, ...]) -> tuple[Network, Tensor]:
+def narrower(
+    problem: FrozenProblem, goal: tuple[int, ...], *, candidates: int = 4, move_shares: tuple[float, ...] = (1.0, 0.5)
+) -> tuple[Network, Tensor]:
     """Return the problem's network without one unit, and its parameters, of shape (p',).
 
-    It is the one whose loss is the least, of some that the linear model finds cheap, in layers wider than `goal`.
+    Parameters
+    ----------
+    goal : widths; only layers that are wider lose a unit
+    candidates : units of the least predicted cost whose removal is evaluated; the one with the least loss is removed
+    move_shares : fractions of the predicted move that are tried, as it is often longer than the range of the model
 
     Raises
     ------
     ValueError
         When no layer is wider.
     """
-    found = sorted(_removals(problem, goal), key=lambda removal: removal.cost)[:TRIED]
+    found = sorted(_removals(problem, goal), key=lambda removal: removal.cost)[:candidates]
     if not found:
         raise ValueError(f"No layer of {problem.network.widths} is wider than {goal}.")
     trials = [
         without_unit(problem.network, problem.theta + share * removal.move, removal.layer, removal.unit)
         for removal in found
-        for share in SHARES
+        for share in move_shares
     ]
     return min(trials, key=lambda trial: _loss(problem, *trial))
 
@@ -80,13 +77,16 @@ def without_unit(network: Network, theta: Tensor, layer: int, unit: int) -> tupl
     return made, made.layout.flatten(layers)
 
 
-def _removals(problem: FrozenProblem, goal: tuple[int, ...]) -> Iterator[_Removal]:
-    """Yield what each unit of the layers wider than the goal would cost."""
+def _removals(problem: FrozenProblem, goal: tuple[int, ...], *, shift: float = 1e-7) -> Iterator[_Removal]:
+    """Yield the removal of each unit of the layers wider than the goal.
+
+    `shift` is relative to the largest diagonal entry of J^T J, above the rounding of rows stored in float32.
+    """
     network, theta = problem.network, problem.theta
     jacobian, _ = problem.linearise(theta)
     product = jacobian.gram()
-    factor = damped_factor(product, SHIFT * product.diagonal().max().expand(len(product)))
-    if factor is None:  # J is not finite, or of rounding: weights alone must tell then
+    factor = damped_factor(product, shift * product.diagonal().max().expand(len(product)))
+    if factor is None:  # J is not finite, or all rounding: rank by the weights alone
         factor = torch.eye(len(product)).to(product)
     inverse = torch.cholesky_inverse(factor)
     for layer, width in enumerate(network.widths):

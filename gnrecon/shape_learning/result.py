@@ -1,4 +1,4 @@
-"""A learned field as the exporter sees it, and the mesh of the part that is shown."""
+"""A learned field, its mesh in a box, and measurements of its loss and error at fresh points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.export import extract, project
-from gnrecon.export.trim import clip
+from gnrecon.export.trim import clip_to_box
 from gnrecon.field import Network
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -18,15 +18,13 @@ from gnrecon.geometry.point_cloud import Frame
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.level_set import chamfer_divergence
 from gnrecon.runtime.errors import FitError, MeshError
-from gnrecon.shape_learning.shape_problem import LAST, ShapeProblem
-
-MARGIN = 2
-"""Cells around the shown box that are meshed as well, so that the cap that closes the field there is cut off."""
+from gnrecon.shape_learning.learning_parameters import ShapeLearningParameters
+from gnrecon.shape_learning.shape_problem import ShapeProblem
 
 
 @dataclass(frozen=True)
 class LearnedField:
-    """A network's values as a field in its own coordinates; about a distance where the terms made it one.
+    """A network's values as a field in its own coordinates; approximately a distance if the terms require it.
 
     Parameters
     ----------
@@ -67,12 +65,13 @@ class LearnedField:
         return self.network.curved_jet(self.theta, torch.as_tensor(points)).hessian.numpy()
 
 
-def mesh_of(field: LearnedField, shown: Box, resolution: int) -> Mesh:
-    """Return the mesh of the part of a field's zero level in a box, with normals: open where it leaves the box.
+def mesh_of(field: LearnedField, shown: Box, resolution: int, *, margin_cells: int = 2) -> Mesh:
+    """Return the mesh of a field's zero level in a box, with normals; it is open where it leaves the box.
 
     Parameters
     ----------
     resolution : cells along the longest side of the box
+    margin_cells : cells around the box that are meshed too, so that the cap that closes the mesh is cut off
 
     Raises
     ------
@@ -81,22 +80,15 @@ def mesh_of(field: LearnedField, shown: Box, resolution: int) -> Mesh:
     """
     sides = shown.upper - shown.lower
     cell = float(sides.max() / resolution)
-    # Whole cells, so that the planes of the box are planes of the lattice where its sides allow it.
+    # Whole cells, so that the planes of the box are planes of the lattice if its sides allow it.
     cells = np.ceil(sides / cell - 1e-9)
-    grow = (cells * cell - sides) / 2 + MARGIN * cell
+    grow = (cells * cell - sides) / 2 + margin_cells * cell
     outer = np.stack([shown.lower - grow, shown.upper + grow])
-    whole = extract(field, resolution=int(cells.max()) + 2 * MARGIN, bounds=outer)
-    mesh = clip(whole, np.stack([shown.lower, shown.upper]))
+    whole = extract(field, resolution=int(cells.max()) + 2 * margin_cells, bounds=outer)
+    mesh = clip_to_box(whole, np.stack([shown.lower, shown.upper]))
     if not len(mesh.faces):
-        raise MeshError("The field has no zero level in the box that is shown, so there is no surface to mesh.")
+        raise MeshError("The field has no zero level in the box, so there is no surface to mesh.")
     return project(mesh, field)
-
-
-DRAWS = 2
-"""Times that each term's points are drawn for the loss; their mean counts."""
-
-
-# How good a surface is, on points of its own that no step has seen.
 
 
 @dataclass(frozen=True)
@@ -109,8 +101,8 @@ class Measurement:
     seconds : since the run began, measuring included
     loss : at fresh points, with the terms' reported weights; infinite where there is no surface
     shares : of the loss, by the terms' names
-    chamfer : root mean square distance from the known solution to the surface, by projection: the paper's figure
-    chamfer_back : that from the surface to the solution
+    chamfer : root mean square distance from the known solution to the surface, by projection, as in the paper
+    chamfer_back : the same from the surface to the solution
     """
 
     step: int
@@ -121,7 +113,7 @@ class Measurement:
     chamfer_back: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it by name."""
+        """Return all fields by name."""
         return asdict(self)
 
 
@@ -141,14 +133,18 @@ def measure(problem: ShapeProblem, theta: Tensor, step: int, seconds: float, see
     )
 
 
-def _shares(problem: ShapeProblem, theta: Tensor, seed: int) -> dict[str, float]:
-    """Return the loss by terms with their last weights, or nothing where there is no surface."""
+def _shares(problem: ShapeProblem, theta: Tensor, seed: int, *, draws: int = 2) -> dict[str, float]:
+    """Return the loss of each term with its last weight, or nothing if there is no surface.
+
+    The loss is the mean over `draws` samples of points.
+    """
+    step = ShapeLearningParameters.measurement_step
     rng = np.random.default_rng(seed)
     total: dict[str, float] = {}
     try:
-        for _ in range(DRAWS):
-            for name, share in problem.freeze(LAST, theta, rng).shares(theta).items():
-                total[name] = total.get(name, 0.0) + share / DRAWS
+        for _ in range(draws):
+            for name, share in problem.freeze(step, theta, rng).shares(theta).items():
+                total[name] = total.get(name, 0.0) + share / draws
     except FitError:
         return {}
     return total

@@ -1,10 +1,10 @@
-"""A shape-learning problem: constraints on a network's zero level, where they hold, and what it begins as."""
+"""A shape-learning problem: terms on the zero level set of a network, with their points, weights and a start."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -20,40 +20,42 @@ from gnrecon.optim import GainRatioDamping, Search
 from gnrecon.residuals import Residual, SecondOrder
 from gnrecon.runtime.errors import FitError
 from gnrecon.shape_learning.frozen_points import FrozenProblem, FrozenTerm
-
-PAPERS = Network((32, 32), TANH)
-"""The network of the paper's minimal and developable surfaces."""
-
-CAUTIOUS = GainRatioDamping(initial_damping=1.0, metric=identity)
-"""Step control that does not tear a surface in its first steps."""
-
-ENERGY = 0.1
-"""Error of a step in the norm of the damped matrix: Gauss-Newton's model is no more exact than that."""
-
-ALIKE = 0.5
-"""Least mean cosine of rows whose sums stand for them. The first steps' dampings are large, and what is not much alike
-serves them too; later ones have points on the surface alone, which are."""
-
-ROUNDING = 0.05
-"""What products with J in float32 may move a step by, in the same norm."""
+from gnrecon.shape_learning.learning_parameters import ShapeLearningParameters
 
 
-def by_neighbours() -> LinearSolver:
-    """Return conjugate gradients that sums of neighbouring rows precondition, afresh at each step.
+def paper_network() -> Network:
+    """Return the network of the paper's minimal and developable surfaces."""
+    return Network((32, 32), TANH)
 
-    The rows of points on a smooth surface, in the order in which `sample_surface` gives them, change little from one
-    to the next, and few of J^T J's eigenvalues are above the damping. Where rows do change, J^T J itself is taken.
+
+def cautious_damping() -> GainRatioDamping:
+    """Return a step control whose initial damping is large enough not to tear the surface in the first steps."""
+    return GainRatioDamping(initial_damping=1.0, metric=identity)
+
+
+def neighbour_sum_cg(*, energy: float = 0.1, least_cosine: float = 0.5, rounding: float = 0.05) -> LinearSolver:
+    """Return conjugate gradients preconditioned by sums of neighbouring rows, set up again at each step.
+
+    The rows of points on a smooth surface, in the order of `sample_surface`, change little from one to the next, and
+    few eigenvalues of J^T J are above the damping. Where rows change, J^T J itself is the preconditioner.
+
+    Parameters
+    ----------
+    energy : relative error of a step in the norm of the damped matrix; Gauss-Newton's model is not more accurate
+    least_cosine : least mean cosine of rows that are summed. Low, because the first dampings are large, so that a rough
+        preconditioner is enough; later all points are on the surface, and their rows are similar
+    rounding : relative change of a step that products with J in float32 may cause, in the same norm
     """
-    return Iterative("cg", NeighbourSums(ALIKE), energy=ENERGY, reuse=False, rounding=ROUNDING)
+    return Iterative("cg", NeighbourSums(least_cosine), energy=energy, reuse=False, rounding=rounding)
 
 
 Start = Callable[[Tensor], Tensor]
-"""From points, of shape (N, 3), to values, of shape (N,): about a distance to a surface much like the wanted one."""
+"""From points, of shape (N, 3), to values, of shape (N,): about a distance to a surface similar to the wanted one."""
 
 
 @dataclass(frozen=True)
 class Pretraining:
-    """What a network is fitted to before a problem's own terms.
+    """The fit of the network before that of a problem's own terms.
 
     Parameters
     ----------
@@ -70,32 +72,32 @@ class Pretraining:
 
 @dataclass(frozen=True)
 class ShapeProblem:
-    """What is asked of a surface.
+    """The constraints on a surface, with the network and the methods to solve them.
 
     Parameters
     ----------
     name : str
     terms : the constraints
-    box : where the surface lives; samplers of the volume and of the surface keep to it
-    start : what the network is fitted to before the constraints are
+    box : the domain of the samplers of volume and surface
+    start : the function that the network is fitted to before the constraints
     network : Network
-    known : the solution, where it is known, to measure against
+    known : the exact solution, if it is known, to measure the error
     shown : the part of the box that is meshed, by default all of it
     search : step control of Gauss-Newton
-    solver : makes Gauss-Newton's linear solver, which may keep what it knows from step to step
-    stored : precision of the Jacobian's rows; products of float32 are faster, and end what undamped steps can reach
-    pretraining : how the network becomes the start, by default from its values in the box
+    solver : creates Gauss-Newton's linear solver, which may have a state
+    stored : precision of the Jacobian's rows; float32 is faster, but limits the accuracy of undamped steps
+    pretraining : the fit of the start, by default of its values in the box
     """
 
     name: str
     terms: tuple[Term, ...]
     box: Box
     start: Start
-    network: Network = PAPERS
+    network: Network = field(default_factory=paper_network)
     known: KnownSurface | None = None
     shown: Box | None = None
-    search: Search = CAUTIOUS
-    solver: Callable[[], LinearSolver] = by_neighbours
+    search: Search = field(default_factory=cautious_damping)
+    solver: Callable[[], LinearSolver] = neighbour_sum_cg
     stored: torch.dtype = torch.float64
     pretraining: Pretraining | None = None
 
@@ -112,18 +114,18 @@ class ShapeProblem:
     def freeze(
         self, step: int, theta: Tensor, rng: np.random.Generator, terms: tuple[Term, ...] | None = None
     ) -> FrozenProblem:
-        """Draw the points of a step, of some terms or by default all; what weighs nothing at it is left out.
+        """Draw the points of a step, of some terms or by default all; terms without weight are omitted.
 
         Raises
         ------
         FitError
             When a term needs points of the surface and there is none.
         """
-        moment = Moment(step, self.level_set(theta), rng)
+        state = StepState(step, self.level_set(theta), rng)
         weighed = [(term, term.weight_at(step)) for term in (self.terms if terms is None else terms)]
-        return self._frozen(theta, [(term, term.sampler(moment), weight) for term, weight in weighed if weight > 0.0])
+        return self._frozen(theta, [(term, term.sampler(state), weight) for term, weight in weighed if weight > 0.0])
 
-    def _frozen(self, theta: Tensor, drawn: list[tuple[Term, Drawn, float]]) -> FrozenProblem:
+    def _frozen(self, theta: Tensor, drawn: list[tuple[Term, SampledPoints, float]]) -> FrozenProblem:
         terms = [
             FrozenTerm(term.name, term.residual, points.points, points.target, weight * points.share, points.on_surface)
             for term, points, weight in drawn
@@ -153,41 +155,36 @@ def circle(radius: float, height: float, count: int = 1000) -> Float:
 
 
 def plane_through(points: Float) -> Start:
-    """Return the signed distance to the plane that fits points of shape (N, 3) best: a start for a sheet in a curve."""
+    """Return the signed distance to the best-fit plane of points, (N, 3): a start for a sheet bounded by a curve."""
     center = points.mean(axis=0)
     normal = torch.as_tensor(np.linalg.svd(points - center)[2][2])
     middle = torch.as_tensor(center)
     return lambda x: (x - middle) @ normal
 
 
-LAST = 10**9
-"""The number of a step that is never reached: weights have ended there."""
-
-MOST_GROWTH = 20.0
-"""Logarithm of the most by which a number of points grows: by then it is all points of any scan."""
-
-NODES = 30_000
-"""Evaluations that the search for a surface costs at each step; see `gnrecon.level_set.sample_surface`."""
-
-
-# The terms of a shape-learning problem: a residual, where its points come from at each step, and its weight.
+# The terms of a shape-learning problem: a residual, a sampler of its points, and a weight.
 #
-# A sampler is called afresh at each step with what the field is then, because the points of a moving surface, or those
-# that join components, change with it. A weight may change from step to step. The loss that a run reports has weights
-# of its own, by default those that the terms end with.
+# A sampler is called at each step with the current field, because the points of a moving surface, and those that join
+# components, change with it. A weight may change from step to step. The loss that a run reports has other weights, by
+# default the last ones of the terms.
 
 
 @dataclass(frozen=True)
-class Moment:
-    """When a sampler is asked: the step's number, from 1, the field's zero level then, and what draws."""
+class StepState:
+    """The input of a sampler: the number of the step, from 1, the current zero level set, and random numbers."""
 
     step: int
     level_set: LevelSet
     rng: np.random.Generator
 
+    @property
+    def measuring(self) -> bool:
+        """Whether the points are for a measurement and not for a step."""
+        return self.step == ShapeLearningParameters.measurement_step
+
 
 @dataclass(frozen=True)
-class Drawn:
+class SampledPoints:
     """Points of a step.
 
     Parameters
@@ -195,7 +192,7 @@ class Drawn:
     points : of shape (N, 3)
     target : of shape (N,) or (N, 3), or None
     on_surface : whether they belong to the surface and move with it
-    share : of all points that were drawn; the others have no residual, and need not be evaluated
+    share : fraction of the drawn points that these are; the others have no residual and are not evaluated
     """
 
     points: Tensor
@@ -204,25 +201,25 @@ class Drawn:
     share: float = 1.0
 
 
-Sampler = Callable[[Moment], Drawn]
+Sampler = Callable[[StepState], SampledPoints]
 
 Weight = Callable[[int], float]
-"""Gives a term's weight at a step of a number, from 1."""
+"""Returns the weight of a term at a step, by its number from 1."""
 
 
 @dataclass(frozen=True)
 class Term:
     """One constraint.
 
-    Its share of the loss is  weight / (2 N) sum_i |r_i|^2  over the N points that are drawn.
+    It contributes  weight / (2 N) sum_i |r_i|^2  over the N drawn points to the loss.
 
     Parameters
     ----------
     name : str
     residual : of `gnrecon.residuals`, of first or second order
-    sampler : gives its points at each step
+    sampler : returns its points at each step
     weight : a number, or one for each step
-    reported : weight in the loss that a run reports, by default that which the weight ends with
+    reported : weight in the loss that a run reports, by default the last weight
     """
 
     name: str
@@ -232,14 +229,14 @@ class Term:
     reported: float | None = None
 
     def weight_at(self, step: int) -> float:
-        """Return the weight at a step, or that in the reported loss at `LAST`."""
-        if step == LAST and self.reported is not None:
+        """Return the weight at a step, or that in the reported loss at the step number of measurements."""
+        if step == ShapeLearningParameters.measurement_step and self.reported is not None:
             return self.reported
         return self.weight(step) if callable(self.weight) else self.weight
 
 
 Count = Callable[[int], int]
-"""Gives the number of points at a step of a number, from 1."""
+"""Returns the number of points at a step, by its number from 1."""
 
 
 def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count: int | Count | None = None) -> Sampler:
@@ -250,60 +247,61 @@ def at_points(points: npt.ArrayLike, targets: npt.ArrayLike | None = None, count
     known = torch.as_tensor(np.asarray(points, dtype=np.float64))
     values = None if targets is None else torch.as_tensor(np.asarray(targets, dtype=np.float64))
 
-    def draw(moment: Moment) -> Drawn:
-        wanted = count(moment.step) if callable(count) else count
+    def draw(state: StepState) -> SampledPoints:
+        wanted = count(state.step) if callable(count) else count
         if wanted is None or wanted >= len(known):
-            return Drawn(known, values)
-        rows = torch.as_tensor(np.sort(moment.rng.permutation(len(known))[:wanted]))
-        return Drawn(known[rows], None if values is None else values[rows])
+            return SampledPoints(known, values)
+        rows = torch.as_tensor(np.sort(state.rng.permutation(len(known))[:wanted]))
+        return SampledPoints(known[rows], None if values is None else values[rows])
 
     return draw
 
 
 def in_box(count: int, box: Box | None = None) -> Sampler:
-    """Return a sampler of uniform points in a box, by default the problem's, neighbours one after the other."""
+    """Return a sampler of uniform points in a box, by default the problem's, with neighbours adjacent."""
 
-    def draw(moment: Moment) -> Drawn:
-        points = (box or moment.level_set.box).sample(count, moment.rng)
-        return Drawn(torch.as_tensor(points[kd_tree_order(points)]))
+    def draw(state: StepState) -> SampledPoints:
+        points = (box or state.level_set.box).sample(count, state.rng)
+        return SampledPoints(torch.as_tensor(points[kd_tree_order(points)]))
 
     return draw
 
 
-def on_surface(count: int, nodes: int = NODES) -> Sampler:
+def on_surface(count: int, nodes: int = 30_000) -> Sampler:
     """Return a sampler of about `count` points of the zero level in the problem's box, uniform by area.
 
-    It raises `FitError` where there is none.
+    The sampler raises `FitError` if there are none. `nodes` is the number of evaluations of the search at each step,
+    see `gnrecon.level_set.sample_surface`.
     """
 
-    def draw(moment: Moment) -> Drawn:
-        sample = sample_surface(moment.level_set, count, moment.rng, nodes, sweeps=0)
+    def draw(state: StepState) -> SampledPoints:
+        sample = sample_surface(state.level_set, count, state.rng, nodes, sweeps=0)
         if not len(sample):
-            raise FitError(f"At step {moment.step} the field has no zero level in the problem's box any more.")
-        return Drawn(sample.points, on_surface=True)
+            raise FitError(f"At step {state.step} the field has no zero level in the problem's box any more.")
+        return SampledPoints(sample.points, on_surface=True)
 
     return draw
 
 
-def growing(first: int, factor: float, many: int, slowly: float) -> Count:
-    """Return a number of points that grows by a factor a step, and by a smaller one once there are many.
+def growing(first: int, factor: float, many: int, slowly: float, *, most_log_growth: float = 20.0) -> Count:
+    """Return a number of points that grows by a factor per step, and by a smaller one above `many` points.
 
-    The fewer points, the sooner a step is done, and the farther what fits them is from what fits all: that matters the
-    more, the less is left to gain. A measurement takes all points.
+    With fewer points a step is faster but overfits them more, which matters more near the end of a run. A measurement
+    takes all points. `most_log_growth` is the logarithm of the largest growth, beyond the points of any scan.
     """
     quick = math.log(many / first) / math.log(factor)
 
     def at(step: int) -> int:
-        if step == LAST:
+        if step == ShapeLearningParameters.measurement_step:
             return step
         growth = math.log(factor) * min(step - 1, quick) + math.log(slowly) * max(0.0, step - 1 - quick)
-        return round(first * math.exp(min(growth, MOST_GROWTH)))
+        return round(first * math.exp(min(growth, most_log_growth)))
 
     return at
 
 
 def rising(weight: float, hold: int, factor: float, most: float) -> Weight:
-    """Return a weight that holds for some steps, then grows by a factor a step, up to the most."""
+    """Return a weight that is constant for `hold` steps, then grows by a factor per step up to `most`."""
     growth = int(math.log(most / weight) / math.log(factor)) + 1
 
     def at(step: int) -> float:
@@ -313,16 +311,16 @@ def rising(weight: float, hold: int, factor: float, most: float) -> Weight:
 
 
 def falling(weight: float, factor: float, least: float) -> Weight:
-    """Return a weight that shrinks by a factor from the first step on, down to the least."""
+    """Return a weight that decreases by a factor per step from the first step on, down to `least`."""
     steps = int(math.log(least / weight) / math.log(factor)) + 1
     return lambda step: max(least, weight * factor ** min(step, steps))
 
 
 def fading(weight: float, hold: int, factor: float, least: float = 1e-5) -> Weight:
-    """Return a weight that holds for some steps, then shrinks by a factor a step, and is zero below `least`."""
+    """Return a weight that is constant for `hold` steps, then decreases by a factor per step; zero below `least`."""
 
     def at(step: int) -> float:
-        # Capped, because a large power of the factor underflows anyhow.
+        # Capped, because larger powers of the factor underflow.
         faded = weight * factor ** min(max(0, step - hold), 10_000)
         return faded if faded >= least else 0.0
 

@@ -16,14 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.batch_accidents import BROKEN, CONFIG, BatchWatcher, Cost, make_scans, run_command, running
-from benchmarks.harness.command_line import (
-    add_outputs,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    scratch_folder,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.tables import row_table
 from gnrecon.runtime.errors import ExitCode, UsageError
 
@@ -41,10 +34,10 @@ def main(arguments: Sequence[str]) -> int:
     chosen = _parser().parse_args(arguments)
     if chosen.scans < len(BROKEN) + 4:
         raise UsageError(f"At least {len(BROKEN) + 4} scans are needed, not {chosen.scans}.")
-    require_folders(chosen.json)
-    report: dict[str, Any] = provenance("batch", arguments) | {"jobs": chosen.jobs, "runs": {}}
+    command_line.require_folders(chosen.json)
+    report: dict[str, Any] = command_line.provenance("batch", arguments) | {"jobs": chosen.jobs, "runs": {}}
     console = Console(highlight=False)
-    with scratch_folder() as folder:
+    with command_line.scratch_folder() as folder:
         good = make_scans(folder / "scans", chosen.scans - len(BROKEN))
         (folder / "batch.toml").write_text(CONFIG, encoding="utf-8")
         runs = _Runs(folder, good, chosen.jobs)
@@ -54,7 +47,7 @@ def main(arguments: Sequence[str]) -> int:
                 report["runs"][name] = step()
         console.print("bench: one by one", style="dim")
         report["speed"] = runs.one_by_one(min(chosen.alone, len(good)))
-    write_report(chosen.json, report)
+    command_line.write_report(chosen.json, report)
     console.print(table(report))
     passed = [
         sound(one, len(good)) and one["disturbed"] == (name != "undisturbed") for name, one in report["runs"].items()
@@ -218,10 +211,10 @@ def table(report: dict[str, Any]) -> Table:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser("batch", __doc__)
+    parser = command_line.benchmark_parser("batch", __doc__)
     parser.add_argument("--scans", type=int, default=40, metavar="N", help="scans, 6 of them broken (default: 40)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="scans at a time (default: 2)")
     parser.add_argument("--alone", type=int, default=12, metavar="N", help="scans by separate commands (default: 12)")
     parser.add_argument("--no-dask", dest="dask", action="store_false", help="leave out the Dask cluster")
-    add_outputs(parser)
+    command_line.add_outputs(parser)
     return parser

@@ -12,15 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.engine.cost_growth import exponent
-from benchmarks.harness.command_line import (
-    REPOSITORY,
-    add_outputs,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    scratch_folder,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.measurement import run_isolated
 from benchmarks.harness.tables import Figure, column_table
 from gnrecon.runtime.errors import ExitCode, FitError, InputError, UsageError
@@ -53,9 +45,9 @@ def main(arguments: Sequence[str]) -> int:
     """
     chosen = _parser().parse_args(arguments)
     _check(chosen)
-    report: dict[str, Any] = provenance("export", arguments) | {"threads": torch.get_num_threads()}
+    report: dict[str, Any] = command_line.provenance("export", arguments) | {"threads": torch.get_num_threads()}
     console = Console(highlight=False)
-    with scratch_folder() as folder:
+    with command_line.scratch_folder() as folder:
         model = str(chosen.model) if chosen.model else _fitted(chosen.scan, folder)
         report["extractions"] = []
         for cells in chosen.resolutions:
@@ -66,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
             console.print(f"bench: the whole grid of {chosen.whole} cells", style="dim")
             report["whole"] = _isolated("measure_whole_grid", folder / "whole", model=model, resolution=chosen.whole)
     report["exponents"] = _exponents(report["extractions"])
-    write_report(chosen.json, report)
+    command_line.write_report(chosen.json, report)
     console.print(table(report["extractions"]))
     for sentence in sentences(report):
         console.print(sentence, soft_wrap=True)
@@ -100,8 +92,8 @@ def sentences(report: dict[str, Any]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    sample = REPOSITORY / "sample_data" / "bracket_sparse.ply"
-    parser = benchmark_parser("export", __doc__)
+    sample = command_line.REPOSITORY / "sample_data" / "bracket_sparse.ply"
+    parser = command_line.benchmark_parser("export", __doc__)
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--scan",
@@ -122,7 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--whole", type=int, default=256, metavar="N", help="cells of the whole grid; 0: none (default: 256)"
     )
-    add_outputs(parser)
+    command_line.add_outputs(parser)
     return parser
 
 
@@ -133,7 +125,7 @@ def _check(chosen: argparse.Namespace) -> None:
     source = chosen.model or chosen.scan
     if not source.is_file():
         raise InputError(f"There is no file {source}.")
-    require_folders(chosen.json)
+    command_line.require_folders(chosen.json)
 
 
 def _fitted(scan: Path, folder: Path) -> str:

@@ -128,7 +128,7 @@ def whole_surface(lattice: Lattice) -> tuple[Float, Int]:
     values = np.empty(lattice.cells + 1, dtype=np.float32)
     plane = np.stack(np.meshgrid([0], *map(np.arange, values.shape[1:]), indexing="ij"), axis=-1).reshape(-1, 3)
     for i in range(len(values)):
-        values[i] = band.clear(lattice.values(plane + np.array([i, 0, 0]), band.slope)).reshape(values.shape[1:])
+        values[i] = band.clamp(lattice.values(plane + np.array([i, 0, 0]), band.slope)).reshape(values.shape[1:])
     marching_cubes: Any = images.marching_cubes
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent", method="lewiner")
     return vertices.astype(np.float64), faces.astype(np.int64)

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.accuracy.analytic_solids import FunctionField
-from benchmarks.harness.command_line import add_outputs, benchmark_parser, provenance, write_report
+from benchmarks.harness import command_line
 from benchmarks.harness.measurement import Stopwatch
 from gnrecon.export import RefineOptions, SignedDistance, extract, project, quality, refine
 from gnrecon.export.boolean import centre_and_size, from_meshlab, to_meshlab
-from gnrecon.export.project import between
-from gnrecon.export.remeshing.decimate import collapsed
+from gnrecon.export.project import face_sample_points
+from gnrecon.export.remeshing.decimate import simplify_by_collapses
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
@@ -37,9 +37,9 @@ def main(arguments: Sequence[str], *, cells: int = 48, model_cells: int = 128) -
     OutputError
         When the result cannot be written.
     """
-    parser = benchmark_parser("refine", __doc__)
+    parser = command_line.benchmark_parser("refine", __doc__)
     parser.add_argument("--model", type=Path, metavar="FILE", help="a fitted field (.gnr) to remesh as well")
-    add_outputs(parser)
+    command_line.add_outputs(parser)
     chosen = parser.parse_args(arguments)
     fields: dict[str, tuple[SignedDistance, float, int]] = {
         name: (shape, length, cells) for name, (shape, length) in SHAPES.items()
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str], *, cells: int = 48, model_cells: int = 128) -
         fields[chosen.model.stem] = (sdf, float(np.ptp(sdf.bounds, axis=0).max()) / 60, model_cells)
     figures = [record for name, given in fields.items() for record in compare(name, *given)]
     Console(highlight=False).print(table(figures))
-    write_report(chosen.json, provenance("refine", arguments) | {"figures": figures})
+    command_line.write_report(chosen.json, command_line.provenance("refine", arguments) | {"figures": figures})
     return ExitCode.OK
 
 
@@ -70,7 +70,7 @@ def compare(
         "remeshed by gnrecon": ours(RefineOptions(remesh=length)),
         "collapsed by pymeshlab": lambda given: pymeshlab_collapse(given, faces),
         "fewer faces by gnrecon": ours(RefineOptions(faces=faces)),
-        "simplified by manifold3d": lambda given: collapsed(given, cell / 4),
+        "simplified by manifold3d": lambda given: simplify_by_collapses(given, cell / 4),
         "simplified by gnrecon": ours(RefineOptions(simplify=cell / 4)),
     }
     return [{"field": name, "method": method} | measured(work, mesh, field) for method, work in methods.items()]
@@ -86,7 +86,7 @@ def measured(work: Work, mesh: Mesh, field: SignedDistance) -> dict[str, Any]:
         "least_angle": angles["min"],
         "angle_p1": angles["p1"],
         "vertices_off": float(np.abs(field.sdf(made.vertices)).max()),
-        "between_off": float(np.abs(field.sdf(between(made.corners))).max()),
+        "between_off": float(np.abs(field.sdf(face_sample_points(made.corners))).max()),
         "cpu_seconds": watch.cpu_seconds,
     }
 

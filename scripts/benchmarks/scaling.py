@@ -13,15 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.harness.command_line import (
-    add_outputs,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    require_matplotlib,
-    scratch_folder,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.measurement import run_isolated
 from benchmarks.harness.tables import Figure, column_table
 from gnrecon.fit.blocks.block_parameters import BlockParameters
@@ -60,16 +52,16 @@ def main(arguments: Sequence[str]) -> int:
     chosen = _parser().parse_args(arguments)
     if min(chosen.counts) < 1000:
         raise UsageError("A scan must have at least 1,000 points.")
-    require_folders(chosen.json, chosen.picture)
+    command_line.require_folders(chosen.json, chosen.picture)
     if chosen.picture:
-        require_matplotlib()
-    report: dict[str, Any] = provenance("blocks", arguments) | {"runs": []}
+        command_line.require_matplotlib()
+    report: dict[str, Any] = command_line.provenance("blocks", arguments) | {"runs": []}
     console = Console(highlight=False)
     for count in sorted(chosen.counts):
         for blocks in (False, True) if count < BlockParameters.large_scan_points else (True,):
             console.print(f"bench: {count:,} points{'' if blocks else ', in one piece'}", style="dim")
             report["runs"].append({"points": count, "blocks": blocks} | _measure(count, blocks, chosen))
-    write_report(chosen.json, report)
+    command_line.write_report(chosen.json, report)
     measured = [run for run in report["runs"] if "error" not in run]
     by_blocks = [run for run in measured if run["blocks"]]
     if chosen.picture and by_blocks:
@@ -89,7 +81,7 @@ def _measure(count: int, blocks: bool, chosen: argparse.Namespace, *, threads: i
     options = {"quality": chosen.quality, "threads": threads}
     if chosen.resolution is not None:
         options["resolution"] = chosen.resolution
-    with scratch_folder() as scratch:
+    with command_line.scratch_folder() as scratch:
         folder = scratch / "job"
         arguments = {"folder": str(folder), "points": count, "blocks": blocks, "options": options}
         figures = run_isolated("benchmarks.scaling_run:measure_blocks", arguments, folder, threads=1)
@@ -99,13 +91,13 @@ def _measure(count: int, blocks: bool, chosen: argparse.Namespace, *, threads: i
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser("blocks", __doc__)
+    parser = command_line.benchmark_parser("blocks", __doc__)
     parser.add_argument(
         "--counts", nargs="+", type=int, default=(100_000, 300_000, 1_000_000, 2_000_000), help="points of the scans"
     )
     parser.add_argument("--quality", default="normal", help="of the fits, as of gnrecon")
     parser.add_argument("--resolution", type=int, help="cells of the meshes, as of gnrecon")
-    add_outputs(parser, picture="plot time and memory")
+    command_line.add_outputs(parser, picture="plot time and memory")
     return parser
 
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
-from benchmarks.harness.command_line import add_outputs, benchmark_parser, provenance, require_folders, write_report
+from benchmarks.harness import command_line
 from benchmarks.harness.measurement import median_time
 from benchmarks.harness.tables import number_or_dash
 from gnrecon.least_squares import Cholesky, DenseJacobian, LinearSolver, identity
@@ -40,14 +40,14 @@ def main(arguments: Sequence[str]) -> int:
     OutputError
         When the result cannot be written.
     """
-    parser = benchmark_parser("learn", __doc__)
+    parser = command_line.benchmark_parser("learn", __doc__)
     parser.add_argument("--problems", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS))
     parser.add_argument("--optimisers", nargs="*", choices=list(OPTIMISERS), default=list(OPTIMISERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="SEED")
     parser.add_argument("--budget", type=float, default=600.0, metavar="SECONDS", help="of each run; by default 600")
-    add_outputs(parser)
+    command_line.add_outputs(parser)
     chosen = parser.parse_args(arguments)
-    require_folders(chosen.json)
+    command_line.require_folders(chosen.json)
     console = Console(highlight=False)
     step = step_figures(chosen.seeds[0])
     for which in ("first", "later"):
@@ -57,7 +57,9 @@ def main(arguments: Sequence[str]) -> int:
         for optimiser in chosen.optimisers:
             figures += [run(name, optimiser, chosen.budget, seed) for seed in chosen.seeds]
     console.print(table(figures))
-    write_report(chosen.json, provenance("learn", arguments) | {"step": step, "figures": figures})
+    command_line.write_report(
+        chosen.json, command_line.provenance("learn", arguments) | {"step": step, "figures": figures}
+    )
     return ExitCode.OK
 
 

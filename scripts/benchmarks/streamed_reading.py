@@ -11,14 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.harness.command_line import (
-    add_outputs,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    scratch_folder,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.measurement import Stopwatch, run_isolated
 from benchmarks.harness.tables import Figure, column_table
 from gnrecon.geometry.arrays import Float
@@ -50,13 +43,13 @@ def main(arguments: Sequence[str]) -> int:
     chosen = _parser().parse_args(arguments)
     if chosen.points < 1 or chosen.keep < 1:
         raise UsageError("The numbers of points and of those to keep must be positive.")
-    require_folders(chosen.json)
-    report: dict[str, Any] = provenance("ingest", arguments) | {"points": chosen.points, "scans": []}
+    command_line.require_folders(chosen.json)
+    report: dict[str, Any] = command_line.provenance("ingest", arguments) | {"points": chosen.points, "scans": []}
     console = Console(highlight=False)
     for name in chosen.formats:
         console.print(f"bench: {chosen.points:,} points as {name}", style="dim")
         report["scans"].append({"format": name} | _measure(name, chosen))
-    write_report(chosen.json, report)
+    command_line.write_report(chosen.json, report)
     console.print(table(report["scans"]))
     return ExitCode.BATCH if any("error" in one for one in report["scans"]) else ExitCode.OK
 
@@ -68,7 +61,7 @@ def table(scans: Sequence[dict[str, Any]]) -> Table:
 
 
 def _measure(name: str, chosen: argparse.Namespace) -> dict[str, Any]:
-    with scratch_folder() as folder:
+    with command_line.scratch_folder() as folder:
         scan = folder / f"scan.{name}"
         WRITERS[name](scan, chosen.points)
         arguments = {"scan": str(scan), "most": chosen.keep}
@@ -76,13 +69,13 @@ def _measure(name: str, chosen: argparse.Namespace) -> dict[str, Any]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser("ingest", __doc__)
+    parser = command_line.benchmark_parser("ingest", __doc__)
     parser.add_argument("--points", type=int, default=20_000_000, help="points in each file")
     parser.add_argument(
         "--keep", type=int, default=IOParameters.most_points, help="points to keep, as of --read-points"
     )
     parser.add_argument("--formats", nargs="+", choices=list(WRITERS), default=list(WRITERS), help="formats to read")
-    add_outputs(parser)
+    command_line.add_outputs(parser)
     return parser
 
 

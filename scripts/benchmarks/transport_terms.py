@@ -19,14 +19,14 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from benchmarks.harness.command_line import add_outputs, benchmark_parser, provenance, require_folders, write_report
+from benchmarks.harness import command_line
 from benchmarks.harness.tables import number_or_dash
 from gnrecon.least_squares import LayeredJacobian
 from gnrecon.level_set import derivative_along, sample_surface, transported
 from gnrecon.optim import Problem, StopRule
 from gnrecon.residuals import Linearised, SecondOrder, mean_curvature
 from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.shape_learning import OPTIMISERS, PROBLEMS, Drawn, Moment, ShapeProblem, Term
+from gnrecon.shape_learning import OPTIMISERS, PROBLEMS, SampledPoints, ShapeProblem, StepState, Term
 from gnrecon.shape_learning.learn import pretrained
 from gnrecon.shape_learning.result import measure
 
@@ -44,13 +44,13 @@ def main(arguments: Sequence[str]) -> int:
     OutputError
         When the result cannot be written.
     """
-    parser = benchmark_parser("transport", __doc__)
+    parser = command_line.benchmark_parser("transport", __doc__)
     parser.add_argument("--problem", action="append", metavar="NAME", help="by default catenoid and cone")
     parser.add_argument("--steps", default="0,5,20", help="moments of a run; the last is also the length of the runs")
     parser.add_argument("--seed", type=int, default=0)
-    add_outputs(parser)
+    command_line.add_outputs(parser)
     chosen = parser.parse_args(arguments)
-    require_folders(chosen.json)
+    command_line.require_folders(chosen.json)
     moments = _moments(chosen.steps)
     figures: list[dict[str, Any]] = []
     for name in chosen.problem or ("catenoid", "cone"):
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
         figures += compare(name, PROBLEMS[name](), moments, chosen.seed)
     for shown in tables(figures):
         Console(highlight=False).print(shown)
-    write_report(chosen.json, provenance("transport", arguments) | {"figures": figures})
+    command_line.write_report(chosen.json, command_line.provenance("transport", arguments) | {"figures": figures})
     return ExitCode.OK
 
 
@@ -103,8 +103,8 @@ def still(problem: ShapeProblem) -> ShapeProblem:
     """Return the problem with surface points that do not move."""
 
     def stays(term: Term) -> Term:
-        def draw(moment: Moment) -> Drawn:
-            return replace(term.sampler(moment), on_surface=False)
+        def draw(state: StepState) -> SampledPoints:
+            return replace(term.sampler(state), on_surface=False)
 
         return replace(term, sampler=draw)
 

@@ -22,15 +22,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from benchmarks.accuracy.scans import unit
-from benchmarks.harness.command_line import (
-    REPOSITORY,
-    add_outputs,
-    add_repeat,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.contact_sheet import Part, Pixels, Row, draw_row, write_sheet
 from benchmarks.harness.tables import Figure, row_table
 from gnrecon.export.metrics import sample_surface
@@ -65,15 +57,15 @@ def main(
     """
     cases, options = cases or CASES, options or {"resolution": 96}
     chosen = _parser(cases).parse_args(arguments)
-    require_folders(chosen.json, chosen.picture)
-    report: dict[str, Any] = provenance("uncertainty", arguments) | {"options": options, "trials": []}
+    command_line.require_folders(chosen.json, chosen.picture)
+    report: dict[str, Any] = command_line.provenance("uncertainty", arguments) | {"options": options, "trials": []}
     for name in chosen.cases:
         for seed in range(chosen.repeat):
             print(f"bench: {name}, seed {seed}", file=sys.stderr)
             check = run(cases[name], seed, options)
             report["trials"].append({"case": name, "seed": seed} | figures(check))
             # After each one, so that an interrupted run keeps its results.
-            write_report(chosen.json, report)
+            command_line.write_report(chosen.json, report)
             if chosen.picture and (name, seed) == (chosen.pictured, 0):
                 draw_picture(check, chosen.picture)
     Console(highlight=False, width=140).print(table(report["trials"]))
@@ -96,12 +88,12 @@ def _cell(values: Sequence[float | None], form: str) -> str:
 
 
 def _parser(cases: Mapping[str, Case], *, pictured: str = "bracket, holed") -> argparse.ArgumentParser:
-    parser = benchmark_parser("uncertainty", __doc__)
+    parser = command_line.benchmark_parser("uncertainty", __doc__)
     parser.add_argument(
         "--cases", nargs="+", choices=cases, default=list(cases), metavar="CASE", help=f"of {', '.join(cases)}"
     )
-    add_repeat(parser, "scans of each case")
-    add_outputs(parser, picture="draw one of the cases")
+    command_line.add_repeat(parser, "scans of each case")
+    command_line.add_outputs(parser, picture="draw one of the cases")
     parser.add_argument(
         "--pictured", choices=cases, default=pictured, metavar="CASE", help=f"case to draw (default: {pictured})"
     )
@@ -213,7 +205,7 @@ def draw(case: Case, seed: int, *, normal_noise: float = 0.05) -> PointCloud:
     `normal_noise` is the standard deviation of each component of the normals before they are normalised.
     """
     rng = np.random.default_rng(seed)
-    reference = read_mesh(REPOSITORY / "sample_data" / f"{case.shape}_reference.ply")
+    reference = read_mesh(command_line.REPOSITORY / "sample_data" / f"{case.shape}_reference.ply")
     radius = Frame.of(reference.vertices).scale
     # Twice as many, because the holes remove some.
     points = project(case.truth.distance, sample_surface(reference, 2 * case.points, rng).points)

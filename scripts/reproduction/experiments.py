@@ -77,8 +77,6 @@ def interrupted(code: int) -> bool:
     return code == ExitCode.INTERRUPTED
 
 
-COLUMNS = ("problem", "optimiser", "seconds", "steps", "loss", "chamfer", "authors_quantity", "authors")
-
 AUTHORS: dict[str, tuple[str, dict[str, float | None]]] = {
     "bunny": ("loss", {"gn": 7.1e-5, "lbfgs": 2.4e-4, "adam": 1.4e-3}),
     "bunny-sparse": ("loss", {"gn": 5.8e-5, "lbfgs": 1.9e-4, "adam": 1.0e-3}),
@@ -105,18 +103,19 @@ def row(one: Experiment) -> dict[str, Any]:
 
 
 def as_csv(done: Sequence[Experiment]) -> str:
-    """Return the rows as the text of a CSV file."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    """Return the rows of one or more experiments as the text of a CSV file."""
+    rows, text = [row(one) for one in done], io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(row(one) for one in done)
+    writer.writerows(rows)
     return text.getvalue()
 
 
 def as_markdown(done: Sequence[Experiment]) -> str:
-    """Return the rows as a Markdown table."""
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-    lines += ["| " + " | ".join(_cell(value) for value in row(one).values()) + " |" for one in done]
+    """Return the rows of one or more experiments as a Markdown table."""
+    rows = [row(one) for one in done]
+    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
+    lines += ["| " + " | ".join(map(_cell, values.values())) + " |" for values in rows]
     return "\n".join(lines) + "\n"
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from benchmarks.harness.contact_sheet import Row, draw_row, write_sheet
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh
 from gnrecon.rendering import render
@@ -18,9 +18,6 @@ from reproduction.experiments import Experiment
 NAMES = {"gn": "Gauss-Newton", "lbfgs": "L-BFGS", "adam": "Adam"}
 UP = {"bunny": "y", "bunny-sparse": "y", "rockerarm": "y"}
 """Upward axis of the pictures where it is not z."""
-
-LOW, MIDDLE, HIGH = (33, 102, 172), (247, 247, 247), (178, 24, 43)
-"""sRGB colours of the curvature scale: a diverging scale of blue, white and red (ColorBrewer RdBu)."""
 
 
 def draw_convergence(done: Sequence[Experiment], path: Path) -> None:
@@ -88,9 +85,20 @@ def draw_surfaces(
     write_sheet(rows, folder / "surfaces.png")
 
 
-def coloured(mesh: Mesh, values: npt.NDArray[np.float64], most: float) -> Mesh:
-    """Return a mesh with colours of values of shape (V,), white at zero and full from `most` on."""
+def coloured(
+    mesh: Mesh,
+    values: Float,
+    most: float,
+    *,
+    low: tuple[int, int, int] = (33, 102, 172),
+    middle: tuple[int, int, int] = (247, 247, 247),
+    high: tuple[int, int, int] = (178, 24, 43),
+) -> Mesh:
+    """Return a mesh with colours of values of shape (V,), white at zero and full from `most` on.
+
+    The sRGB colours are those of the diverging scale RdBu of ColorBrewer.
+    """
     share = np.clip(np.nan_to_num(values) / max(most, np.finfo(np.float64).tiny), -1, 1)[:, None]
-    ends = np.where(share < 0, LOW, HIGH)
-    colors = np.rint(np.array(MIDDLE) * (1 - np.abs(share)) + ends * np.abs(share))
+    ends = np.where(share < 0, low, high)
+    colors = np.rint(np.array(middle) * (1 - np.abs(share)) + ends * np.abs(share))
     return mesh.with_attributes({"colors": colors.astype(np.uint8)})

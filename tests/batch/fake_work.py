@@ -1,4 +1,4 @@
-"""Work for child processes that takes no time: what a scan's file says is done, where gnrecon would reconstruct it."""
+"""Fake work for child processes: does what the text of a scan's file says instead of reconstructing it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REPORT = {
 
 
 def work(argument: dict[str, Any]) -> int:
-    """Do what the first word of the scan says; every beginning and end is noted beside the scan."""
+    """Do what the first word of the scan says, and log its start and end in the folder of the scan."""
     scan, folder = Path(argument["scan"]), Path(argument["folder"])
     words = scan.read_text().split()
     _note(scan, "began")
@@ -72,7 +72,7 @@ def _hog() -> int:
 
 
 def _signal(name: str, once: str | None = None) -> int:
-    """Be killed, unless a file says that this was so before."""
+    """Kill this process, unless a file shows that it was killed before."""
     if once is not None and Path(once).exists():
         return 0
     if once is not None:
@@ -102,14 +102,14 @@ def _note(scan: Path, word: str) -> None:
 
 
 def notes(folder: Path, word: str) -> list[str]:
-    """Names of the scans of a folder that this was noted of, in order."""
+    """Names of the scans of a folder with such an entry in the log, in order."""
     path = folder / "notes.log"
     lines = [line.split() for line in path.read_text().splitlines()] if path.exists() else []
-    return [name for name, said in lines if said == word]
+    return [name for name, entry in lines if entry == word]
 
 
 def job(folder: Path, name: str, text: str, limits: Limits | None = None, **more: Any) -> Job:
-    """A scan of a folder that says what is to be done, as a job whose outputs go into a folder below."""
+    """A job for a new scan with this text; outputs go into a folder next to that of the scans."""
     scans = folder / "scans"
     scans.mkdir(exist_ok=True)
     scan = scans / f"{Path(name).name}.ply"

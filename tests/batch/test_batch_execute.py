@@ -1,7 +1,8 @@
-"""One job: what kills it is named, what it leaves half done is gone, and nothing is done twice."""
+"""One job: failures are named, partial outputs are removed, and nothing is done twice."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -65,12 +66,12 @@ def test_an_unchanged_result_is_not_made_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change", ["scan", "options", "format", "kinds", "reference", "gone", "broken record", "fresh"]
 )
-def test_whatever_has_changed_is_made_again(tmp_path: Path, change: str) -> None:
+def test_any_change_makes_the_result_again(tmp_path: Path, change: str) -> None:
     one = job(tmp_path, "good", "good")
     done(one)
     other = one
     if change == "scan":
-        one.scan.write_text("good 0 anew")
+        one.scan.write_text("good 0 changed")
     if change == "options":
         other = replace(one, options={**one.options, "resolution": 64})
     if change == "format":
@@ -91,7 +92,7 @@ def test_whatever_has_changed_is_made_again(tmp_path: Path, change: str) -> None
     assert notes(tmp_path / "scans", "ended") == ["good", "good"]
 
 
-def test_what_others_wrote_or_changed_is_left_alone(tmp_path: Path) -> None:
+def test_files_that_others_wrote_or_changed_are_kept(tmp_path: Path) -> None:
     one = job(tmp_path, "good", "good")
     mesh = one.output / "good.obj"
     mesh.write_text("by hand")
@@ -105,7 +106,16 @@ def test_what_others_wrote_or_changed_is_left_alone(tmp_path: Path) -> None:
     assert mesh.read_text() == "retouched"
 
 
-def test_a_batch_killed_before_the_files_had_their_names_gives_them_at_its_next_start(tmp_path: Path) -> None:
+def test_records_of_earlier_versions_are_read(tmp_path: Path) -> None:
+    one = job(tmp_path, "good", "good")
+    first = done(one)
+    values = json.loads(one.record().read_text())
+    values["told"] = values.pop("facts")
+    one.record().write_text(json.dumps(values))
+    assert done(one) == replace(first, status=Status.UNCHANGED, attempts=0, seconds=0.0)
+
+
+def test_a_batch_killed_before_files_were_moved_moves_them_at_its_next_start(tmp_path: Path) -> None:
     one = job(tmp_path, "deep/good", "good", kinds=("page",))
     first = done(one)
     record = read_record(one.record())
@@ -118,7 +128,7 @@ def test_a_batch_killed_before_the_files_had_their_names_gives_them_at_its_next_
         assert done(one) == replace(first, status=Status.UNCHANGED, attempts=0, seconds=0.0)
 
 
-def test_a_batch_killed_before_the_files_had_their_names_knows_them_as_its_own(tmp_path: Path) -> None:
+def test_a_batch_killed_before_files_were_moved_knows_them_as_its_own(tmp_path: Path) -> None:
     one = job(tmp_path, "good", "good")
     done(one)
     old = (one.output / "good.obj").read_bytes()
@@ -167,7 +177,7 @@ def test_a_scan_that_is_missing_is_an_input_error(tmp_path: Path) -> None:
     assert "No such file" in outcome.message
 
 
-def test_only_what_may_pass_is_tried_again(tmp_path: Path) -> None:
+def test_only_transient_failures_are_tried_again(tmp_path: Path) -> None:
     assert done(job(tmp_path, "bad", "exit 3", retry=2)).attempts == 1
     outcome = done(job(tmp_path, "killed", "signal SIGABRT", retry=2))
     assert (outcome.attempts, outcome.message) == (3, "Killed by SIGABRT.")
@@ -199,7 +209,7 @@ def test_a_stop_ends_a_running_scan(tmp_path: Path) -> None:
     assert time.monotonic() - start < 20
 
 
-def test_temporary_files_of_the_libraries_are_gone_with_the_attempt(tmp_path: Path) -> None:
+def test_temporary_files_of_libraries_are_deleted(tmp_path: Path) -> None:
     done(job(tmp_path, "bad", "litter"))
     assert not list(tmp_path.rglob("left"))
 

@@ -21,7 +21,7 @@ from gnrecon.options import Options
 from gnrecon.runtime.dask_scheduler import dask_client
 from gnrecon.runtime.errors import UsageError
 
-# Dask's own threads and sockets go when they please.
+# Dask closes its threads and sockets late.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 
 
@@ -82,12 +82,12 @@ def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Mo
     assert not outcomes
 
 
-def test_a_sign_that_is_late_is_no_end(tmp_path: Path) -> None:
-    stop = FileRemoved(tmp_path / "sign")
+def test_a_file_that_appears_late_does_not_stop_a_job(tmp_path: Path) -> None:
+    stop = FileRemoved(tmp_path / "alive")
     assert not stop.is_set()
-    (tmp_path / "sign").touch()
+    (tmp_path / "alive").touch()
     assert not stop.is_set()
-    (tmp_path / "sign").unlink()
+    (tmp_path / "alive").unlink()
     assert stop.is_set()
 
 

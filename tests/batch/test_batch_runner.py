@@ -18,7 +18,8 @@ import numpy as np
 import psutil
 import pytest
 from fake_work import notes
-from scan_files import box, sphere, start, torus, write_scan
+from made_shapes import box, sphere
+from scan_files import start, torus, write_scan
 
 from gnrecon.batch import executors, runner
 from gnrecon.batch.execute import run_job
@@ -52,7 +53,7 @@ def write_bad(folder: Path) -> None:
 
 
 def summary(folder: Path) -> dict[str, dict[str, object]]:
-    """What became of each scan, by its name."""
+    """The summary's entry of each scan, by its name."""
     found = json.loads((folder / "summary.json").read_text())
     assert found["failed"] == sum(scan["status"] == "failed" for scan in found["scans"])
     return {scan["name"]: scan for scan in found["scans"]}
@@ -60,17 +61,17 @@ def summary(folder: Path) -> dict[str, dict[str, object]]:
 
 @contextmanager
 def accidents(output: Path) -> Iterator[None]:
-    """Let the child of the scan "killed" be killed, and that of "hangs" be stopped, as soon as they are there."""
+    """Kill the child of the scan "killed", and stop that of "hangs", as soon as they run."""
     over = threading.Event()
 
-    def befall() -> None:
+    def signal_children() -> None:
         while not over.wait(0.02):
             for name, number in (("killed", signal.SIGSEGV), ("hangs", signal.SIGSTOP)):
                 for progress in map(progress_file, running_folder(output).glob(f"{name}-*")):
                     with suppress(OSError, ValueError):
                         os.kill(json.loads(progress.read_text())["pid"], number)
 
-    thread = threading.Thread(target=befall)
+    thread = threading.Thread(target=signal_children)
     thread.start()
     try:
         yield
@@ -123,7 +124,7 @@ def test_a_batch_that_was_killed_is_continued_and_every_failure_is_named(tmp_pat
         "hangs": ("timeout", "It had not ended after 2 s, which is the limit (--timeout)."),
     }
     assert not list(running_folder(meshes).glob("*"))
-    # An undisturbed run of the good ones makes the same bytes, whatever its number of jobs and its other files.
+    # An undisturbed run of the good ones makes the same bytes, with any number of jobs and any other files.
     for name in ("torn.ply", "void.ply", "hangs.ply", "killed.ply"):
         (scans / name).unlink()
     alone = replace(request, output=tmp_path / "alone", jobs=3, kinds=("report", "page"))
@@ -165,7 +166,7 @@ def command(*words: object) -> int:
 
 @pytest.fixture
 def errand_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the jobs of this process's batches be fake_work."""
+    """Let batches in this process run the fake work."""
     monkeypatch.setattr(executors, "run_job", lambda *words: run_job(*words, work=fake_work.WORK))
 
 
@@ -177,7 +178,7 @@ def write_errands(folder: Path, **texts: str) -> Path:
 
 
 @pytest.mark.usefixtures("errand_runs")
-def test_an_account_of_all_is_written_and_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_summary_is_written_and_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     scans = write_errands(tmp_path / "scans", a="good", b="exit 4", c="good", d="signal SIGABRT")
     request = Request((str(scans),), tmp_path / "out", jobs=2, kinds=("model",), command="gnrecon batch scans")
     assert run_batch(request) == ExitCode.BATCH
@@ -223,7 +224,7 @@ def test_names_and_folders(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("errand_runs")
-def test_an_interrupted_batch_keeps_the_account_of_what_it_did(
+def test_an_interrupted_batch_writes_its_summary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     scans = write_errands(tmp_path / "scans", a="good", b="good 60", c="good")

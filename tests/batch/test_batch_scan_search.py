@@ -1,4 +1,4 @@
-"""Which files a batch takes, and what it calls their outputs."""
+"""The scans that a batch finds, and the names of their outputs."""
 
 from __future__ import annotations
 

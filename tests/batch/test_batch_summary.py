@@ -1,4 +1,4 @@
-"""The account of a batch: numbers that add up, a table that reads back, and a page that stands alone."""
+"""The summary of a batch: counts that add up, a table that reads back, and a self-contained page."""
 
 from __future__ import annotations
 

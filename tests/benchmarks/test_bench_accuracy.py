@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from benchmarks.__main__ import main as bench
 from benchmarks.accuracy.analytic_solids import SOLIDS
-from benchmarks.accuracy.cases import CASES, GROUPS, HARD, chosen_cases
+from benchmarks.accuracy.cases import GROUPS, cases_of, chosen_cases, hard_cases
 from benchmarks.accuracy.comparison import Protocol
 from benchmarks.accuracy.many_scans import main
 from benchmarks.accuracy.methods import METHODS, OURS, PEERS, oriented
@@ -23,13 +23,14 @@ from PIL import Image
 from rich.console import Console
 
 from gnrecon.export import require_sound, verify
-from gnrecon.export.metrics import Surface
+from gnrecon.export.metrics import SurfaceQuery
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import UsageError
 
 NOWHERE = Path("nowhere")
+CASES = cases_of(GROUPS)
 VOLUMES = {
     "sphere": 4 / 3 * np.pi,
     "torus": 2 * np.pi**2 * 0.7 * 0.3**2,
@@ -64,7 +65,7 @@ def test_the_truths_are_solids_of_the_stated_genus_and_of_radius_one(name: str) 
 def test_points_lie_on_the_shapes_and_normals_lead_out(name: str, rng: np.random.Generator) -> None:
     solid = SOLIDS[name]
     points, normals = solid.draw(2000, rng)
-    surface = Surface(solid.mesh())
+    surface = SurfaceQuery(solid.mesh())
     gaps = np.linalg.norm(points - surface.nearest(points)[0], axis=1)
     # The mesh of a curved shape has chords; of a flat one the nearest point differs by rounding alone.
     assert gaps.mean() < (5e-5 if solid.function else 1e-7)
@@ -143,21 +144,21 @@ def test_groups_and_names_choose_cases_once() -> None:
     assert list(chosen_cases(["clean", "noisy", "sparse"], GROUPS)) == list(GROUPS["analytic"])
     assert {len(GROUPS[name]) for name in ("srb", "vipss")} == {6, 2}
     assert set(chosen_cases(GROUPS, GROUPS)) == set(CASES)
-    assert set(HARD).isdisjoint(GROUPS["clean"])
+    assert set(hard_cases()).isdisjoint(GROUPS["clean"])
     with pytest.raises(UsageError, match="no case 'teapot'"):
         chosen_cases(["teapot"], GROUPS)
 
 
-def test_the_files_truths_have_their_genus_and_bare_scans_no_normals(shared_data: Path) -> None:
+def test_the_files_truths_have_their_genus_and_unoriented_scans_no_normals(shared_data: Path) -> None:
     for name, case in GROUPS["vipss"].items():
         problem = case.problem(shared_data, 0)
         assert (len(problem.scan), problem.scan.normals) == (500, None)
         assert verify(problem.truth).genus == problem.genus, name
         # The frame is one for both, so that the points lie on the truth.
-        feet, _ = Surface(problem.truth).nearest(problem.scan.points)
+        feet, _ = SurfaceQuery(problem.truth).nearest(problem.scan.points)
         assert np.linalg.norm(problem.scan.points - feet, axis=1).mean() < 2e-3
-    given, bare = (CASES[name].problem(shared_data, 0) for name in ("gargoyle", "gargoyle, no normals"))
-    assert bare.scan.normals is None
+    given, unoriented = (CASES[name].problem(shared_data, 0) for name in ("gargoyle", "gargoyle, no normals"))
+    assert unoriented.scan.normals is None
     assert given.scan.normals is not None
     assert isinstance(given.truth, PointCloud)
     assert (given.radius, given.factor, given.surface_samples) == (None, 1.0, 0)
@@ -172,7 +173,7 @@ def test_peers_make_a_sphere(name: str, given: bool) -> None:
     points = ball(400)
     mesh, _ = METHODS[name]()(points, points if given else None, **SMALL.get(name, {}))
     assert len(mesh.faces) > 100
-    # MeshLab's marching cubes have ghosts far off, so that the median tells.
+    # MeshLab's marching cubes have ghosts far off, so the median is what counts.
     assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1)) < 0.03
 
 
@@ -185,15 +186,15 @@ def test_estimated_normals_are_outward() -> None:
 
 def test_all_methods_have_their_settings() -> None:
     protocol = Protocol(threads=1, depths=(7, 8), options={"resolution": 64})
-    told = protocol.contestants(list(METHODS))
-    assert [name for name, _ in told if name in OURS] == list(OURS)
-    assert dict(told)["Adam"] == {"resolution": 64, "optimiser": "adam", "widths": (32, 32, 32)}
-    assert dict(told)["gnrecon"] == {"resolution": 64}
-    assert [settings for name, settings in told if name == "MeshLab Poisson"] == [
+    tried = protocol.contestants(list(METHODS))
+    assert [name for name, _ in tried if name in OURS] == list(OURS)
+    assert dict(tried)["Adam"] == {"resolution": 64, "optimiser": "adam", "widths": (32, 32, 32)}
+    assert dict(tried)["gnrecon"] == {"resolution": 64}
+    assert [settings for name, settings in tried if name == "MeshLab Poisson"] == [
         {"depth": 7, "threads": 1},
         {"depth": 8, "threads": 1},
     ]
-    assert {name for name, _ in told} == set(METHODS)
+    assert {name for name, _ in tried} == set(METHODS)
 
 
 def test_scans_and_truths_come_back_from_their_files(tmp_path: Path) -> None:
@@ -247,7 +248,7 @@ def summary(case: str, ours: float | None, *theirs: float | None) -> dict[str, A
 
 
 def test_the_standing_counts_hard_cases_against_the_best_peer() -> None:
-    first, second, third, fourth, fifth = list(HARD)[:5]
+    first, second, third, fourth, fifth = hard_cases()[:5]
     found = [
         summary(first, 0.7, 2.0, 1.0),
         summary(second, 0.9, 1.0, 2.0),
@@ -263,7 +264,7 @@ def test_the_standing_counts_hard_cases_against_the_best_peer() -> None:
 
 
 def test_the_table_shows_best_settings_distances_in_the_unit_and_failures() -> None:
-    case = next(iter(HARD))
+    case = hard_cases()[0]
     poisson = [record(case, "Poisson", mean, settings={"depth": depth}) for depth, mean in ((7, 0.002), (8, 0.001))]
     records = [record(case, "gnrecon", 0.0005, genus=5, closed=True), *poisson, broken(case, "APSS", "No surface.")]
     found = summarise(records, Problem(PointCloud(ball(9)), tetrahedron(), genus=5))

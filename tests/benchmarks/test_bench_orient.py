@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.accuracy.cases import cases_of
 from benchmarks.accuracy.comparison import Protocol
-from benchmarks.accuracy.orientation import CASES, main, meshes_table, sides, true_normals
+from benchmarks.accuracy.orientation import ORIENTATION_GROUPS, main, meshes_table, sides, true_normals
 from benchmarks.accuracy.problem import Problem
 from benchmarks.accuracy.scans import AnalyticScan
 
@@ -16,16 +17,17 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.errors import ExitCode, UsageError
 
 NOWHERE = Path("nowhere")
+CASES = cases_of(ORIENTATION_GROUPS)
 
 
 def test_true_normals_are_the_scans_or_the_surfaces() -> None:
     problem = AnalyticScan("torus", 500).problem(NOWHERE, 0)
     given = problem.scan.normals
-    bare = Problem(problem.scan.with_normals(None), problem.truth)
+    unoriented = Problem(problem.scan.with_normals(None), problem.truth)
     assert np.allclose(true_normals(problem), given)
-    found = true_normals(bare)
+    found = true_normals(unoriented)
     assert np.einsum("ij,ij->i", found, given).min() > 0.999
-    cloud = PointCloud(bare.scan.points)
+    cloud = PointCloud(unoriented.scan.points)
     assert true_normals(Problem(cloud, cloud)) is None
     assert sides(Problem(cloud, cloud))["gnrecon"]["right"] is None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,6 @@ from gnrecon.shape_learning import PROBLEMS, catenoid
 def test_figures_of_a_small_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(import_module("gnrecon.shape_learning.learn"), "STEPS", 15)
     monkeypatch.setitem(PROBLEMS, "catenoid", lambda: replace(catenoid(), network=Network((8, 8), TANH)))
     out = tmp_path / "figures.json"
     assert bench(["transport", "--problem", "catenoid", "--steps", "0,2", "--json", str(out)]) == ExitCode.OK

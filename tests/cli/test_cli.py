@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_shapes import sphere
 from markupsafe import escape
-from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, sphere, start, torus, wait_for, write_scan
+from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
 
 from gnrecon.cli.app import main
 from gnrecon.export import verify_file
@@ -309,7 +310,7 @@ def test_an_interrupt_during_the_fit_keeps_the_best_mesh(out: Path, scan: Path) 
         process.send_signal(signal.SIGINT)
         code, stderr = end(process)
     assert code == ExitCode.INTERRUPTED, stderr
-    assert stderr.endswith(f"gnrecon: Interrupted; {out / 'mesh.obj'} shows the best field until then.\n")
+    assert stderr.endswith(f"gnrecon: Interrupted; {out / 'mesh.obj'} is the mesh of the best field so far.\n")
     assert_torus(out / "mesh.obj")
     assert json.loads((out / "report.json").read_text())["fit"]["interrupted"]
 

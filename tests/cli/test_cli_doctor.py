@@ -88,24 +88,21 @@ def test_what_other_packages_bring_is_loaded(tmp_path: Path, monkeypatch: pytest
     assert fine == Check("reader fine", True, "the package fine 1.2")
     assert (broken.name, broken.ok) == ("writer bad", False)
     assert "cannot be loaded (ModuleNotFoundError: No module named 'no_such_library')" in broken.found
-    assert broken.remedy == "Mend or uninstall the package broken 1.2."
+    assert broken.remedy == "Repair or uninstall the package broken 1.2."
 
 
 def test_a_crash_in_native_code_is_survived_and_named() -> None:
     assert doctor.run_python("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)") == (False, "crashed (SIGSEGV)")
 
 
-def test_an_import_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "IMPORT_SECONDS", 0.2)
-    ok, said = doctor.run_python("import time; time.sleep(60)")
+def test_an_import_that_hangs_is_given_up() -> None:
+    ok, said = doctor.run_python("import time; time.sleep(60)", timeout_seconds=0.2)
     assert not ok
     assert "no answer" in said
 
 
-def test_short_memory_and_disk_are_faults(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(doctor, "LEAST_MEMORY", 2**60)
-    monkeypatch.setattr(doctor, "LEAST_DISK", 2**60)
-    for check in (doctor.check_memory(), doctor.check_disk(tmp_path)):
+def test_short_memory_and_disk_are_faults(tmp_path: Path) -> None:
+    for check in (doctor.check_memory(needed_bytes=2**60), doctor.check_disk(tmp_path, needed_bytes=2**60)):
         assert not check.ok
         assert check.remedy.startswith("Free some")
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from scan_files import sphere, write_scan
+from made_shapes import sphere
+from scan_files import write_scan
 
 from gnrecon.cli.app import main
 from gnrecon.report.report import report_schema
@@ -54,7 +55,7 @@ def test_a_troubled_scan_is_described(tmp_path: Path, capsys: pytest.CaptureFixt
     lines = {name: rest.strip() for name, _, rest in (line.partition(":") for line in text.splitlines())}
     assert "20 in isolated clusters" in lines["points"]
     assert lines["unit"].startswith("perhaps mm, a guess: its longest side would be 4")
-    assert lines["normals"] == "good, of other lengths than one"
+    assert lines["normals"] == "good, but not of length one"
     assert lines["surface"].startswith("open, or with holes: ")
     assert lines["layers"].startswith("two, about 5")
     assert "points in isolated clusters." in text
@@ -69,4 +70,4 @@ def test_a_run_that_was_not_measured_is_not_estimated(
     text = said(capsys, scan, "-o", tmp_path / "mesh.ply", "--dry-run", "--widths", "300", "--units", "mm")
     assert "layers of 300 sines, in 4 steps" in text
     assert "No estimate of time and memory" in text
-    assert "mm, as was told" in text
+    assert "mm, as given" in text

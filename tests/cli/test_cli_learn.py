@@ -54,8 +54,8 @@ def test_a_few_steps_of_the_catenoid(gnrecon: CommandLine, tmp_path: Path) -> No
         (("cone", "--resolution", "2"), "resolution"),
         (("cone", "--threads", "0"), "threads"),
         (("cone", "--wider", "-1"), "at least 0"),
-        (("cone", "--wider", "2", "--optimiser", "adam"), "Gauss-Newton alone"),
-        (("cone", "--share", "0.2"), "is for scans, not for cone"),
+        (("cone", "--wider", "2", "--optimiser", "adam"), "Gauss-Newton only"),
+        (("cone", "--share", "0.2"), "--share and --data are for scans, not for cone"),
         (("bunny", "--share", "1.5"), "above 0 and at most 1"),
     ],
 )

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-from importlib import import_module
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 from command_line import CommandLine
 
 from gnrecon.export import verify_file
-from gnrecon.field import Network
-from gnrecon.field.layers import WAVELET
 from gnrecon.io import read_mesh
 from gnrecon.runtime.errors import ExitCode
+from gnrecon.shape_learning import ShapeLearningParameters, bracket
 
 
 @pytest.fixture
@@ -22,10 +22,10 @@ def gnrecon(capfd: pytest.CaptureFixture[str]) -> CommandLine:
 
 
 def test_a_few_steps_of_the_sample(gnrecon: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(import_module("gnrecon.shape_learning.learn"), "STEPS", 12)
-    monkeypatch.setattr("gnrecon.shape_learning.part_problem.POOL", 30_000)
-    monkeypatch.setattr("gnrecon.shape_learning.part_problem.CELLS", 32)
-    monkeypatch.setattr("gnrecon.shape_learning.part_problem.NETWORK", Network((8, 8), WAVELET, (6.0, 2.0)))
+    quick = replace(
+        ShapeLearningParameters.part, widths=(8, 8), frequencies=(6.0, 2.0), pool_points=30_000, component_cells=32
+    )
+    monkeypatch.setattr("gnrecon.cli.learn_problem.bracket", partial(bracket, parameters=quick))
     mesh, report = tmp_path / "part.ply", tmp_path / "r.json"
     words = ("bracket", "-o", mesh, "--report", report, "--steps", 2, "--resolution", 48, "--curvature", "--clip", 1000)
     done = gnrecon("learn", *words)
@@ -46,9 +46,9 @@ def test_a_few_steps_of_the_sample(gnrecon: CommandLine, tmp_path: Path, monkeyp
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("catenoid", "--clip", "100"), "A design is for the problem bracket alone"),
+        (("catenoid", "--clip", "100"), "A design is for the problem bracket only"),
         (("bracket", "--region", "region.stl"), "both --region and --interfaces"),
-        (("bracket", "--interfaces-frame", "0,0,0,1"), "--interfaces-frame is for --interfaces"),
+        (("bracket", "--interfaces-frame", "0,0,0,1"), "--interfaces-frame needs --interfaces"),
         (("bracket", "--clip", "-1"), "clipped at -1"),
         (("bracket", "--region", "a.stl", "--interfaces", "b.stl", "--interfaces-frame", "1,2,3"), "X,Y,Z,SCALE"),
         (("bracket", "--region", "a.stl", "--interfaces", "b.stl", "--interfaces-frame", "1,2,3,0"), "X,Y,Z,SCALE"),

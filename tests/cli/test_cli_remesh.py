@@ -73,7 +73,7 @@ def test_edges_and_errors_may_be_asked_for_with_units(model: Path, tmp_path: Pat
     words = ("mesh", model, "--units", "cm", "-o")
     coarse = command(*words, tmp_path / "coarse.ply", "--edge-length", "1mm")
     assert coarse.returncode == 0, coarse.stderr
-    assert "cells along the box, edges are 0." in coarse.stderr
+    assert "cells along the box: the mean edge is 0." in coarse.stderr
     mesh = read_mesh(tmp_path / "coarse.ply")
     sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
     assert np.linalg.norm(sides, axis=2).mean() == pytest.approx(0.1, rel=0.1)

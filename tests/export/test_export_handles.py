@@ -78,7 +78,7 @@ def test_necks_between_plates_are_cut(true_clip: Mesh) -> None:
     assert off(mesh, true_clip) > 0.09
     assert off(result, true_clip) < 0.04
     assert result.volume == pytest.approx(true_clip.volume, rel=0.002)
-    assert actions[0].startswith("Removed 6 handles or tunnels that no points support, of up to ")
+    assert actions[0].startswith("Removed 6 handles or tunnels that no points support, up to ")
     # What is far from the necks is as it was, normals included.
     kept = np.isin(mesh.vertices, result.vertices).all(axis=1)
     assert kept.mean() > 0.8
@@ -144,7 +144,7 @@ def test_a_neck_that_holds_a_part_is_not_cut() -> None:
         assert remove_handles(mesh, scanned(truth)) == (mesh, [])
 
 
-def test_the_two_parts_of_a_mesh_are_told_apart() -> None:
+def test_two_parts_of_a_mesh_stay_separate() -> None:
     """A handle of one of two components is cut; the other, which has none, stays as it is."""
     bored = without(box((0.3, 0.7, 0.06), (0.5, 0.0, 0.0)), rod(0.03, 0.5, 0.2))
     ball = sphere(0.3, (-0.4, 0.0, 0.0))
@@ -170,7 +170,7 @@ def test_loops_are_as_short_as_they_can_be() -> None:
     for seed in range(3):
         loops = short_loops(ring, longest, everywhere, np.random.default_rng(seed))
         assert len(loops) > 10
-        assert {loop.word for loop in loops} == {loops[0].word} != {0}
+        assert {loop.signature for loop in loops} == {loops[0].signature} != {0}
         # Paths of edges are a little longer than the circle.
         assert shortest * 0.98 < loops[0].length < shortest * 1.1
         assert [loop.length for loop in loops] == sorted(loop.length for loop in loops)
@@ -182,5 +182,5 @@ def test_loops_are_as_short_as_they_can_be() -> None:
     assert not short_loops(ring, longest, ~everywhere, np.random.default_rng(0))
     # The tunnel's own loops are longer, and of another class.
     around = short_loops(ring, np.full(len(ring.vertices), 3.5 * shortest), everywhere, np.random.default_rng(0))
-    assert {loop.word for loop in around} == {around[0].word}
+    assert {loop.signature for loop in around} == {around[0].signature}
     assert not short_loops(meshed(sphere()), longest, everywhere, np.random.default_rng(0))

@@ -12,10 +12,10 @@ from analytic_fields import UTM, Field, torus
 
 from gnrecon.export import SignedDistance
 from gnrecon.export import mesh_field as meshing
-from gnrecon.export.mesh_field import fine_enough, mesh_field
-from gnrecon.export.mesh_options import MeshOptions
+from gnrecon.export.export_parameters import ExportParameters, ResolutionParameters
+from gnrecon.export.mesh_field import MeshOptions, cells_for_curvature, mesh_field
 from gnrecon.export.resolution import chord_error
-from gnrecon.ingest.noise import neighbour_spacing
+from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError
@@ -66,9 +66,9 @@ def test_a_mesh_becomes_finer_until_the_error_is_small_enough(field: Precise) ->
     assert again.fineness.resolution == 20
 
 
-def test_what_the_limit_of_cells_reaches_is_said(field: Precise, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meshing, "MOST_REFINED", 30)
-    meshed = mesh_field(field, MeshOptions(resolution=20, max_error=1e-6), data=None)
+def test_what_the_limit_of_cells_reaches_is_said(field: Precise) -> None:
+    limited = ExportParameters(resolution=ResolutionParameters(most_refined_cells=30))
+    meshed = mesh_field(field, MeshOptions(resolution=20, max_error=1e-6), data=None, parameters=limited)
     assert meshed.fineness.resolution == 30
     assert meshed.actions[-1] == "That is not within 1e-06: the limit of 30 cells was reached."
 
@@ -97,7 +97,7 @@ def test_single_precision_serves_where_values_and_gradients_agree(shift: float, 
 
     cell = 2.2 / 50
     field, data = Double(torus()), np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3))
-    assert (meshing._coarse(field, data, 50) is not field) == kept
+    assert (meshing._single_precision_field(field, data, 50) is not field) == kept
 
 
 def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
@@ -134,8 +134,8 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
             x = result.mesh.vertices[result.mesh.faces].mean(axis=1)
             off = np.hypot(np.hypot(x[:, 0], x[:, 1]) - 3, x[:, 2]) - 1
             assert np.abs(off).mean() < 3e-4
-            assert fine_enough(result.sdf, 200) == max(200, cells)
-            assert fine_enough(replace(result.sdf, detail=None), 128) == 128
+            assert cells_for_curvature(result.sdf, 200) == max(200, cells)
+            assert cells_for_curvature(replace(result.sdf, detail=None), 128) == 128
     assert found[0.0] > found[0.02] == 128
     assert reconstruct(points, normals, quality="draft", resolution=60).report["fineness"]["resolution"] == 60
 
@@ -143,12 +143,12 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
 def test_an_impossible_edge_length_is_refused_before_the_fit() -> None:
     stages: list[str] = []
 
-    class Heard(Progress):
+    class Recorded(Progress):
         def stage(self, name: str) -> None:
             stages.append(name)
 
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     with pytest.raises(UsageError, match="possible"):
-        reconstruct(points, points, edge_length=1e-9, progress=Heard())
+        reconstruct(points, points, edge_length=1e-9, progress=Recorded())
     assert stages == ["read", "ingest"]

@@ -7,7 +7,7 @@ import pytest
 from analytic_fields import UNIT, UTM, Field, shells, sphere, torus
 
 from gnrecon.export import extract, project, require_sound
-from gnrecon.export.metrics import Surface, nearest_on_surface
+from gnrecon.export.metrics import SurfaceQuery, nearest_on_surface
 from gnrecon.export.offset import OffsetField
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
@@ -40,7 +40,7 @@ def test_the_sign_in_a_shell_within_a_shell(rng: np.random.Generator) -> None:
     points = rng.uniform(-1, 1, (5000, 3))
     truth = field.sdf(points)
     clear = np.abs(truth) > 0.02
-    inside = Surface(meshed(field)).inside(points)
+    inside = SurfaceQuery(meshed(field)).inside(points)
     assert np.array_equal(inside[clear], truth[clear] < 0)
 
 
@@ -49,7 +49,7 @@ def test_the_nearest_point_agrees_with_a_slow_search(rng: np.random.Generator) -
 
     mesh = extract(Field(sphere()), resolution=8)
     points = rng.uniform(-1, 1, (50, 3))
-    feet, faces = Surface(mesh, batch=7).nearest(points)
+    feet, faces = SurfaceQuery(mesh, batch=7).nearest(points)
     slow = np.array(
         [
             np.linalg.norm(

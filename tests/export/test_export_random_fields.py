@@ -22,7 +22,7 @@ CASES = 200
 outcomes: Counter[str] = Counter()
 
 
-def refusal(field: SignedDistance, seed: int, path: Path) -> MeshError | None:
+def manifold_error(field: SignedDistance, seed: int, path: Path) -> MeshError | None:
     """Extract, project, repair, require and write a field, at a resolution of the seed's own; what prevents that."""
     try:
         mesh = project(extract(field, resolution=14 + seed % 11), field, steps=2)
@@ -38,7 +38,7 @@ def refusal(field: SignedDistance, seed: int, path: Path) -> MeshError | None:
 def test_a_written_file_bounds_a_solid(seed: int, tmp_path: Path) -> None:
     kind, field = random_field(seed)
     path = tmp_path / f"mesh.{FORMATS[seed // 3 % len(FORMATS)]}"
-    refused = refusal(field, seed, path)
+    refused = manifold_error(field, seed, path)
     outcomes["written" if refused is None else "refused"] += 1
     if refused is not None:
         assert refused.exit_code == ExitCode.MESH

@@ -23,7 +23,7 @@ def test_nothing_asked_for_is_nothing_done() -> None:
     assert actions == []
 
 
-def test_steps_come_in_their_order_and_are_told() -> None:
+def test_steps_run_in_their_order_and_are_reported() -> None:
     field = Field(cylinder())
     mesh = extracted(field)
     shares: list[float] = []
@@ -85,8 +85,7 @@ def test_a_tolerance_that_would_leave_nothing_is_lowered_or_given_up() -> None:
     result, actions = refine(mesh, field, RefineOptions(simplify=100.0))
     assert require_sound(result).genus == 0
     assert actions == [
-        "Not simplified to within 100, because that failed: manifold3d left nothing of the mesh "
-        "(within the tolerance it is flat)."
+        "Not simplified to within 100: manifold3d left nothing of the mesh (within the tolerance it is flat)."
     ]
     assert result is mesh
 
@@ -104,9 +103,7 @@ def test_a_step_that_fails_is_tried_more_gently(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(sys.modules["gnrecon.export.remeshing.refine"], "simplify", fails_when_strong)
     _, actions = refine(extracted(field, 16), field, RefineOptions(simplify=0.02))
     assert tried == [0.02, 0.01]
-    assert (
-        "Simplified to within 0.02, at 0.5 of the strength because more would have failed (Too strong.)" in actions[0]
-    )
+    assert "Simplified to within 0.02, at 0.5 of the strength because more failed (Too strong.)" in actions[0]
 
 
 def test_a_step_that_changes_the_topology_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,8 @@ from analytic_fields import UTM, Field, Function, sines, sphere, torus
 from sharp_fields import between, box, cylinder, extracted, lens, to_box_edges, to_cylinder_edges, to_lens_edge
 
 from gnrecon.export import project, quality, remesh, require_sound, sharpen, verify
-from gnrecon.export.remeshing.edge_table import CORNER, CREASE
-from gnrecon.export.remeshing.remesh import creased
+from gnrecon.export.remeshing.edge_table import VertexKind
+from gnrecon.export.remeshing.remesh import with_creases
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 
@@ -51,7 +51,7 @@ def test_edges_stay_sharp(function, distance) -> None:  # type: ignore[no-untype
     on_edge = to_edge < 1e-6
     # No vertex floats beside the edge, and the edge's vertices make its lines.
     assert np.count_nonzero(~on_edge & (to_edge < 0.1 * length)) <= 0.02 * np.count_nonzero(on_edge)
-    surface = creased(mesh, field, 30.0)
+    surface = with_creases(mesh, field, 30.0)
     crease = surface.vertices[surface.creases]
     assert distance(crease.reshape(-1, 3)).max() < 1e-6
     assert np.quantile(distance(crease.mean(axis=1)), 0.99) < 0.15 * length**2 / 0.6
@@ -63,9 +63,9 @@ def test_edges_stay_sharp(function, distance) -> None:  # type: ignore[no-untype
 def test_a_box_keeps_its_corners() -> None:
     field = Field(box())
     mesh = remesh(project(sharpen(extracted(field), field), field), field, 0.1)
-    kinds = creased(mesh, field, 30.0).kinds()
-    assert np.count_nonzero(kinds == CORNER) == 8
-    assert np.count_nonzero(kinds == CREASE) > 80
+    kinds = with_creases(mesh, field, 30.0).kinds()
+    assert np.count_nonzero(kinds == VertexKind.CORNER) == 8
+    assert np.count_nonzero(kinds == VertexKind.CREASE) > 80
     assert mesh.volume == pytest.approx(8 * 0.7 * 0.6 * 0.35, rel=1e-6)
 
 

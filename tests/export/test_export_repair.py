@@ -6,10 +6,19 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, plate, shells, sines, sphere, union
+from analytic_fields import UTM, Field, ball_mesh, plate, shells, sines, sphere, union
 from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
 
-from gnrecon.export import drop_stray, extract, project, remove_stray, repair, require_bordered, require_sound, verify
+from gnrecon.export import (
+    drop_stray_components,
+    extract,
+    project,
+    remove_stray,
+    repair,
+    require_bordered,
+    require_sound,
+    verify,
+)
 from gnrecon.export.mesh_statistics import submesh
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
@@ -17,8 +26,7 @@ from gnrecon.runtime.errors import MeshError, UsageError
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    field = Field(sphere(), frame=UTM)
-    return project(extract(field, resolution=24), field)
+    return ball_mesh()
 
 
 def test_a_sound_mesh_comes_back_as_it_is(ball: Mesh) -> None:
@@ -142,7 +150,7 @@ def test_nested_shells_stay_oriented() -> None:
     assert len(actions) == 1
     inner, actions = kept(0.7, 0.3)
     assert inner.volume == pytest.approx(ball * (0.7**3 - 0.3**3), rel=0.02)
-    assert "Turned 2 components round" in actions[1]
+    assert "Reversed 2 components" in actions[1]
     for mesh in (outer, shell, inner):
         require_sound(mesh)
         assert mesh.normals is not None
@@ -154,7 +162,7 @@ def test_stray_parts_of_a_surface_with_borders_are_dropped() -> None:
     # A ball and a speck; faces beyond a plane are missing from both, as at the end of a box.
     both = extract(Field(union(sphere(0.5, (-0.4, 0, 0)), sphere(0.2, (0.6, 0, 0)))), resolution=32)
     open_ones = submesh(both, (both.corners[:, :, 2] > -0.1).all(axis=1))
-    mesh, actions = drop_stray(open_ones, on_sphere(0.5, 1000, (-0.4, 0, 0)))
+    mesh, actions = drop_stray_components(open_ones, on_sphere(0.5, 1000, (-0.4, 0, 0)))
     facts = require_bordered(mesh)
     assert facts.components == 1
     assert facts.boundary_edges > 0
@@ -162,10 +170,10 @@ def test_stray_parts_of_a_surface_with_borders_are_dropped() -> None:
     assert "Dropped 1 of 2 components" in actions[0]
     outward = np.einsum("ij,ij->i", mesh.vertex_normals(), mesh.vertices - (-0.4, 0, 0))
     assert (outward > 0).all(), "what stays keeps its side"
-    assert drop_stray(mesh, on_sphere(0.5, 10, (-0.4, 0, 0))) == (mesh, [])
+    assert drop_stray_components(mesh, on_sphere(0.5, 10, (-0.4, 0, 0))) == (mesh, [])
 
 
-@pytest.mark.parametrize("without", [remove_stray, drop_stray])
+@pytest.mark.parametrize("without", [remove_stray, drop_stray_components])
 def test_stray_parts_need_points(without: Callable[[Mesh, np.ndarray], object]) -> None:
     with pytest.raises(UsageError, match="no points"):
         without(extract(Field(plate(0.1)), resolution=16), np.empty((0, 3)))

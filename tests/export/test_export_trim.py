@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from analytic_fields import Field, sphere, torus, union
 
-from gnrecon.export import Neighbourhood, extract, invented, require_bordered, require_sound, trim, verify_file
+from gnrecon.export import Neighbourhood, extract, require_bordered, require_sound, trim, unsupported_area, verify_file
+from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.mesh_statistics import Edges, split_vertices
-from gnrecon.export.trim import CLEAR
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
 from gnrecon.runtime.errors import MeshError, UsageError
@@ -66,14 +66,14 @@ def test_invented_area_of_half_a_sphere(rng: np.random.Generator) -> None:
     points = points_on_sphere(20_000, rng)
     upper = points[points[:, 2] > 0]
     mesh, around = ball(), Neighbourhood(upper)
-    found = invented(mesh, around.distances(mesh.vertices), around.spacing())
+    found = unsupported_area(mesh, around.distances(mesh.vertices), around.spacing())
     # Each of 20,000 points has its share of the sphere to itself.
     spacing = np.sqrt(4 * np.pi * RADIUS**2 / 20_000)
     assert around.spacing() == pytest.approx(spacing, rel=0.03)
     assert found.invented_beyond == pytest.approx(3 * spacing, rel=0.03)
     assert found.invented_area_share == pytest.approx((RADIUS - 3 * spacing) / (2 * RADIUS), abs=0.02)
     assert "--trim 3s" in found.describe()[0]
-    whole = invented(mesh, Neighbourhood(points).distances(mesh.vertices), spacing)
+    whole = unsupported_area(mesh, Neighbourhood(points).distances(mesh.vertices), spacing)
     assert whole.invented_area_share < 1e-3
     assert whole.describe() == []
 
@@ -104,7 +104,7 @@ def test_small_holes_stay_closed_and_crumbs_go(rng: np.random.Generator) -> None
     assert result.euler_characteristic == 1
     assert result.vertices[:, 2].min() > -0.3
     assert "with 1 small leftover pieces" in done.describe()[0]
-    assert "1 smaller gaps were left closed" in done.describe()[0]
+    assert "1 small gaps were left closed" in done.describe()[0]
 
 
 def test_a_supported_component_stays_however_small_it_is() -> None:
@@ -141,17 +141,15 @@ def test_values_are_interpolated_at_the_cut() -> None:
     assert (np.einsum("ij,ij->i", result.normals, result.vertices) > 0.99 * RADIUS).all()
     place = mesh.vertices[result.attributes["label"]]
     assert np.linalg.norm(place - result.vertices, axis=1).max() < 0.06
-    assert np.abs(border_points(result)[:, 2]).max() < 2 * CLEAR * 0.05
+    assert np.abs(border_points(result)[:, 2]).max() < 2 * ExportParameters.trim.edge_clearance * 0.05
 
 
 def test_nothing_far_and_nothing_near() -> None:
     mesh = ball(24)
     result, done = trim(mesh, np.zeros(len(mesh.vertices)), 0.1)
     assert result is mesh
-    assert done.describe() == ["Nothing was cut: no part of the surface lies farther than 0.1 from every point."]
-    with pytest.raises(
-        UsageError, match=r"Trimming at 0\.1 leaves nothing: the surface lies 7 or more from every point"
-    ):
+    assert done.describe() == ["Nothing was cut off: all of the surface lies within 0.1 of a point."]
+    with pytest.raises(UsageError, match=r"Trimming at 0\.1 leaves nothing: every point is at least 7 away"):
         trim(mesh, np.full(len(mesh.vertices), 7.0), 0.1)
 
 

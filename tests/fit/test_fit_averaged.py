@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import made_shapes
 import numpy as np
 import pytest
 
@@ -20,22 +21,15 @@ FRAME = Frame(np.array([10.0, -20.0, 30.0]), 2.0)
 
 
 def cube(count: int, noise: float, rng: np.random.Generator) -> Samples:
-    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
-    x, normals = rng.uniform(-0.8, 0.8, (count, 3)), np.zeros((count, 3))
-    x[rows, axis] = 0.8 * side + noise * rng.standard_normal(count)
-    normals[rows, axis] = side
-    return Samples(x, normals, FRAME)
+    return Samples(*made_shapes.cube(count, 0.8, rng, noise), FRAME)
 
 
 def ball(count: int, noise: float, rng: np.random.Generator) -> Samples:
-    x = rng.standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return Samples(x * (0.8 + noise * rng.standard_normal((count, 1))), x, FRAME)
+    return Samples(*made_shapes.sphere(count, rng, 0.8, noise), FRAME)
 
 
 def off_cube(x: np.ndarray) -> np.ndarray:
-    outside = np.abs(x) - 0.8
-    return np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
+    return made_shapes.off_cube(x, 0.8)
 
 
 def test_a_noisy_cube_is_averaged_and_its_fit_says_so() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import made_shapes
 import numpy as np
 import pytest
 
@@ -14,19 +15,12 @@ WIDE = BilateralFilter(3.0, 0.4)
 
 
 def ball(count: int, rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    x = rng.standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return x * (0.8 + noise * rng.standard_normal((count, 1))), x
+    return made_shapes.sphere(count, rng, 0.8, noise)
 
 
 def cube(count: int, rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Points of the surface of [-1, 1]^3, moved along their normals."""
-    axis, side = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count)
-    x, normals = rng.uniform(-1, 1, (count, 3)), np.zeros((count, 3))
-    rows = np.arange(count)
-    x[rows, axis] = side + noise * rng.standard_normal(count)
-    normals[rows, axis] = side
-    return x, normals
+    return made_shapes.cube(count, 1.0, rng, noise)
 
 
 def tilted(normals: np.ndarray, angle: float, rng: np.random.Generator) -> np.ndarray:
@@ -70,8 +64,8 @@ def test_a_cube_loses_its_noise_and_keeps_its_edges() -> None:
     edge = np.sort(np.abs(x), axis=1)[:, 1] > 0.95
     assert 300 < edge.sum() < 1000
     assert off_cube(points[edge]).mean() < 0.5 * off_cube(x[edge]).mean()
-    heedless, _ = BilateralFilter(3.0, 10.0).apply(x, normals)
-    assert off_cube(heedless[edge]).mean() > 1.5 * off_cube(points[edge]).mean()
+    unguided, _ = BilateralFilter(3.0, 10.0).apply(x, normals)
+    assert off_cube(unguided[edge]).mean() > 1.5 * off_cube(points[edge]).mean()
 
 
 def test_the_two_sides_of_a_sheet_do_not_attract() -> None:
@@ -84,7 +78,7 @@ def test_the_two_sides_of_a_sheet_do_not_attract() -> None:
 
 
 def test_a_surface_behind_a_wall_that_looks_the_same_way_does_not_attract() -> None:
-    """As the wall of a bore does beside a thin wall: a patch of it lies behind, with the same normals."""
+    """As the wall of a bore behind a thin wall: a patch of it lies behind, with the same normals."""
     rng = np.random.default_rng(6)
     front, behind, noise = 4000, 300, 0.005
     x = np.concatenate([rng.uniform(-1, 1, (front, 3)), rng.uniform(-0.25, 0.25, (behind, 3))])
@@ -92,9 +86,9 @@ def test_a_surface_behind_a_wall_that_looks_the_same_way_does_not_attract() -> N
     x[:, 2] = height + noise * rng.standard_normal(len(x))
     points, _ = WIDE.apply(x, np.tile([0.0, 0.0, 1.0], (len(x), 1)))
     off = np.abs(points[:, 2] - height)
-    beside = np.abs(x[:, :2]).max(axis=1) < 0.2
-    assert off[:front][beside[:front]].mean() < 0.4 * noise
-    assert off[front:][beside[front:]].mean() < 0.4 * noise
+    central = np.abs(x[:, :2]).max(axis=1) < 0.2
+    assert off[:front][central[:front]].mean() < 0.4 * noise
+    assert off[front:][central[front:]].mean() < 0.4 * noise
 
 
 @pytest.mark.parametrize("count", [2, 10])

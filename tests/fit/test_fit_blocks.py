@@ -42,7 +42,7 @@ BELIEF = Hyperparameters(0.1, 1e-3, 0.05)
 FEATURES = 60
 
 
-def known(*_: object) -> Hyperparameters:
+def fixed_belief(*_: object) -> Hyperparameters:
     """Replace the choice, which is tested elsewhere."""
     return BELIEF
 
@@ -80,7 +80,7 @@ def fitted(
 @pytest.fixture(autouse=True)
 def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fix length and noise; their choice is tested elsewhere."""
-    monkeypatch.setattr(large, "select_hyperparameters", known)
+    monkeypatch.setattr(large, "select_hyperparameters", fixed_belief)
     monkeypatch.setitem(QUALITIES, "draft", FEATURES)
 
 
@@ -88,7 +88,7 @@ def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
 def whole() -> Detail:
     """The detail of an undisturbed fit in one process."""
     with pytest.MonkeyPatch.context() as patch, threads(1):
-        patch.setattr(large, "select_hyperparameters", known)
+        patch.setattr(large, "select_hyperparameters", fixed_belief)
         patch.setitem(QUALITIES, "draft", FEATURES)
         return fitted(block_points=200)[1]
 
@@ -143,7 +143,7 @@ def test_a_cluster_that_loses_a_worker_changes_no_digit(whole: Detail, tmp_path:
 
 
 def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="need a work folder"):
+    with pytest.raises(UsageError, match="needs a work folder"):
         Options(block_scheduler="tcp://127.0.0.1:9")
     assert Options(block_scheduler="tcp://127.0.0.1:9", work_dir="work").block_scheduler == "tcp://127.0.0.1:9"
     monkeypatch.setattr(workers, "dask_client", partial(dask_client, timeout="1s"))
@@ -154,7 +154,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    found = LocalData(samples, FieldResiduals.of(sdf, samples), known())
+    found = LocalData(samples, FieldResiduals.of(sdf, samples), fixed_belief())
     single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
@@ -217,7 +217,8 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent), *sys.path]!r}\n"
         "import time, torch; from pathlib import Path\n"
         "from gnrecon.fit.blocks import solve as large; import test_fit_blocks as own\n"
-        "torch.set_num_threads(1); large.select_hyperparameters = own.known; own.QUALITIES['draft'] = own.FEATURES\n"
+        "torch.set_num_threads(1); large.select_hyperparameters = own.fixed_belief\n"
+        "own.QUALITIES['draft'] = own.FEATURES\n"
         "save = own.WorkFolder.save\n"
         "own.WorkFolder.save = lambda *arguments: (save(*arguments), time.sleep(0.2))\n"
         f"own.fitted(Path({str(tmp_path)!r}))\n"

@@ -13,7 +13,7 @@ COUNT = 6000
 
 
 def two_balls() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals and disks of a ball and of a smaller one beside it."""
+    """Points, normals and disks of a ball and of a smaller one next to it."""
     rng = np.random.default_rng(0)
     normals = rng.standard_normal((COUNT, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -25,9 +25,7 @@ def cube(count: int, seed: int = 0) -> tuple[Float, Float]:
 
 
 def ball(count: int) -> tuple[Float, Float]:
-    x = np.random.default_rng(0).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return SIDE * x, x
+    return made_shapes.sphere(count, 0, SIDE)
 
 
 def bored(count: int, seed: int = 0) -> tuple[Float, Float]:
@@ -35,9 +33,7 @@ def bored(count: int, seed: int = 0) -> tuple[Float, Float]:
 
 
 def off_cube(x: Float) -> Float:
-    outside = np.abs(x) - SIDE
-    off: Float = np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
-    return off
+    return made_shapes.off_cube(x, SIDE)
 
 
 def without(points: Float, normals: Float, middle: list[float], reach: float) -> tuple[Float, Float]:
@@ -115,7 +111,7 @@ def test_a_cylinder_of_two_sides() -> None:
 
 
 def corner(size: int, hidden: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the cells of a box's corner, those known but for a cube about it, and signed distances of its faces."""
+    """Return the cells of a box's corner, those known except a cube around it, and signed distances of its faces."""
     half = size // 2 - 0.5
     at = np.stack(np.meshgrid(*[np.arange(size) - half] * 3, indexing="ij"), axis=-1)
     inside = (at < 0).all(axis=-1)
@@ -136,14 +132,14 @@ def test_a_minimal_cut_runs_along_faces_to_a_corner_and_without_them_takes_the_s
 
 def test_cells_enclosed_by_a_cut_are_counted() -> None:
     sides = np.zeros((12, 12, 12), dtype=bool)
-    seen = np.zeros_like(sides)
-    seen[5:8, 5:8, 5:8] = True
-    assert not encloses(sides, seen)
+    scanned = np.zeros_like(sides)
+    scanned[5:8, 5:8, 5:8] = True
+    assert not encloses(sides, scanned)
     sides[3:10, 3:10, 3:10] = True
     sides[5:8, 5:8, 5:8] = False
-    assert encloses(sides, seen)
+    assert encloses(sides, scanned)
     sides[5:, 6, 6] = False
-    assert not encloses(sides, seen)
+    assert not encloses(sides, scanned)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -194,11 +190,11 @@ def across_opening(height: float) -> tuple[Float, Float]:
 
 def test_the_opening_of_a_bore_whose_wall_was_scanned_is_recognised() -> None:
     points, normals = bored(6000)
-    seen = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > 0.05)
-    points, normals = points[seen], normals[seen]
+    scanned = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > 0.05)
+    points, normals = points[scanned], normals[scanned]
     for turn in (np.eye(3), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])):
-        shut, theirs = across_opening(HEIGHT)
-        assert in_bore_opening(shut @ turn, theirs @ turn, points @ turn, normals @ turn).all()
+        shut, sample_normals = across_opening(HEIGHT)
+        assert in_bore_opening(shut @ turn, sample_normals @ turn, points @ turn, normals @ turn).all()
     # A wall that was scanned at one end only does not show the other opening.
     end = (np.hypot(points[:, 0], points[:, 1]) > BORE + 1e-6) | (points[:, 2] > HEIGHT - 0.03)
     assert in_bore_opening(*across_opening(HEIGHT), points[end], normals[end]).all()
@@ -212,11 +208,11 @@ def test_the_floor_of_a_blind_bore_and_a_face_without_one_are_no_openings() -> N
     floor, up = across_opening(0.1)
     above = ~inner | (points[:, 2] > 0.1)
     assert not in_bore_opening(floor, up, points[above], normals[above]).any()
-    # A face with a hole that nobody saw has faces behind it, which look away from it.
+    # A face with a hole that was not scanned has faces behind it, which look away from it.
     x, out = cube(6000)
-    left, theirs = without(x, out, [0.0, 0.0, SIDE], 0.4)
+    left, sample_normals = without(x, out, [0.0, 0.0, SIDE], 0.4)
     patch, up = across_opening(SIDE)
-    assert not in_bore_opening(patch, up, left, theirs).any()
+    assert not in_bore_opening(patch, up, left, sample_normals).any()
 
 
 def test_the_side_of_a_can_goes_on() -> None:
@@ -241,7 +237,7 @@ def test_whole_shapes_and_round_ones_have_nothing_to_go_on(scan: tuple[Float, Fl
 
 
 def test_a_round_shape_with_one_flat_side_is_not_extended() -> None:
-    """Across a hole in its flat side a plane would go on; but what else is flat about it?"""
+    """Across a hole in its flat side a plane would extend; but nothing else of it is flat."""
     points, normals = ball(4000)
     below = points[:, 2] < -0.8 * SIDE
     points[below, 2], normals[below] = -0.8 * SIDE, [0.0, 0.0, -1.0]
@@ -259,8 +255,8 @@ def test_points_that_crowd_in_a_corner_make_no_lattice_without_end() -> None:
 def test_noise_is_no_hole_and_an_open_side_no_place_for_samples() -> None:
     assert not len(complete_holes(*noisy(*cube(2500), 0.01, 0.2)))
     points, normals = cube(2500)
-    seen = points[:, 2] > -0.5 * SIDE
-    across = complete_holes(points[seen], normals[seen])
+    scanned = points[:, 2] > -0.5 * SIDE
+    across = complete_holes(points[scanned], normals[scanned])
     assert across.points[:, 2].min(initial=0.0) > -1.05 * SIDE
 
 

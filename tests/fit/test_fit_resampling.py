@@ -26,8 +26,7 @@ def cube(count: int, seed: int = 0) -> Oriented:
 
 
 def off_cube(x: Float) -> Float:
-    outside = np.abs(x) - SIDE
-    return np.asarray(np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0)))
+    return made_shapes.off_cube(x, SIDE)
 
 
 def off_plate(x: Float) -> Float:
@@ -42,25 +41,20 @@ def gaps(points: Float, places: Float) -> Float:
 
 
 def ball(count: int) -> Oriented:
-    x = np.random.default_rng(0).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return SIDE * x, x
+    return made_shapes.sphere(count, 0, SIDE)
 
 
 def torus(count: int) -> Oriented:
-    u, v = np.random.default_rng(1).uniform(0, 2 * np.pi, (2, count))
-    ring = np.stack([np.cos(u), np.sin(u), 0 * u], axis=1)
-    normals = np.cos(v)[:, None] * ring + np.sin(v)[:, None] * [0.0, 0.0, 1.0]
-    return 0.6 * ring + 0.25 * normals, normals
+    return made_shapes.torus(count, 1, 0.6, 0.25)
 
 
 @pytest.mark.parametrize(("count", "seed"), [(60, 0), (60, 1), (400, 2)])
 def test_a_cube_is_covered_up_to_its_edges_and_corners(count: int, seed: int) -> None:
     points, normals = cube(count, seed)
-    samples, theirs = resample_primitives(points, normals)
+    samples, sample_normals = resample_primitives(points, normals)
     assert 3 * count < len(samples) <= 1.2 * ResamplingParameters.max_samples_per_point * count
     assert off_cube(samples).max() < 1e-9
-    assert np.abs((samples * theirs).sum(axis=1) - SIDE).max() < 1e-9
+    assert np.abs((samples * sample_normals).sum(axis=1) - SIDE).max() < 1e-9
     places = cube(20_000, 9)[0]
     before, after = gaps(points, places), gaps(np.concatenate([points, samples]), places)
     assert after.mean() < 0.45 * before.mean()
@@ -70,14 +64,14 @@ def test_a_cube_is_covered_up_to_its_edges_and_corners(count: int, seed: int) ->
 
 def test_a_bore_has_samples_on_its_wall_and_none_in_its_openings() -> None:
     points, normals = bored_plate(900, SIDE, HEIGHT, BORE)
-    samples, theirs = resample_primitives(points, normals)
+    samples, sample_normals = resample_primitives(points, normals)
     assert len(samples) > 3000
     assert np.quantile(off_plate(samples), 0.998) < 1e-6
     assert off_plate(samples).max() < 0.5 * Density(points).radius
     wall = np.abs(np.hypot(samples[:, 0], samples[:, 1]) - BORE) < 1e-6
     assert wall.sum() > 200
     inward = -samples[wall, :2] / BORE
-    assert np.abs(theirs[wall, :2] - inward).max() < 1e-5
+    assert np.abs(sample_normals[wall, :2] - inward).max() < 1e-5
 
 
 def test_a_thin_plate_does_not_grow_beyond_a_rim_of_which_little_was_seen() -> None:
@@ -98,9 +92,9 @@ def test_a_thin_plate_does_not_grow_beyond_a_rim_of_which_little_was_seen() -> N
 
 def test_an_open_side_stays_open() -> None:
     points, normals = cube(900)
-    seen = points[:, 2] > -SIDE + 1e-9
-    samples, _ = resample_primitives(points[seen], normals[seen])
-    radius = Density(points[seen]).radius
+    scanned = points[:, 2] > -SIDE + 1e-9
+    samples, _ = resample_primitives(points[scanned], normals[scanned])
+    radius = Density(points[scanned]).radius
     assert samples[:, 2].min() > -SIDE - 3 * radius
     assert (np.abs(samples[samples[:, 2] < -SIDE + 0.01]).max(axis=1) > SIDE - 1e-6).all()
 
@@ -113,13 +107,13 @@ def test_round_shapes_and_dense_scans_get_none(scan: Oriented) -> None:
 
 def test_points_that_crowd_ask_for_no_more_than_others() -> None:
     points, normals = cube(900)
-    crowd, theirs = cube(40_000, 3)
+    crowd, sample_normals = cube(40_000, 3)
     near = np.linalg.norm(crowd - SIDE, axis=1) < 0.15
-    joined = np.concatenate([points, crowd[near]]), np.concatenate([normals, theirs[near]])
+    joined = np.concatenate([points, crowd[near]]), np.concatenate([normals, sample_normals[near]])
     assert near.sum() > 100
     samples, _ = resample_primitives(*joined)
     assert 2000 < len(samples) < 12_000
-    # One may go on a little where the other face has a gap, too.
+    # One may extend a little farther where the other face has a gap, too.
     assert (off_cube(samples) < 1e-9).mean() > 0.999
     assert off_cube(samples).max() < 0.01
 

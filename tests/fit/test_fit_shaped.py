@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from holed_can import RADIUS, can, distance
+from holed_can import Can
 
 from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, fit
@@ -22,8 +22,8 @@ from gnrecon.ingest import prepare
 Float = npt.NDArray[np.float64]
 
 
-def fitted(cloud: PointCloud, **asked: str) -> NeuralSDF:
-    return fit(prepare(cloud)[0], FitOptions(quality="draft", **asked))[0]
+def fitted(cloud: PointCloud, seed: int = 0, **penalties: str) -> NeuralSDF:
+    return fit(prepare(cloud)[0], FitOptions(quality="draft", seed=seed, **penalties))[0]
 
 
 def surface(sdf: NeuralSDF, cloud: PointCloud) -> Float:
@@ -63,28 +63,28 @@ def test_a_minimal_film_has_little_mean_curvature() -> None:
     assert np.abs(film.sdf(cloud.points)).mean() < 5e-3
 
 
-@pytest.mark.seed(1391994188)
 def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    cloud = can(0.12, 0.45)
+    cloud = Can().scan(0.12, 0.45)
 
-    def off(**asked: str) -> float:
-        sdf = fitted(cloud, **asked)
+    def off(seed: int = 0, **penalties: str) -> float:
+        sdf = fitted(cloud, seed, **penalties)
         x = surface(sdf, cloud)
-        hole = x[np.linalg.norm(x - [RADIUS, 0, 0], axis=1) < 0.3]
+        hole = x[Can().in_hole(x, 0.3)]
         assert len(hole) > 20
         # Features that are bent to the surface run off beside it, if nothing holds the free space.
-        elsewhere = x[np.linalg.norm(x - [RADIUS, 0, 0], axis=1) > 0.3]
-        assert np.abs(distance(elsewhere)).mean() < 0.01
-        return float(np.sqrt(np.mean(distance(hole) ** 2)))
+        elsewhere = x[~Can().in_hole(x, 0.3)]
+        assert np.abs(Can().distance(elsewhere)).mean() < 0.01
+        return float(np.sqrt(np.mean(Can().distance(hole) ** 2)))
 
     assert off() < 2e-3  # its side goes on
-    developable = off(prior="developable")
+    developable = [off(seed, prior="developable") for seed in range(3)]
     monkeypatch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
     monkeypatch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
     monkeypatch.setattr(sharp, "resample_primitives", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
-    smooth = off()
-    assert smooth > 0.01
-    assert developable < 0.4 * smooth
+    smooth = [off(seed) for seed in range(3)]
+    assert min(smooth) > 0.01
+    # One fit in some ends in a worse minimum, and which one depends on the order of sums: the median does not.
+    assert np.median(np.divide(developable, smooth)) < 0.4
 
 
 def test_strain_smooths() -> None:
@@ -100,7 +100,7 @@ def test_strain_smooths() -> None:
 
 
 def test_the_same_again_is_the_same() -> None:
-    cloud = can(0.25, 0.45)
+    cloud = Can().scan(0.25, 0.45)
     one, other = (fitted(cloud, fill="minimal", prior="developable", smooth="strain=1e-5") for _ in range(2))
     assert one.theta.equal(other.theta)
     assert one.detail is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import made_shapes
 import numpy as np
 import pytest
 
@@ -24,19 +25,13 @@ AVERAGING = BilateralFilter(SharpShapeParameters.averaging_width_radii, SharpSha
 
 def cube(count: int, noise: float = 0.0, tilt: float = 0.0, seed: int = 0) -> Samples:
     rng = np.random.default_rng(seed)
-    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
-    x, normals = rng.uniform(-SIDE, SIDE, (count, 3)), np.zeros((count, 3))
-    x[rows, axis] = SIDE * side + noise * rng.standard_normal(count)
-    normals[rows, axis] = side
+    x, normals = made_shapes.cube(count, SIDE, rng, noise)
     normals += tilt * rng.standard_normal((count, 3))
     return Samples(x, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)
 
 
 def ball(count: int, noise: float = 0.0) -> Samples:
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return Samples(x * (SIDE + noise * rng.standard_normal((count, 1))), x, FRAME)
+    return Samples(*made_shapes.sphere(count, 0, SIDE, noise), FRAME)
 
 
 def rounded(count: int, radius: float) -> Samples:
@@ -68,7 +63,7 @@ def test_faces_of_a_cube_are_extended_to_its_edges_and_its_gaps_are_halved() -> 
     assert (found.averaging, found.snapped) == (None, None)
     x, normals = found.samples.points[600:], found.samples.normals[600:]
     assert (found.samples.points[:600] == scan.points).all()
-    # One may go on a little where the other face has a gap, too.
+    # One may extend a little farther where the other face has a gap, too.
     assert (off_cube(x) < 1e-9).mean() > 0.999
     assert off_cube(x).max() < 0.02
     # Each sample's normal is that of a face that it lies on.
@@ -119,7 +114,7 @@ def test_smooth_shapes_have_no_edges(samples: Samples) -> None:
 
 
 def test_outliers_are_no_edges() -> None:
-    """Whichever way an outlier looks, it lies on no face. Yet single points on a plate's sides tell of its edges."""
+    """Outliers of any direction lie on no face. But single points on a plate's sides show its edges."""
     rng = np.random.default_rng(2)
     smooth = ball(1500)
     normals = smooth.normals.copy()

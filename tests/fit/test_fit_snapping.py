@@ -35,17 +35,11 @@ def bored(count: int) -> Oriented:
 
 
 def ball(count: int) -> Oriented:
-    x = np.random.default_rng(2).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return SIDE * x, x
+    return made_shapes.sphere(count, 2, SIDE)
 
 
 def torus(count: int) -> Oriented:
-    rng = np.random.default_rng(3)
-    u, v = rng.uniform(0, 2 * np.pi, (2, count))
-    ring = np.stack([np.cos(u), np.sin(u), 0 * u], axis=1)
-    normals = np.cos(v)[:, None] * ring + np.sin(v)[:, None] * [0.0, 0.0, 1.0]
-    return SIDE * ring + 0.35 * SIDE * normals, normals
+    return made_shapes.torus(count, 3, SIDE, 0.35 * SIDE)
 
 
 def bulged(count: int, by: float) -> tuple[Oriented, np.ndarray]:
@@ -68,7 +62,7 @@ def test_faces_of_a_cube_are_known_far_better_than_an_average_knows_them() -> No
     scan = noisy(exact)
     found = of(scan)
     assert found is not None
-    assert found.snapped.mean() > 0.95
+    assert found.on_primitive.mean() > 0.95
     assert found.primitives == 6
     axis = np.abs(exact[1]).argmax(axis=1)
 
@@ -77,7 +71,7 @@ def test_faces_of_a_cube_are_known_far_better_than_an_average_knows_them() -> No
 
     averaged, _ = AVERAGING.apply(*scan)
     assert off(found.points) < 0.5 * off(averaged) < 0.25 * off(scan[0])
-    turned = np.einsum("nd,nd->n", found.normals[found.snapped], exact[1][found.snapped])
+    turned = np.einsum("nd,nd->n", found.normals[found.on_primitive], exact[1][found.on_primitive])
     assert np.degrees(np.arccos(turned.clip(-1, 1))).max() < 0.5
 
 
@@ -88,24 +82,24 @@ def test_a_bore_narrower_than_what_is_averaged_is_found_in_what_is_left() -> Non
     assert found is not None
     wall = (np.hypot(*exact[0][:, :2].T) < BORE + 1e-9) & (np.abs(exact[1][:, 2]) < 0.5)
     assert wall.sum() > 100
-    assert found.snapped[wall].mean() > 0.9
+    assert found.on_primitive[wall].mean() > 0.9
 
     def off(points: Float) -> Float:
-        return np.abs(np.hypot(*points[wall & found.snapped, :2].T) - BORE)
+        return np.abs(np.hypot(*points[wall & found.on_primitive, :2].T) - BORE)
 
     assert off(found.points).mean() < 0.3 * off(scan[0]).mean()
-    assert np.einsum("nd,nd->n", found.normals, exact[1])[wall & found.snapped].mean() > 0.995
+    assert np.einsum("nd,nd->n", found.normals, exact[1])[wall & found.on_primitive].mean() > 0.995
 
 
 def test_exact_points_stay_and_their_tilted_normals_are_righted() -> None:
     exact = cube(3000)
     found = of(noisy(exact, noise=0.0, tilt=0.25))
     assert found is not None
-    on = found.snapped
+    on = found.on_primitive
     assert on.mean() > 0.9
     np.testing.assert_allclose(found.points[on], exact[0][on], atol=1e-3)
     turned = np.einsum("nd,nd->n", found.normals, exact[1])[on]
-    assert np.mean(turned > 1 - 1e-5) > 0.99  # but for some beside an edge
+    assert np.mean(turned > 1 - 1e-5) > 0.99  # except some near an edge
 
 
 def test_no_point_is_snapped_beyond_an_edge() -> None:
@@ -117,7 +111,7 @@ def test_no_point_is_snapped_beyond_an_edge() -> None:
     assert found is not None
     beyond = np.sort(np.abs(points), axis=1)[:, 1] > SIDE
     assert beyond.sum() > 10
-    assert np.abs(found.points[found.snapped]).max() < SIDE + 0.6 * NOISE
+    assert np.abs(found.points[found.on_primitive]).max() < SIDE + 0.6 * NOISE
 
 
 def test_single_points_farther_off_than_noise_is_are_snapped_too() -> None:
@@ -129,17 +123,17 @@ def test_single_points_farther_off_than_noise_is_are_snapped_too() -> None:
     assert found is not None
     axis = np.abs(exact[1][rows]).argmax(axis=1)[:, None]
     off = np.abs(np.abs(np.take_along_axis(found.points[rows], axis, 1)[:, 0]) - SIDE)
-    assert np.mean(found.snapped[rows] & (off < 0.2 * NOISE)) > 0.9
+    assert np.mean(found.on_primitive[rows] & (off < 0.2 * NOISE)) > 0.9
 
 
 @pytest.mark.parametrize("by", [2 * NOISE, 5 * NOISE, 10 * NOISE, 20 * NOISE])
 def test_a_face_that_bulges_is_not_flattened(by: float) -> None:
-    """Averaging knows it well; pieces of cylinders that the noise cannot rule out would be off by half of it."""
+    """Averaging keeps the bulge; pieces of cylinders, which noise does not rule out, would miss half of it."""
     exact, upper = bulged(4000, by)
     scan = noisy(exact)
     found = of(scan)
     assert found is not None
-    assert found.snapped[~upper].mean() > 0.95
+    assert found.on_primitive[~upper].mean() > 0.95
 
     def off(points: Float) -> float:
         x, y, z = points[upper].T
@@ -152,8 +146,8 @@ def test_a_noisy_ball_is_a_sphere() -> None:
     found = of(noisy(ball(3000)))
     assert found is not None
     assert found.primitives == 1
-    assert found.snapped.mean() > 0.99
-    assert np.abs(np.linalg.norm(found.points[found.snapped], axis=1) - SIDE).max() < 0.15 * NOISE
+    assert found.on_primitive.mean() > 0.99
+    assert np.abs(np.linalg.norm(found.points[found.on_primitive], axis=1) - SIDE).max() < 0.15 * NOISE
 
 
 @pytest.mark.parametrize("scan", [torus(3000), torus(400), cube(8)])
@@ -169,5 +163,5 @@ def test_what_averaging_moves_farther_than_noise_does_stays_where_it_was() -> No
     moved = np.concatenate([averaged[0], [apart + 0.1]]), np.concatenate([averaged[1], [scan[1][0]]])
     found = snap_to_primitives(points, normals, moved)
     assert found is not None
-    assert not found.snapped[-1]
+    assert not found.on_primitive[-1]
     np.testing.assert_array_equal(found.points[-1], apart)

@@ -25,7 +25,7 @@ def test_normals_beside_edges_are_those_of_their_faces(seed: int) -> None:
     estimated = oriented_normals(points).normals
     found = snap_unoriented_points(points, estimated)
     assert found is not None
-    assert found.snapped.mean() > 0.9
+    assert found.on_primitive.mean() > 0.9
     assert found.primitives >= 7
     before, after = ((turned(some, normals) > 15).mean() for some in (estimated, found.normals))
     assert after < 0.4 * before

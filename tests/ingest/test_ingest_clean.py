@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import IngestCounts, clean, find_outliers
@@ -34,9 +34,9 @@ def test_every_reason_is_counted_and_attributes_follow() -> None:
     assert cloud.normals is not None
     np.testing.assert_allclose(cloud.normals, normals[kept] / 3, atol=1e-15)
     assert counts.remarks() == [
-        "Dropped 2 of 200 points with a coordinate that is not finite.",
+        "Dropped 2 of 200 points with a non-finite coordinate.",
         "Dropped 2 of 200 points with a zero or non-finite normal.",
-        "Dropped 2 of 200 points at the position of another.",
+        "Dropped 2 of 200 points that duplicate another.",
     ]
     assert counts.as_dict()["duplicates"] == 2
 
@@ -133,7 +133,7 @@ def test_outlier_modes() -> None:
     assert auto.outliers_found > 445
     assert clean(many, "on")[1].outliers == auto.outliers_found
     assert clean(many, max_outlier_share=0.5)[1].outliers == auto.outliers_found
-    assert f"Left {auto.outliers_found} points alone that look like outliers." in auto.remarks()
+    assert f"Kept {auto.outliers_found} points that look like outliers." in auto.remarks()
 
 
 def test_arguments_are_checked() -> None:

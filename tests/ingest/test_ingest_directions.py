@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import made_shapes
 import numpy as np
 import pytest
-from analytic_clouds import Float, sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.ingest.normals import tangent_planes, unoriented_normals
 
 
@@ -15,12 +18,7 @@ def degrees(found: Float, truth: Float) -> Float:
 
 
 def cube(count: int, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Points on the surface of a cube of side 2, and their normals."""
-    axis, side = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count)
-    points, normals = rng.uniform(-1, 1, (count, 3)), np.zeros((count, 3))
-    points[np.arange(count), axis] = side
-    normals[np.arange(count), axis] = side
-    return points, normals
+    return made_shapes.cube(count, 1.0, rng)
 
 
 def test_planes_are_those_of_a_singular_value_decomposition(rng: np.random.Generator) -> None:

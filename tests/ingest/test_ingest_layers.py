@@ -6,11 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, thin_shell, torus
+from analytic_clouds import thin_shell, torus
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare
-from gnrecon.ingest.survey import find_layers
+from gnrecon.ingest.double_walls import find_layers
 
 Shape = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
 

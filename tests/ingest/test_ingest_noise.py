@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 
 from gnrecon.geometry.local_pca import tangent_coordinates
 from gnrecon.ingest import estimate_noise, mean_spacing

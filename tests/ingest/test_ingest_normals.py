@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, thin_shell, torus
+from analytic_clouds import thin_shell, torus
+from made_shapes import sphere
 
 from gnrecon.ingest import flip_if_inward, oriented_normals
 from gnrecon.ingest.orientation_methods import (

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_clouds import Float, sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
 from gnrecon.ingest.orientation import oriented_normals
@@ -87,8 +89,8 @@ def test_what_is_done_with_given_normals(rng: np.random.Generator) -> None:
     samples, counts = told["mixed", "signs"]
     assert counts.flipped == pytest.approx(share, abs=0.01)
     assert np.abs(np.einsum("ij,ij->i", samples.normals, truth)).min() > 1 - 1e-12
-    assert "% turned around; " in counts.remarks()[-1]
-    assert "% of the points confirm their side." in counts.remarks()[-1]
+    assert "% flipped; " in counts.remarks()[-1]
+    assert "% of the points confirm their sign." in counts.remarks()[-1]
     assert [told["mixed", mode][0].estimated for mode in ("auto", "given", "signs", "estimate")] == [
         False,
         False,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import clean, isolated_clusters
-from gnrecon.ingest.clean import repeated_points
 from gnrecon.ingest.outliers import OutlierRule, outliers_by_rule, parse_outliers
+from gnrecon.ingest.repeated_points import repeated_points
 from gnrecon.runtime.errors import UsageError
 
 UTM = np.array([431234.123456789, 5412345.987654321, 312.1])
@@ -74,7 +75,7 @@ def test_cluster_modes_and_their_counts(rng: np.random.Generator) -> None:
     assert "Dropped 30 of 8030 points in isolated clusters." in counts.remarks()
     off = clean(PointCloud(few), clusters="off")[1]
     assert (off.clusters, off.clusters_found, off.kept) == (0, 30, 8030)
-    assert "Left 30 points alone that lie in isolated clusters." in off.remarks()
+    assert "Kept 30 points in isolated clusters." in off.remarks()
     assert clean(PointCloud(many), "off")[1].clusters_found == 540
     assert clean(PointCloud(many), "off", clusters="on")[1].clusters == 540
     with pytest.raises(UsageError, match="clusters is 'maybe', but must be one of auto, on, off"):

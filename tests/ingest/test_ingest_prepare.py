@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, thin_shell, torus
+from analytic_clouds import thin_shell, torus
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
@@ -84,7 +85,7 @@ def test_samples_are_smoothed_and_it_is_told(rng: np.random.Generator) -> None:
     local = (samples.frame.to_world(samples.points) - UTM) / 10
     assert np.sqrt((off_torus(local) ** 2).mean()) < 0.006
     assert counts.moved == pytest.approx(0.1, rel=0.3)
-    assert "Smoothed the points, which moved by 0.0" in " ".join(counts.remarks())
+    assert "Smoothed the points; they moved by 0.0" in " ".join(counts.remarks())
     assert samples.held_out is not None
     kept_out = (samples.held_out.frame.to_world(samples.held_out.points) - UTM) / 10
     assert np.sqrt((off_torus(kept_out) ** 2).mean()) == pytest.approx(0.01, rel=0.15)  # what checks a fit is as it was

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud

@@ -20,8 +20,8 @@ from gnrecon.ingest import guess_units
         ((-0.5, -0.3, -0.2), (0.5, 0.3, 0.2), (), None, "scaled to a unit box"),
         ((0, 0, 0), (1, 0.3, 0.2), (), None, "scaled to a unit box"),
         ((-1, -1, -0.3), (1, 0.98, 0.3), (), None, "scaled to a unit box"),
-        ((0, 0, 0), (9000, 10, 10), (), None, "not like that of most things"),
-        ((0, 0, 0), (1e-4, 1e-4, 1e-4), (), None, "not like that of most things"),
+        ((0, 0, 0), (9000, 10, 10), (), None, "is unusual in mm and in m"),
+        ((0, 0, 0), (1e-4, 1e-4, 1e-4), (), None, "is unusual in mm and in m"),
     ],
 )
 def test_guesses(

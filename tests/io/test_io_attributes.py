@@ -108,7 +108,7 @@ def test_glb_holds_finite_numbers(mesh: Mesh, tmp_path: Path, rng: np.random.Gen
         (".3mf", "3MF cannot hold heat and label of the vertices; PLY can."),
     ],
 )
-def test_what_is_lost_is_said(suffix: str, sentence: str, mesh: Mesh, tmp_path: Path) -> None:
+def test_losses_are_reported(suffix: str, sentence: str, mesh: Mesh, tmp_path: Path) -> None:
     count = np.arange(len(mesh.vertices))
     full = mesh.with_attributes({"heat": count / 2, "label": count})
     assert write_mesh(full, tmp_path / f"m{suffix}") == [sentence]
@@ -268,8 +268,8 @@ def test_3mf_objects_are_put_together_as_the_model_says(tmp_path: Path) -> None:
     assert mesh.vertices.tolist()[8:] == [[24, 34, 44], [26, 34, 44], [24, 36, 44]]
     # The second one is a mirror image, so its faces are turned round.
     assert mesh.faces.tolist() == [[0, 2, 1], [0, 1, 3], [5, 6, 4], [7, 5, 4], [8, 9, 10]]
-    red, glass, bare = [255, 0, 0, 255], [0, 255, 0, 128], [0, 0, 0, 0]
-    assert mesh.attributes["colors"].tolist() == [red, red, red, glass, red, red, red, glass, bare, bare, bare]
+    red, glass, none = [255, 0, 0, 255], [0, 255, 0, 128], [0, 0, 0, 0]
+    assert mesh.attributes["colors"].tolist() == [red, red, red, glass, red, red, red, glass, none, none, none]
 
 
 @pytest.mark.parametrize(
@@ -292,9 +292,9 @@ def test_damaged_3mf_archives_are_refused(tmp_path: Path, mesh: Mesh) -> None:
     write_mesh(mesh, whole)
     (tmp_path / "cut.3mf").write_bytes(whole.read_bytes()[:-500])
     (tmp_path / "text.3mf").write_text("solid")
-    archive(tmp_path / "bare.3mf", PARTS, relations=False)
+    archive(tmp_path / "unrelated.3mf", PARTS, relations=False)
     archive(tmp_path / "torn.3mf", PARTS[:300])
-    for name in ("cut", "text", "bare", "torn"):
+    for name in ("cut", "text", "unrelated", "torn"):
         with pytest.raises(InputError, match="not a well-formed 3MF archive") as caught:
             read_mesh(tmp_path / f"{name}.3mf")
         assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""Damaged files of every format end in points or in one sentence, whatever is done to them.
+"""Damaged files of every format end in points or in one sentence.
 
 More than two thousand files, made from valid ones by seeded mutations, are read in this process: an exception of any
 other kind, a word on standard output or error, or a hang fails the test. Some are given to the command line too.
@@ -129,7 +129,7 @@ def test_damaged_files_end_in_points_or_in_one_sentence(
         else:
             assert len(cloud) > 0
     assert sentences, "the damage is none"
-    assert not [said for said in sentences if "\n" in said or not said.startswith(str(source))]
+    assert not [sentence for sentence in sentences if "\n" in sentence or not sentence.startswith(str(source))]
     assert capfd.readouterr() == ("", "")
 
 

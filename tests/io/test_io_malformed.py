@@ -1,4 +1,4 @@
-"""Whatever is wrong with a file becomes one sentence in an InputError, and nothing else: no crash, no print."""
+"""Any error in a file becomes an InputError of one sentence, without a crash or other output."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def test_matrices(make: Callable[[int, torch.dtype], Made], stored: torch.dtype,
     close(jacobian.gram().tril(), (J.T @ J).tril(), stored)
     close(jacobian.diagonal(), J.square().sum(0), stored)
     close(jacobian.row_squares(), J.square().sum(1), stored)
-    assert sum(jacobian.stretches) == len(J)
+    assert sum(jacobian.constraint_rows) == len(J)
 
 
 @each_maker
@@ -90,11 +90,11 @@ def test_runs(make: Callable[[int, torch.dtype], Made], stored: torch.dtype, len
     jacobian, J = make(0, stored)
     sums = [
         part.sum(0) / math.sqrt(len(part))
-        for stretch in J.split(list(jacobian.stretches))
+        for stretch in J.split(list(jacobian.constraint_rows))
         for part in stretch.split(length)
         if len(part)
     ]
-    found = list(jacobian.runs([length] * len(jacobian.stretches)))
+    found = list(jacobian.run_sums([length] * len(jacobian.constraint_rows)))
     assert all(chunk.dtype == stored for chunk in found)
     close(torch.cat([J[:0].to(stored), *found]), torch.stack(sums) if sums else J[:0], stored)
     close(jacobian.kernel().tril(), (J @ J.T).tril(), stored)

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, Function, sphere, union
+from analytic_fields import UTM, Field, Function, ball_mesh, sphere, union
 
 from gnrecon.export import extract, project
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.rendering import render, render_sheet
 from gnrecon.rendering.rays import VIEWS, Camera
+from gnrecon.rendering.rendering_parameters import SheetParameters
 from gnrecon.runtime.errors import OutputError, UsageError
 
 SIZE = (120, 90)
@@ -20,8 +21,7 @@ SIZE = (120, 90)
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    field = Field(sphere(), frame=UTM)
-    return project(extract(field, resolution=24), field)
+    return ball_mesh()
 
 
 def box(half: tuple[float, float, float], center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Function:
@@ -131,17 +131,14 @@ def test_what_cannot_be_drawn_is_said(ball: Mesh, tmp_path: Path) -> None:
         render(ball, tmp_path / "missing" / "ball.png", size=(8, 8))
 
 
-def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(tmp_path: Path) -> None:
     """A bar along x with an arm towards +z at its right end: every side has its own outline."""
     from PIL import Image
 
-    for name, value in (("WIDTH", 600), ("TALL", 240), ("LOW", 180)):
-        monkeypatch.setattr(f"gnrecon.rendering.picture.{name}", value)
+    layout = SheetParameters(width=600, upper_height=240, lower_height=180)
     field = Field(union(box((0.8, 0.2, 0.15)), box((0.12, 0.2, 0.5), (0.68, 0, 0.4))), frame=UTM)
     mesh = extract(field, resolution=32)
-    image = render_sheet(mesh, tmp_path / "sheet.png", points=PointCloud(mesh.vertices))
+    image = render_sheet(mesh, tmp_path / "sheet.png", points=PointCloud(mesh.vertices), layout=layout)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "sheet.png")), image)
     assert image.shape == (240 + 36 + 180 + 36, 600, 3)
     row = drawn(image)[276:456]
@@ -156,7 +153,7 @@ def test_a_sheet_shows_scan_and_mesh_and_the_sides_with_their_names(
     for foot, panels in ((image[240:276], 2), (image[456:], 3)):
         words = foot.min(axis=2) < 170
         assert all(part.any() for part in np.array_split(words, panels, axis=1))
-    alone = render_sheet(mesh)
+    alone = render_sheet(mesh, layout=layout)
     assert alone.shape == image.shape
     assert not (alone[..., 2].astype(int) - alone[..., 0] > 30).any()
 

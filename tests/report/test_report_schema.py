@@ -15,7 +15,7 @@ import pytest
 from scan_files import gnrecon, torus, write_scan
 
 import gnrecon as package
-from gnrecon.export import Invented, MeshFacts, MeshQuality, Metrics, Trimming
+from gnrecon.export import MeshFacts, MeshQuality, Metrics, Trimming, UnsupportedArea
 from gnrecon.ingest import IngestCounts
 from gnrecon.optim import Record
 from gnrecon.options import Options
@@ -172,7 +172,7 @@ def test_everything_is_described(path: str, schema: dict[str, Any]) -> None:
     [
         ("options", [field.name for field in fields(Options)]),
         ("ingest", [field.name for field in fields(IngestCounts)]),
-        ("mesh", [*(field.name for field in [*fields(MeshFacts), *fields(Invented)]), "guarantee", "quality"]),
+        ("mesh", [*(field.name for field in [*fields(MeshFacts), *fields(UnsupportedArea)]), "guarantee", "quality"]),
         ("mesh.quality", [field.name for field in fields(MeshQuality)]),
         ("trim", [field.name for field in fields(Trimming)]),
         ("metrics", [*(field.name for field in fields(Metrics)), "relative"]),

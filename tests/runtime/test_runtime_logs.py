@@ -129,6 +129,6 @@ def test_a_cancelled_run_is_logged(
     def cancel(*_: object) -> None:
         raise Cancelled
 
-    monkeypatch.setattr("gnrecon.run.Shown.stage", cancel)
+    monkeypatch.setattr("gnrecon.run.ConsoleProgress.stage", cancel)
     assert run(scan, "-o", tmp_path / "mesh.obj", "--log", tmp_path / "run.log") == ExitCode.INTERRUPTED
     assert "Cancelled: Cancelled; nothing was written." in (tmp_path / "run.log").read_text()

@@ -18,7 +18,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.report.report import report_schema
-from gnrecon.run import STAGES, Shown
+from gnrecon.run import STAGES, ConsoleProgress
 from gnrecon.runtime.errors import Cancelled, ExitCode
 from gnrecon.runtime.progress import subrange
 
@@ -141,7 +141,7 @@ def test_a_run_may_end_at_every_stage(cloud: Cloud, stage: str) -> None:
 def test_a_command_that_ends_before_it_writes_leaves_nothing(
     tmp_path: Path, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gnrecon.run.Shown.stage", lambda _, name: cancel() if name == "write" else None)
+    monkeypatch.setattr("gnrecon.run.ConsoleProgress.stage", lambda _, name: cancel() if name == "write" else None)
     scan = write_scan(tmp_path / "ring.ply", *cloud)
     handler = signal.getsignal(signal.SIGTERM)
     asked = [str(tmp_path / name) for name in ("mesh.obj", "report.json", "model.gnr")]
@@ -164,7 +164,7 @@ def test_the_bar_shows_the_share_of_the_stage() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=120)
     with Bar(console=console, auto_refresh=False) as bar:
-        shown = Shown(console, bar, verbose=False)
+        shown = ConsoleProgress(console, bar, verbose=False)
         shown.stage("fit")
         assert bar.tasks[0].total is None
         shown.advance(0.25)
@@ -189,7 +189,7 @@ def cancel() -> None:
 def test_a_cancelled_command_ends_as_an_interrupted_one(
     tmp_path: Path, cloud: Cloud, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("gnrecon.run.Shown.advance", lambda *_: cancel())
+    monkeypatch.setattr("gnrecon.run.ConsoleProgress.advance", lambda *_: cancel())
     scan = write_scan(tmp_path / "ring.ply", *cloud)
     handler = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as end:

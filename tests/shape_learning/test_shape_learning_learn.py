@@ -62,12 +62,12 @@ def sheet(target: float = 0.3) -> ShapeProblem:
 
 @pytest.mark.parametrize(("optimiser", "steps", "share"), [("gn", 12, 0.1), ("lbfgs", 2, 0.2), ("adam", 60, 0.9)])
 def test_each_optimiser_lowers_the_loss(optimiser: str, steps: int, share: float) -> None:
-    told: list[Measurement] = []
-    learned = learn(half_ball(), optimiser, budget=None, steps=steps, learning_rate=3e-3, heard=told.append)
-    assert told == list(learned.history)
-    assert told[0].step == 0
-    assert learned.best.loss == min(found.loss for found in told)
-    assert learned.best.loss < share * told[0].loss
+    measurements: list[Measurement] = []
+    learned = learn(half_ball(), optimiser, budget=None, steps=steps, learning_rate=3e-3, callback=measurements.append)
+    assert measurements == list(learned.history)
+    assert measurements[0].step == 0
+    assert learned.best.loss == min(found.loss for found in measurements)
+    assert learned.best.loss < share * measurements[0].loss
     assert learned.best.loss == pytest.approx(sum(learned.best.shares.values()))
     assert learned.best.chamfer is None
 
@@ -99,7 +99,7 @@ def test_the_same_seed_gives_the_same_parameters() -> None:
 
 def test_the_catenoid_is_approached() -> None:
     found: list[Measurement] = []
-    learned = learn(replace(catenoid(), network=Network((16, 16))), budget=None, steps=12, heard=found.append)
+    learned = learn(replace(catenoid(), network=Network((16, 16))), budget=None, steps=12, callback=found.append)
     assert learned.best.chamfer is not None
     assert learned.best.chamfer < 0.5 * found[0].chamfer
     assert learned.best.loss < 0.01 * found[0].loss
@@ -128,7 +128,7 @@ def test_the_mean_of_the_last_steps_is_returned_where_it_is_better(monkeypatch: 
         # Of each pair, the later one is the mean.
         return Measurement(step, 0.0, 1.0 / len(seen), {}, None, None)
 
-    monkeypatch.setattr(learning._Run, "measured", measured)
+    monkeypatch.setattr(learning._LearningRun, "measured", measured)
     learned = learn(half_ball(), budget=None, steps=4)
     start, one, two = seen[0], learned.solution.theta, learned.field.theta
     assert not torch.equal(one, two)

@@ -1,12 +1,13 @@
-"""Fewer faces: to a number of faces, or as few as a tolerance allows.
+"""Reduces the faces of a mesh: to a number, within a tolerance, or quickly for display.
 
-Both put faces where the surface bends, and both keep edges: quadric edge collapse (Garland and Heckbert, 1997; by
-pymeshlab) removes what costs the least squared distance to the planes of the faces, and manifold3d's simplification
-removes vertices as long as the surface stays within a distance. The former's new vertices are then brought onto the
-field; the latter's are some of the old ones, and are there already.
+`decimate` is quadric edge collapse (Garland and Heckbert, 1997; by pymeshlab), which removes what costs the least
+squared distance to the planes of the faces; its new vertices are then projected onto the field. `simplify` uses
+manifold3d, which removes vertices as long as the surface stays within a distance; the vertices it keeps are on the
+field already. Both put faces where the surface bends, and both keep sharp edges.
 
-manifold3d holds its distance collapse by collapse, so that several in a row may add up to more. What became of the
-surface is therefore measured, and the simplification repeated with a smaller distance until all is within the wanted.
+manifold3d holds its distance collapse by collapse, so that several in a row may add up to more. The distance between
+the surfaces is therefore measured, and the simplification repeated with a smaller one until all is within the
+tolerance.
 """
 
 from __future__ import annotations
@@ -15,22 +16,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gnrecon.export.boolean import centre_and_size, from_meshlab, from_solid, refusal, to_meshlab, to_solid
-from gnrecon.export.metrics import Surface, nearest_on_surface
-from gnrecon.export.project import SignedDistance, between, project
+from gnrecon.export.boolean import centre_and_size, from_meshlab, from_solid, manifold_error, to_meshlab, to_solid
+from gnrecon.export.metrics import SurfaceQuery, nearest_on_surface
+from gnrecon.export.project import SignedDistance, face_sample_points, project
 from gnrecon.export.remeshing.edge_table import unit
-from gnrecon.export.remeshing.remesh import creased, settled
+from gnrecon.export.remeshing.remesh import move_vertices, with_creases
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
-
-FEWEST = 4
-"""Faces of a tetrahedron."""
-
-SMALLER = 0.9
-"""Margin below the distance that the last attempt suggests for the next one."""
-
-ATTEMPTS = 4
 
 
 def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30.0) -> Mesh:
@@ -57,8 +50,9 @@ def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30
     UsageError
         When fewer than four faces are wanted.
     """
-    if faces < FEWEST:
-        raise UsageError(f"The number of faces is {faces}, but a closed mesh has at least {FEWEST}.")
+    # The smallest closed mesh is a tetrahedron.
+    if faces < 4:
+        raise UsageError(f"The number of faces is {faces}, but a closed mesh has at least 4.")
     if len(mesh.faces) <= faces:
         return mesh
     work = to_meshlab(mesh)
@@ -71,10 +65,10 @@ def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30
         autoclean=False,
     )
     fewer = from_meshlab(work, mesh)
-    return project(settled(creased(fewer, field, angle), fewer.vertices, field, angle).mesh(), field)
+    return project(move_vertices(with_creases(fewer, field, angle), fewer.vertices, field, angle).mesh(), field)
 
 
-def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
+def simplify(mesh: Mesh, field: SignedDistance, tolerance: float, *, attempts: int = 4, safety: float = 0.9) -> Mesh:
     """Remove vertices as long as the surface moves by no more than a tolerance.
 
     Parameters
@@ -85,6 +79,10 @@ def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
         Whose zero level the vertices lie on.
     tolerance : float, file units
         Greatest distance, either way, between one surface and the other's vertices, edge midpoints and face centres.
+    attempts : int
+        Most simplifications.
+    safety : float
+        Margin below the distance that the last attempt suggests for the next one.
 
     Returns
     -------
@@ -96,21 +94,21 @@ def simplify(mesh: Mesh, field: SignedDistance, tolerance: float) -> Mesh:
     UsageError
         When the tolerance is not positive.
     MeshError
-        When nothing is left of the mesh, or no attempt keeps within the tolerance.
+        When nothing is left of the mesh, or no attempt stays within the tolerance.
     """
     if not 0 < tolerance < np.inf:
         raise UsageError(f"The tolerance is {tolerance} file units, but must be positive.")
     distance = tolerance
-    for _ in range(ATTEMPTS):
-        simple = collapsed(mesh, distance)
-        moved = max(_farthest(mesh, simple), _farthest(simple, mesh))
+    for _ in range(attempts):
+        simple = simplify_by_collapses(mesh, distance)
+        moved = max(_max_distance(mesh, simple), _max_distance(simple, mesh))
         if moved <= tolerance:
             return Mesh(simple.vertices, simple.faces, unit(field.gradient(simple.vertices)))
-        distance *= SMALLER * tolerance / moved
+        distance *= safety * tolerance / moved
     raise MeshError(f"The surface would have moved by {moved:.3g}.")
 
 
-def collapsed(mesh: Mesh, tolerance: float) -> Mesh:
+def simplify_by_collapses(mesh: Mesh, tolerance: float) -> Mesh:
     """Return a mesh as manifold3d simplifies it, by collapses of a tolerance each, in the unit of the vertices.
 
     Raises
@@ -120,54 +118,50 @@ def collapsed(mesh: Mesh, tolerance: float) -> Mesh:
     """
     _, size = centre_and_size(mesh)
     solid = to_solid(mesh, merge=False).simplify(tolerance / size)
-    error = refusal(solid)
+    error = manifold_error(solid)
     if error is not None or solid.is_empty():
         raise MeshError(f"manifold3d left nothing of the mesh ({error or 'within the tolerance it is flat'}).")
     return from_solid(solid, mesh)
 
 
-def _farthest(one: Mesh, other: Mesh) -> float:
+def _max_distance(one: Mesh, other: Mesh) -> float:
     """Greatest distance to a mesh from another one's vertices, edge midpoints and face centres."""
-    points = np.concatenate([other.vertices, between(other.corners)])
+    points = np.concatenate([other.vertices, face_sample_points(other.corners)])
     return float(nearest_on_surface(one, points)[0].max())
 
 
-DENSITY = 2.3
-"""Faces that clustering leaves for each square of the surface that is as wide as a cube, about."""
+def decimate_by_clustering(mesh: Mesh, faces: int) -> Mesh:
+    """Return a lighter mesh for display, with at most `faces` faces and interpolated normals and attributes.
 
-
-# A lighter copy of a mesh, for looking at: fewer faces by clustering vertices, attributes included.
-#
-# All vertices within a cube of a regular grid become one (Rossignac and Borrel 1993), at the place of the surface that
-# is nearest to their mean, with the attributes of that place. Unlike collapsing edges by their error, this keeps as
-# many vertices where a surface is flat as where it is curved, and so the detail of its attributes; and it takes seconds
-# for millions of faces. Nothing is promised of the copy's topology.
-
-
-def lighten(mesh: Mesh, faces: int) -> Mesh:
-    """Return the mesh with at most `faces` faces, its normals and attributes interpolated.
-
-    A mesh that has so few is returned as it is.
+    All vertices within a cube of a regular grid become one (Rossignac and Borrel 1993), at the place of the surface
+    that is nearest to their mean. Unlike edge collapse, this keeps as many vertices where a surface is flat as where it
+    is curved, and so the detail of its attributes, and it takes seconds for millions of faces. The topology may change.
+    A mesh that has so few faces is returned unchanged.
     """
     if len(mesh.faces) <= faces:
         return mesh
     means, triangles = _clustered(mesh, faces)
-    vertices, nearest = Surface(mesh).nearest(means)
+    vertices, nearest = SurfaceQuery(mesh).nearest(means)
+    # Normals and attributes are those of the place on the original surface.
     corners, weights = mesh.faces[nearest], barycentric(mesh.corners[nearest], vertices)
     normals = interpolate(mesh.vertex_normals(), corners, weights)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return Mesh(vertices, triangles, normals, _carried(mesh.attributes, corners, weights))
+    return Mesh(vertices, triangles, normals, _interpolated_attributes(mesh.attributes, corners, weights))
 
 
-def _clustered(mesh: Mesh, faces: int) -> tuple[Float, Int]:
-    """Means of clustered vertices, of shape (N, 3), and the faces between them, at most so many."""
+def _clustered(mesh: Mesh, faces: int, *, faces_per_square: float = 2.3) -> tuple[Float, Int]:
+    """Means of clustered vertices, of shape (N, 3), and the faces between them, at most so many.
+
+    The first cube's width follows from about how many faces clustering leaves for each square of surface of its width.
+    """
     import open3d
 
     centre, size = centre_and_size(mesh)
     places = open3d.utility.Vector3dVector((mesh.vertices - centre) / size)
     heavy = open3d.geometry.TriangleMesh(places, open3d.utility.Vector3iVector(mesh.faces))
-    cube = np.sqrt(DENSITY * mesh.area / faces) / size
+    cube = np.sqrt(faces_per_square * mesh.area / faces) / size
     light = heavy.simplify_vertex_clustering(cube)
+    # The first width is an estimate; wider cubes leave fewer faces.
     while len(light.triangles) > faces:
         cube *= 1.1
         light = heavy.simplify_vertex_clustering(cube)
@@ -204,7 +198,7 @@ def interpolate(values: Values, corners: Int, weights: Float) -> Float:
     return mixed
 
 
-def _carried(attributes: Mapping[str, Values], corners: Int, weights: Float) -> dict[str, Values]:
+def _interpolated_attributes(attributes: Mapping[str, Values], corners: Int, weights: Float) -> dict[str, Values]:
     """Interpolated attributes in their own types; whole numbers are rounded."""
     carried: dict[str, Values] = {}
     for name, values in attributes.items():

@@ -1,10 +1,10 @@
-"""Collapsing short edges of a surface.
+"""Collapses short edges and splits long ones of a surface.
 
 An edge collapses into its end of the higher kind (corner, crease, smooth), or into its middle when both are of one
-kind. It may do so when the surface stays what it is: the ends share no neighbours but the two opposite vertices (the
+kind. It may do so when the topology and the shape stay: the ends share no neighbours but the two opposite vertices (the
 link condition, by which a closed 2-manifold stays one of the same genus), creases neither vanish nor merge, no face
-turns out of its surroundings, and no edge becomes too long. Collapses that touch no common face are made at once, the
-shortest edges first.
+turns away from its surroundings, and no edge becomes too long. Collapses that touch no common face are made at once,
+the shortest edges first. The entries are `collapse_short` and `split_long`.
 """
 
 from __future__ import annotations
@@ -14,27 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 
+from gnrecon.export.export_parameters import ExportParameters, RemeshParameters
 from gnrecon.export.remeshing.edge_table import (
-    CORNER,
-    SMOOTH,
+    CreasedSurface,
     EdgeTable,
-    Surface,
+    VertexKind,
     area_vectors,
     face_normals,
+    independent_rings,
     ranks,
-    rings_apart,
     unit,
 )
 from gnrecon.geometry.arrays import Float, Int, Mask
-
-SHORT = 4.0 / 5.0
-"""An edge is too short below this share of the target length: with `LONG`, no halved edge is collapsed again."""
-
-TURN = 0.5
-"""Least cosine between a face's new normal and what it should be."""
-
-ROUNDS = 15
-"""Most rounds; the first few do most of the work, and what is left is tried again in the next iteration."""
 
 
 @dataclass(frozen=True)
@@ -50,43 +41,56 @@ class _Collapses:
         return _Collapses(self.gone[mask], self.kept[mask], self.place[mask], self.normal[mask])
 
 
-def collapse_short(surface: Surface, length: Float) -> tuple[Surface, Float]:
+def collapse_short(
+    surface: CreasedSurface,
+    length: Float,
+    *,
+    most_rounds: int = 15,
+    parameters: RemeshParameters = ExportParameters.remesh,
+) -> tuple[CreasedSurface, Float]:
     """Collapse edges shorter than 4/5 of the target length, of shape (V,), where that is safe.
+
+    The first few of at most `most_rounds` do most of the work; the next iteration of remeshing retries the rest.
 
     Returns
     -------
-    Surface, array
+    CreasedSurface, array
         The surface without unused vertices, and the target lengths at those that are left.
     """
+    # Edges that were unsafe once are not tried again, so that they do not keep their neighbours from collapsing.
     refused = np.empty(0, dtype=np.int64)
     size = len(surface.vertices)
-    for _ in range(ROUNDS):
+    for _ in range(most_rounds):
         edges = EdgeTable.of(surface.faces)
         names = edges.ends @ np.array([size, 1])
-        wanted = _wanted(surface, edges, length) & ~np.isin(names, refused)
+        wanted = _collapsible(surface, edges, length, parameters.short_edge_ratio) & ~np.isin(names, refused)
         chosen = _independent(surface, edges, wanted)
         if not len(chosen):
             break
-        collapses = _directed(surface, edges.ends[chosen])
-        good = _keeps_topology(edges, chosen, size) & _keeps_shape(surface, collapses, length)
+        collapses = _collapse_targets(surface, edges.ends[chosen])
+        good = _keeps_topology(edges, chosen, size) & _keeps_shape(
+            surface, collapses, length, parameters.long_edge_ratio
+        )
         refused = np.union1d(refused, names[chosen[~good]])
-        surface = _apply(surface, collapses.only(good))
+        surface = _collapse(surface, collapses.only(good))
     used = np.unique(surface.faces)
     return surface.compact(), length[used]
 
 
-def _wanted(surface: Surface, edges: EdgeTable, length: Float) -> Mask:
-    """Which edges are too short and may collapse as far as creases are concerned."""
+def _collapsible(surface: CreasedSurface, edges: EdgeTable, length: Float, short_ratio: float) -> Mask:
+    """Which edges are shorter than a ratio of the target length and may collapse as far as creases are concerned."""
     a, b = edges.ends.T
-    short = np.linalg.norm(surface.vertices[a] - surface.vertices[b], axis=1) < SHORT * np.minimum(length[a], length[b])
+    short = np.linalg.norm(surface.vertices[a] - surface.vertices[b], axis=1) < short_ratio * np.minimum(
+        length[a], length[b]
+    )
     low = surface.kinds()[edges.ends].min(axis=1)
-    along = surface.is_crease(edges.ends) & (low < CORNER) & ~_in_crease_triangle(surface, edges)
-    wanted: Mask = short & ((low == SMOOTH) | along)
+    along = surface.is_crease(edges.ends) & (low < VertexKind.CORNER) & ~_in_crease_triangle(surface, edges)
+    wanted: Mask = short & ((low == VertexKind.SMOOTH) | along)
     return wanted
 
 
-def _in_crease_triangle(surface: Surface, edges: EdgeTable) -> Mask:
-    """Which edges have a face whose other two edges are creases: a collapse would lay these on each other."""
+def _in_crease_triangle(surface: CreasedSurface, edges: EdgeTable) -> Mask:
+    """Which edges have a face whose other two edges are creases: a collapse would make these coincide."""
     sides = [
         surface.is_crease(np.sort(np.stack([edges.ends[:, end], edges.opposite[:, face]], axis=1), axis=1))
         for face in (0, 1)
@@ -95,17 +99,18 @@ def _in_crease_triangle(surface: Surface, edges: EdgeTable) -> Mask:
     return (sides[0] & sides[1]) | (sides[2] & sides[3])
 
 
-def _independent(surface: Surface, edges: EdgeTable, wanted: Mask) -> Int:
+def _independent(surface: CreasedSurface, edges: EdgeTable, wanted: Mask) -> Int:
     """Numbers of wanted edges that touch no common face, the shortest first."""
     rows = np.flatnonzero(wanted)
     ends = edges.ends[rows]
     lengths = np.linalg.norm(surface.vertices[ends[:, 0]] - surface.vertices[ends[:, 1]], axis=1)
-    return rows[rings_apart(ends, ranks(lengths), surface.faces, len(surface.vertices))]
+    return rows[independent_rings(ends, ranks(lengths), surface.faces, len(surface.vertices))]
 
 
-def _directed(surface: Surface, ends: Int) -> _Collapses:
+def _collapse_targets(surface: CreasedSurface, ends: Int) -> _Collapses:
     """Decide for each edge, of shape (N, 2), which end stays, and where."""
     kinds = surface.kinds()[ends]
+    # The end of the higher kind stays in place, so that corners and creases keep their position.
     kept = np.where(kinds[:, 0] > kinds[:, 1], ends[:, 0], ends[:, 1])
     even = (kinds[:, 0] == kinds[:, 1])[:, None]
     place = np.where(even, surface.vertices[ends].mean(axis=1), surface.vertices[kept])
@@ -119,27 +124,35 @@ def _keeps_topology(edges: EdgeTable, chosen: Int, size: int) -> Mask:
     links = coo_array((np.ones(len(both), dtype=np.int8), both.T), shape=(size, size)).tocsr()
     a, b = edges.ends[chosen].T
     common = np.asarray(links[a].multiply(links[b]).sum(axis=1)).reshape(-1)
+    # Fewer than three neighbours would leave two faces on the same three vertices.
     valence = np.bincount(both[:, 0], minlength=size)
     safe: Mask = (common == 2) & (valence[edges.opposite[chosen]] > 3).all(axis=1)
     return safe
 
 
-def _keeps_shape(surface: Surface, collapses: _Collapses, length: Float) -> Mask:
-    """Whether no face turns from what it should be, unless it was turned already, and no edge becomes too long."""
+def _keeps_shape(
+    surface: CreasedSurface, collapses: _Collapses, length: Float, long_ratio: float, *, least_cosine: float = 0.5
+) -> Mask:
+    """Whether no face turns and no edge becomes too long, each of shape (N,).
+
+    A face turns where the cosine between its new normal and what `face_normals` expects is below `least_cosine`. An
+    edge is too long beyond a ratio of the target length, unless it was longer before.
+    """
     count = len(collapses.gone)
     owner = np.full(len(surface.vertices), -1, dtype=np.int64)
     owner[collapses.gone] = owner[collapses.kept] = np.arange(count)
     owners = owner[surface.faces].max(axis=1)
-    after = _apply(surface, collapses, drop=False)
+    after = _collapse(surface, collapses, drop=False)
     changed = np.flatnonzero(owners >= 0)
     faces = after.faces[changed]
+    # The two faces of the collapsed edge vanish and are not checked.
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     changed, faces = changed[whole], faces[whole]
     areas = area_vectors(after.vertices, faces)
     along = np.einsum("ij,ij->i", areas, face_normals(surface)[changed])
-    bad = ~(along > TURN * np.linalg.norm(areas, axis=1))
+    bad = ~(along > least_cosine * np.linalg.norm(areas, axis=1))
     a, b = after.vertices[faces], after.vertices[np.roll(faces, -1, axis=1)]
-    limit = LONG * np.minimum(length[faces], length[np.roll(faces, -1, axis=1)])
+    limit = long_ratio * np.minimum(length[faces], length[np.roll(faces, -1, axis=1)])
     before = surface.vertices[surface.faces[changed]]
     grown = np.linalg.norm(a - b, axis=2) > np.maximum(
         limit, np.linalg.norm(before - np.roll(before, -1, axis=1), axis=2)
@@ -149,45 +162,45 @@ def _keeps_shape(surface: Surface, collapses: _Collapses, length: Float) -> Mask
     return good
 
 
-def _apply(surface: Surface, collapses: _Collapses, *, drop: bool = True) -> Surface:
-    """Rename the vanishing vertices; `drop` removes the faces and creases that have lost an edge."""
+def _collapse(surface: CreasedSurface, collapses: _Collapses, *, drop: bool = True) -> CreasedSurface:
+    """Replace the vanishing vertices; `drop` removes the faces and creases that have lost an edge."""
     names = np.arange(len(surface.vertices))
     names[collapses.gone] = collapses.kept
     vertices, normals = surface.vertices.copy(), surface.normals.copy()
     vertices[collapses.kept], normals[collapses.kept] = collapses.place, collapses.normal
     faces, creases = names[surface.faces], names[surface.creases]
     if not drop:
-        return Surface(vertices, normals, faces, surface.creases)
+        return CreasedSurface(vertices, normals, faces, surface.creases)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     creases = np.unique(np.sort(creases[creases[:, 0] != creases[:, 1]], axis=1), axis=0)
-    return Surface(vertices, normals, faces, creases)
+    return CreasedSurface(vertices, normals, faces, creases)
 
 
-LONG = 4.0 / 3.0
-"""An edge is too long beyond this many target lengths: its halves are then nearer to the target than itself."""
-
-PASSES = 12
-"""Most rounds of halving; an edge may be 4096 times too long."""
-
-
-# Splitting edges of a surface, any number at once.
-#
 # A face keeps its outline: with one, two or three of its edges split it becomes two, three or four faces, so that the
 # pieces of neighbours always fit. With two split edges, the remaining quadrilateral is cut along its shorter diagonal.
 
 
-def split_long(surface: Surface, length: Float) -> tuple[Surface, Float]:
+def split_long(
+    surface: CreasedSurface,
+    length: Float,
+    *,
+    most_rounds: int = 12,
+    long_ratio: float = ExportParameters.remesh.long_edge_ratio,
+) -> tuple[CreasedSurface, Float]:
     """Halve edges that are longer than 4/3 of the target length, of shape (V,), until none is.
+
+    With `most_rounds` an edge may be 4096 times too long.
 
     Returns
     -------
-    Surface, array
+    CreasedSurface, array
         The new surface, whose first V vertices are the old ones, and the target lengths at its vertices.
     """
-    for _ in range(PASSES):
+    for _ in range(most_rounds):
         edges = EdgeTable.of(surface.faces)
         a, b = edges.ends.T
-        long = np.linalg.norm(surface.vertices[a] - surface.vertices[b], axis=1) > LONG * 0.5 * (length[a] + length[b])
+        lengths = np.linalg.norm(surface.vertices[a] - surface.vertices[b], axis=1)
+        long = lengths > long_ratio * 0.5 * (length[a] + length[b])
         if not long.any():
             break
         middles = 0.5 * (surface.vertices[a[long]] + surface.vertices[b[long]])
@@ -196,7 +209,9 @@ def split_long(surface: Surface, length: Float) -> tuple[Surface, Float]:
     return surface, length
 
 
-def split(surface: Surface, edges: EdgeTable, marked: Mask, points: Float, centres: Float | None = None) -> Surface:
+def split(
+    surface: CreasedSurface, edges: EdgeTable, marked: Mask, points: Float, centres: Float | None = None
+) -> CreasedSurface:
     """Split the marked edges, a mask of shape (E,), at the given points, of shape (M, 3), in the edges' order.
 
     The new vertices follow the old ones in the same order. Where `centres` is given, of shape (T, 3), each of the T
@@ -221,7 +236,9 @@ def split(surface: Surface, edges: EdgeTable, marked: Mask, points: Float, centr
         parts += _fans(corner[full], middle[full], len(vertices) + np.arange(len(centres)))
         vertices = np.concatenate([vertices, centres])
         normals.append(unit(surface.normals[corner[full]].sum(axis=1)))
-    return Surface(vertices, np.concatenate(normals), np.concatenate(parts), _split_creases(surface, edges, marked))
+    return CreasedSurface(
+        vertices, np.concatenate(normals), np.concatenate(parts), _split_creases(surface, edges, marked)
+    )
 
 
 def _middles(edges: EdgeTable, marked: Mask, faces: int, first: int) -> Int:
@@ -256,7 +273,7 @@ def _fans(corner: Int, middle: Int, centre: Int) -> list[Int]:
     return [np.stack([ring[:, k], ring[:, (k + 1) % 6], centre], 1) for k in range(6)]
 
 
-def _split_creases(surface: Surface, edges: EdgeTable, marked: Mask) -> Int:
+def _split_creases(surface: CreasedSurface, edges: EdgeTable, marked: Mask) -> Int:
     """Creases with the split ones replaced by their halves, whose new vertex has the higher number."""
     ends, middles = edges.ends[marked], len(surface.vertices) + np.arange(np.count_nonzero(marked))
     cut = surface.is_crease(ends)

@@ -1,24 +1,30 @@
-"""A closed surface under local surgery: positions, normals, faces and creases, and the table of its edges.
+"""The data structure of remeshing: a closed surface with normals and creases, and the table of its edges.
 
-Creases are edges where the surface is meant to be sharp. They are kept as pairs of vertices and follow every split and
-collapse, so that they need not be found again on a coarser mesh, where a bend of the surface looks like an edge.
+Creases are edges where the surface is sharp. They are kept as pairs of vertices and follow every split and collapse, so
+that they need not be detected again on a coarser mesh, where a bend of the surface looks like an edge.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 
-SMOOTH, CREASE, CORNER = 0, 1, 2
-"""Kinds of vertices: without a crease, on one that passes through, and where creases end, meet or branch."""
+
+class VertexKind(IntEnum):
+    """Kinds of vertices: without a crease, on one that passes through, and where creases end, meet or branch."""
+
+    SMOOTH = 0
+    CREASE = 1
+    CORNER = 2
 
 
 @dataclass(frozen=True)
-class Surface:
+class CreasedSurface:
     """A closed, oriented 2-manifold with creases.
 
     Parameters
@@ -37,20 +43,21 @@ class Surface:
     creases: Int
 
     def kinds(self) -> Int:
-        """`SMOOTH`, `CREASE` or `CORNER` for each vertex, of shape (V,)."""
+        """The `VertexKind` of each vertex, of shape (V,)."""
         count = np.bincount(self.creases.reshape(-1), minlength=len(self.vertices))
-        return np.where(count == 0, SMOOTH, np.where(count == 2, CREASE, CORNER)).astype(np.int64)
+        on_crease = np.where(count == 2, VertexKind.CREASE, VertexKind.CORNER)
+        return np.where(count == 0, VertexKind.SMOOTH, on_crease).astype(np.int64)
 
     def mesh(self) -> Mesh:
         """Return vertices and faces as a mesh without normals."""
         return Mesh(self.vertices, self.faces)
 
-    def compact(self) -> Surface:
+    def compact(self) -> CreasedSurface:
         """Return the surface without vertices that no face uses, the others in their order."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
         names = np.cumsum(used) - 1
-        return Surface(self.vertices[used], self.normals[used], names[self.faces], names[self.creases])
+        return CreasedSurface(self.vertices[used], self.normals[used], names[self.faces], names[self.creases])
 
     def is_crease(self, ends: Int) -> Mask:
         """Which edges, of shape (E, 2) with the lower vertex first, are creases; of shape (E,)."""
@@ -105,23 +112,22 @@ def unit(vectors: Float) -> Float:
     return units
 
 
-def face_normals(surface: Surface) -> Float:
+def face_normals(surface: CreasedSurface) -> Float:
     """Unit normals that the faces should have, of shape (F, 3): the mean of the field's at their smooth vertices.
 
-    These are right where a face is a sliver or turned over, and on either side of a crease. A face whose vertices all
-    lie on creases has its own.
+    They are right also where a face is a sliver or turned over, and on either side of a crease. A face whose vertices
+    all lie on creases gets its own.
     """
-    smooth = surface.normals * (surface.kinds() == SMOOTH)[:, None]
+    smooth = surface.normals * (surface.kinds() == VertexKind.SMOOTH)[:, None]
     sums = smooth[surface.faces].sum(axis=1)
     unknown = np.einsum("ij,ij->i", sums, sums) < 0.01
     sums[unknown] = area_vectors(surface.vertices, surface.faces[unknown])
     return unit(sums)
 
 
-# Sets of local changes that do not touch each other, so that arrays can make all of them at once.
-#
-# Every candidate has a rank and a set of vertices. It is chosen when it has the lowest rank of all candidates on each
-# of its vertices: chosen candidates share no vertex then, and as the lowest rank of all is always chosen, rounds end.
+# Independent sets of local changes, which can all be applied at once. Every candidate has a rank and a set of vertices.
+# It is chosen when it has the lowest rank of all candidates on each of its vertices. So chosen candidates share no
+# vertex, and since the lowest rank of all is always chosen, rounds end.
 
 
 def ranks(order_by: Float) -> Int:
@@ -131,7 +137,7 @@ def ranks(order_by: Float) -> Int:
     return rank
 
 
-def apart(members: Int, rank: Int, count: int) -> Mask:
+def independent_set(members: Int, rank: Int, count: int) -> Mask:
     """Which candidates, with vertices `members` of shape (N, K) among `count`, share no vertex with a lower rank."""
     best = np.full(count, len(rank), dtype=np.int64)
     for column in members.T:
@@ -140,7 +146,7 @@ def apart(members: Int, rank: Int, count: int) -> Mask:
     return chosen
 
 
-def rings_apart(members: Int, rank: Int, faces: Int, count: int) -> Mask:
+def independent_rings(members: Int, rank: Int, faces: Int, count: int) -> Mask:
     """Which candidates, with vertices `members` of shape (N, K), touch no face that one of lower rank touches."""
     best = np.full(count, len(rank), dtype=np.int64)
     for column in members.T:

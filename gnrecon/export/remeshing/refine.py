@@ -1,19 +1,21 @@
-"""Adapting a mesh to its use: sharp edges, isotropic faces, fewer faces, in that order.
+"""Sharpens, remeshes, simplifies and decimates a mesh, in that order, as `RefineOptions` say.
 
-Each step starts from a sound mesh. What comes out of it is repaired and verified, and must hang together as before: as
-many components, as many handles. A step that fails is tried again more gently, and given up with a sentence when that
-fails too; the sound mesh before it then stays.
+Each step starts from a sound mesh. Its result is repaired and verified, and must have the same number of components and
+of handles. A step that fails is tried again with less strength, and skipped with a sentence when that fails too; the
+sound mesh before it then stays. The entry is `refine`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from gnrecon.export.export_parameters import ExportParameters, RemeshParameters
 from gnrecon.export.project import SignedDistance, project
-from gnrecon.export.remeshing.decimate import FEWEST, decimate, simplify
+from gnrecon.export.remeshing.decimate import decimate, simplify
 from gnrecon.export.remeshing.remesh import remesh
 from gnrecon.export.remeshing.sharpen import sharpen
 from gnrecon.export.repair import repair
@@ -21,9 +23,6 @@ from gnrecon.export.verify import verify
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
-
-GENTLER = (1.0, 0.5, 0.25)
-"""Factors by which a step's strength is lowered before it is given up."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,9 @@ class RefineOptions:
         for name, length in (("edge length to remesh to", self.remesh), ("tolerance to simplify to", self.simplify)):
             if length is not None and not 0 < length < np.inf:
                 raise UsageError(f"The {name} must be positive, not {length}.")
-        if self.faces is not None and self.faces < FEWEST:
-            raise UsageError(f"The number of faces must be at least {FEWEST}, not {self.faces}.")
+        # The smallest closed mesh is a tetrahedron.
+        if self.faces is not None and self.faces < 4:
+            raise UsageError(f"The number of faces must be at least 4, not {self.faces}.")
         if not 5 <= self.feature_angle <= 90:
             raise UsageError(f"The feature angle must be from 5 to 90 degrees, not {self.feature_angle}.")
         if self.adaptive and self.remesh is None:
@@ -73,9 +73,14 @@ class RefineOptions:
 
 
 def refine(
-    mesh: Mesh, field: SignedDistance, options: RefineOptions, *, advance: ProgressCallback = ignore_progress
+    mesh: Mesh,
+    field: SignedDistance,
+    options: RefineOptions,
+    *,
+    advance: ProgressCallback = ignore_progress,
+    parameters: RemeshParameters = ExportParameters.remesh,
 ) -> tuple[Mesh, list[str]]:
-    """Adapt a mesh to the options; where they ask for nothing, it comes back as it is.
+    """Sharpen, remesh, simplify and decimate a mesh as the options ask.
 
     Parameters
     ----------
@@ -85,12 +90,13 @@ def refine(
         The field that it was extracted from.
     options : RefineOptions
     advance : callable
-        Told of the share that is done after each step.
+        Receives the share that is done, after each step.
+    parameters : RemeshParameters
 
     Returns
     -------
     Mesh, list of str
-        A sound mesh on the zero level with the field's normals, and a sentence for each thing that was done.
+        A sound mesh on the zero level with the field's normals, and a sentence for each change.
 
     Raises
     ------
@@ -100,9 +106,9 @@ def refine(
     if not options.anything:
         return mesh, []
     mesh, actions = repair(mesh)
-    steps = _steps(field, options)
+    steps = _steps(field, options, parameters)
     for number, step in enumerate(steps, start=1):
-        mesh, sentences = _take(step, mesh)
+        mesh, sentences = _apply_step(step, mesh)
         actions += sentences
         advance(number / len(steps))
     return mesh, actions
@@ -110,20 +116,22 @@ def refine(
 
 @dataclass(frozen=True)
 class _Step:
-    """A change of a mesh, by a strength from 1 downwards, and what it is called when it is done."""
+    """A change of a mesh by a strength, the strengths that are tried in turn, and a phrase for the report."""
 
     done: str
     change: Callable[[Mesh, float], Mesh]
-    strengths: tuple[float, ...] = GENTLER
+    strengths: tuple[float, ...] = (1.0, 0.5, 0.25)
 
 
-def _steps(field: SignedDistance, options: RefineOptions) -> list[_Step]:
+def _steps(field: SignedDistance, options: RefineOptions, parameters: RemeshParameters) -> list[_Step]:
     angle, adaptive = options.feature_angle, options.adaptive
     length, tolerance, faces = options.remesh, options.simplify, options.faces
+    # Sharpening comes first, because the later steps keep the edges that they find.
     steps = [_Step("Sharpened edges", lambda mesh, _: _sharpened(mesh, field, angle), (1.0,))]
     if length is not None:
         done = f"Remeshed to edges of {'at most ' if adaptive else ''}{length:g}"
-        steps.append(_Step(done, lambda mesh, s: remesh(mesh, field, s * length, adaptive=adaptive, angle=angle)))
+        even = partial(remesh, adaptive=adaptive, angle=angle, parameters=parameters)
+        steps.append(_Step(done, lambda mesh, s: even(mesh, field, s * length)))
     if tolerance is not None:
         steps.append(_Step(f"Simplified to within {tolerance:g}", lambda mesh, s: simplify(mesh, field, s * tolerance)))
     if faces is not None:
@@ -138,8 +146,8 @@ def _sharpened(mesh: Mesh, field: SignedDistance, angle: float) -> Mesh:
     return mesh if sharp is mesh else project(sharp, field)
 
 
-def _take(step: _Step, mesh: Mesh) -> tuple[Mesh, list[str]]:
-    """The mesh after a step, or as it was where no strength gives a sound mesh of the same topology."""
+def _apply_step(step: _Step, mesh: Mesh) -> tuple[Mesh, list[str]]:
+    """The mesh after a step, or as before where no strength gives a sound mesh of the same topology."""
     failure = ""
     for strength in step.strengths:
         try:
@@ -150,15 +158,13 @@ def _take(step: _Step, mesh: Mesh) -> tuple[Mesh, list[str]]:
             continue
         if result is mesh:
             return mesh, []
-        gentler = (
-            "" if strength == 1 else f", at {strength:g} of the strength because more would have failed ({failure})"
-        )
+        gentler = "" if strength == 1 else f", at {strength:g} of the strength because more failed ({failure})"
         return result, [f"{step.done}{gentler}: {len(mesh.faces)} faces became {len(result.faces)}.", *repaired]
-    return mesh, [f"Not {step.done[0].lower()}{step.done[1:]}, because that failed: {failure}"]
+    return mesh, [f"Not {step.done[0].lower()}{step.done[1:]}: {failure}"]
 
 
 def _require_topology_of(mesh: Mesh, result: Mesh) -> None:
-    """Raise MeshError where a mesh does not hang together as another one does."""
+    """Raise MeshError where the numbers of components or of handles differ."""
     before, after = verify(mesh), verify(result)
     if (before.components, before.genus) != (after.components, after.genus):
         raise MeshError(

@@ -1,4 +1,4 @@
-"""Give back the edges and corners that marching cubes cuts off.
+"""Restores the sharp edges and corners that marching cubes cuts off.
 
 Marching cubes puts vertices on the edges of a lattice only, and so bridges a sharp edge of the surface by chamfers. A
 chamfer shows in the field: its ends lie on different sides, so that the normals there differ. Each such mesh edge is
@@ -13,15 +13,9 @@ import numpy as np
 
 from gnrecon.export.project import SignedDistance
 from gnrecon.export.remeshing.edge_operators import split
-from gnrecon.export.remeshing.edge_table import EdgeTable, Surface, area_vectors, unit
+from gnrecon.export.remeshing.edge_table import CreasedSurface, EdgeTable, area_vectors, unit
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
-
-REACH = 1.5
-"""How far from a chamfer's middle its crease may lie, in lengths of the chamfer."""
-
-BETTER = 0.5
-"""A new point counts when the field is nearer to zero there than in the chamfer's middle, by this factor."""
 
 
 def sharpen(mesh: Mesh, field: SignedDistance, *, angle: float = 30.0) -> Mesh:
@@ -56,14 +50,14 @@ def sharpen(mesh: Mesh, field: SignedDistance, *, angle: float = 30.0) -> Mesh:
     full = mesh.faces[sides == 3]
     middles = mesh.vertices[full].mean(axis=1)
     centres, at_corner = _crease_points(mesh, full, middles, field, angle)
-    surface = Surface(mesh.vertices, normals, mesh.faces, np.empty((0, 2), dtype=np.int64))
+    surface = CreasedSurface(mesh.vertices, normals, mesh.faces, np.empty((0, 2), dtype=np.int64))
     plain = np.concatenate([mesh.vertices, mesh.vertices[edges.ends[marked]].mean(axis=1), middles])
     result = split(surface, edges, marked, points[better], np.where(at_corner[:, None], centres, middles))
-    return Mesh(_unfolded(result, plain, len(normals)), result.faces)
+    return Mesh(_undo_folds(result, plain, len(normals)), result.faces)
 
 
-def _unfolded(surface: Surface, plain: Float, old: int) -> Float:
-    """Vertices, of shape (V, 3), with those in their `plain` places that would fold a face over.
+def _undo_folds(surface: CreasedSurface, plain: Float, old: int) -> Float:
+    """Vertices, of shape (V, 3), with those put back to their `plain` places that fold a face over.
 
     Near corners a chamfer's two sides may meet beyond the third. In plain places, in the middle of what was split, no
     face is folded.
@@ -96,34 +90,39 @@ def _crossings(places: Float, normals: Float) -> Float:
     return crossings
 
 
-def _crease_points(mesh: Mesh, corners: Int, starts: Float, field: SignedDistance, angle: float) -> tuple[Float, Mask]:
-    """Where the sides meet on which the corners, of shape (N, K), lie, and whether the surface is nearer there."""
+def _crease_points(
+    mesh: Mesh,
+    corners: Int,
+    starts: Float,
+    field: SignedDistance,
+    angle: float,
+    *,
+    reach_lengths: float = 1.5,
+    better_ratio: float = 0.5,
+) -> tuple[Float, Mask]:
+    """Crease points between the sides on which the corners, of shape (N, K), lie, and which of them to use.
+
+    One is used within `reach_lengths`, in lengths of the chamfer, of its middle, where the field's magnitude is below
+    `better_ratio` times that in the middle.
+    """
     places = mesh.vertices[corners]
     owners = np.repeat(np.arange(len(corners)), corners.shape[1])
     points = meeting_points(starts, owners, places.reshape(-1, 3), field, angle)
     middles = places.mean(axis=1)
     size = np.linalg.norm(places - np.roll(places, 1, axis=1), axis=2).max(axis=1)
-    near = np.linalg.norm(points - middles, axis=1) < REACH * size
-    return points, near & (np.abs(field.sdf(points)) < BETTER * np.abs(field.sdf(middles)))
+    near = np.linalg.norm(points - middles, axis=1) < reach_lengths * size
+    return points, near & (np.abs(field.sdf(points)) < better_ratio * np.abs(field.sdf(middles)))
 
 
-NEARER = 0.3
-"""Share of the way to the crease that is left between two rounds."""
-
-ROUNDS = 3
-
-
-# Where a field is sharp: creases between faces, and the points on them.
-#
 # Newton's method along the gradient cannot find an edge or a corner of a field, because there the gradient jumps. But
-# the surface on either side is smooth. From points on both sides, the tangent planes are taken, and the point that fits
-# all of them best is the crease's: the least-squares intersection of the extended marching cubes (Kobbelt, Botsch,
-# Schwanecke and Seidel, 2001) and of dual contouring (Ju, Losasso, Schaefer and Warren, 2002). Directions in which the
-# planes say nothing are left alone: two planes move a point only across their line. Then the points on both sides are
-# drawn nearer to it and the planes taken again, so that creases between curved surfaces are met too.
+# the surface on either side is smooth. The crease point is the least-squares intersection of the tangent planes at
+# points on both sides, as in extended marching cubes (Kobbelt, Botsch, Schwanecke and Seidel, 2001) and in dual
+# contouring (Ju, Losasso, Schaefer and Warren, 2002). It moves only in directions that the planes determine: two planes
+# move a point only across their line. Then the points on both sides are moved towards it and the planes taken again, so
+# that creases between curved surfaces are found too.
 
 
-def feet(points: Float, field: SignedDistance, steps: int = 2) -> tuple[Float, Float]:
+def newton_feet(points: Float, field: SignedDistance, steps: int = 2) -> tuple[Float, Float]:
     """Points of shape (N, 3) brought to the zero level by Newton steps, and the field's unit gradients there."""
     gradient = field.gradient(points)
     for _ in range(steps):
@@ -139,8 +138,17 @@ def crease_edges(normals: Float, edges: EdgeTable, angle: float) -> Mask:
     return np.asarray(np.einsum("ij,ij->i", one, other) < np.cos(np.radians(angle)))
 
 
-def meeting_points(points: Float, owners: Int, sides: Float, field: SignedDistance, angle: float) -> Float:
-    """Move points to where the surfaces beside them meet.
+def meeting_points(
+    points: Float,
+    owners: Int,
+    sides: Float,
+    field: SignedDistance,
+    angle: float,
+    *,
+    rounds: int = 3,
+    remaining_share: float = 0.3,
+) -> Float:
+    """Move points to where the adjacent surfaces meet.
 
     Parameters
     ----------
@@ -153,15 +161,19 @@ def meeting_points(points: Float, owners: Int, sides: Float, field: SignedDistan
     field : SignedDistance
     angle : float
         Least angle between the sides of a crease in degrees; planes that differ by much less count as one.
+    rounds : int
+        Times that the planes are taken again.
+    remaining_share : float
+        Share of the distance to the crease at which the next round takes the planes.
 
     Returns
     -------
     array of shape (N, 3)
     """
-    places, normals = feet(sides, field)
-    for _ in range(ROUNDS):
+    places, normals = newton_feet(sides, field)
+    for _ in range(rounds):
         points = points + _least_squares(points, owners, places, normals, angle)
-        nearer, new = feet(points[owners] + NEARER * (places - points[owners]), field)
+        nearer, new = newton_feet(points[owners] + remaining_share * (places - points[owners]), field)
         # Past the crease the normal is the other side's: then the plane from farther away is the better one.
         same = np.einsum("ij,ij->i", normals, new) > np.cos(np.radians(angle) / 2)
         places = np.where(same[:, None], nearer, places)

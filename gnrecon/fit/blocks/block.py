@@ -103,6 +103,7 @@ class BlockSolver:
 
     def solve(self, number: int) -> Arrays:
         """Return the cubes of a block that hold enough points: their rows among all cubes, lengths and amplitudes."""
+        # An empty first array gives the shape where no cube holds enough points.
         kept, lengths, amplitudes = [], [], [np.zeros((0, len(self.features)))]
         for cube in range(self.ends[number], self.ends[number + 1]):
             solved = self._solve_cube(self.keys[cube])
@@ -131,8 +132,10 @@ class BlockSolver:
 
     def _nearby_points(self, key: Int) -> Int:
         """Return the rows of the points in a cell and its neighbours, in order: all points of the cube."""
+        # A cube and its margin reach less than a cell beyond its own cell.
         keys = key + neighbour_offsets()
         codes = np.sort(morton_codes(keys[(keys >= 0).all(axis=1)]))
+        # Cells without points have no code among the occupied ones.
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
         runs = [np.arange(self.first[cell], self.first[cell + 1]) for cell in at]
@@ -149,6 +152,7 @@ class BlockSolver:
         clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]
         winding = self.dipoles.winding_number(x, center, self.partition.reach)
+        # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
         return Volume.around(x, value, signed, is_sign_certain(winding), distance)

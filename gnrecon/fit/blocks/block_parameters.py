@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class BlockParameters:
-    """How a large scan is divided into blocks, and these among processes; only `block_points` is part of the result.
+    """How a large scan is divided into blocks, and these among processes.
+
+    The result depends on the dipole tree's parameters, within its error, and on no others.
 
     Lengths that end in `_radii` are multiples of the median radius of the disk that a point stands for.
     """

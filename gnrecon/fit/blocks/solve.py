@@ -84,6 +84,7 @@ def fit_large(
     with _work_folder(folder) as path:
         work = WorkFolder.open(path, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
+        # A resumed fit finds the blocks of earlier runs.
         missing = [number for number in range(count) if not work.is_solved(number)]
         if scheduler is not None and missing:
             solve_on_cluster(work, missing, scheduler, subrange(advance, chosen, 1.0))
@@ -113,6 +114,7 @@ def _task_data(
     """Return the arrays and the plain values from which all blocks are solved, see `BlockSolver`."""
     density = residuals.density
     codes = morton_codes(_cells(partition, residuals.points))
+    # Stable sorting keeps the order of points within a cell, and so the sums over them.
     order = np.argsort(codes, kind="stable")
     cells, first = np.unique(codes[order], return_index=True)
     keys, ends = _divided(
@@ -165,6 +167,7 @@ def _divided(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) ->
 
     A cube counts the points of its own cell, not those of its overlap.
     """
+    # Keys begin at -1, as cubes below the first cell overlap it; Morton codes begin at 0.
     codes = morton_codes(keys + 1)
     order = np.argsort(codes, kind="stable")
     keys, codes = keys[order], codes[order]
@@ -184,6 +187,7 @@ def _assembled(
         np.concatenate([block[name] for block in solved]) for name in ("cubes", "lengths", "amplitudes")
     )
     kept = keys[cubes]
+    # The order in which smaller scans have them, whatever the blocks are.
     order = np.lexsort((kept[:, 2], kept[:, 1], kept[:, 0]))
     sums = torch.as_tensor(amplitudes[order], device=features.phases.device)
     return Detail(

@@ -61,6 +61,7 @@ class WorkFolder:
         require_work_folder(folder)
         if work._belongs_to(print_):
             return work
+        # Without a manifest, arrays of a killed run may be there, complete or not.
         for name, values in arrays.items():
             with atomic_write(work.folder / f"{name}.npy", overwrite=True) as temporary:
                 np.save(temporary, values)
@@ -167,8 +168,10 @@ def require_work_folder(folder: str | Path) -> None:
 
 def fingerprint(arrays: Arrays, facts: Mapping[str, Any]) -> str:
     """Return a hash, in hexadecimal digits, of everything that determines the result."""
+    # The version is part of it: other code may give other results.
     digest = hashlib.sha256(json.dumps([FORMAT, __version__, facts], sort_keys=True).encode())
     for name in sorted(arrays):
+        # Type and shape as well, as equal bytes may mean other values.
         values = np.ascontiguousarray(arrays[name])
         digest.update(f"{name} {values.dtype.str} {values.shape}".encode())
         digest.update(values.reshape(-1).view(np.uint8).data)

@@ -68,6 +68,7 @@ def octree_blocks(codes: Codes, counts: Int, most: int) -> list[slice]:
         if bits == 0 or last - first == 1 or before[last] - before[first] <= most:
             blocks.append(slice(first, last))
             continue
+        # The three bits of this level say in which of the eight children a cell is.
         octants = (codes[first:last] >> np.uint64(3 * (bits - 1))) & np.uint64(7)
         ends = first + np.searchsorted(octants, np.arange(9, dtype=np.uint64))
         nodes += [(int(a), int(b), bits - 1) for a, b in zip(ends[-2::-1], ends[:0:-1], strict=True) if b > a]
@@ -134,6 +135,7 @@ class DipoleTree:
         codes, first = codes[order], np.arange(len(points) + 1)
         codes, sums, first = _connected(codes, sums)
         levels = [_level(sums, first, origin, side)]
+        # A code without its last three bits is that of the cube of twice the side.
         while len(codes) > root_cubes:
             codes, sums, first = _connected(codes >> np.uint64(3), sums)
             side *= 2
@@ -186,6 +188,7 @@ def _connected(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:
 
 def _level(sums: Float, first: Int, origin: Float, side: float) -> DipoleLevel:
     """Return a level from its sums, of shape (C, 7): areas, areas times points, and dipoles."""
+    # Points of zero area, where several coincide, would divide by zero.
     areas = np.maximum(sums[:, 0], np.finfo(np.float64).tiny)
     places = sums[:, 1:4] / areas[:, None]
     # The lower corner follows from any point within, such as the mean.

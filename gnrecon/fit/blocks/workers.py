@@ -112,7 +112,7 @@ def _send(worker: Process, block: int) -> None:
     assert worker.stdin is not None
     try:
         print(block, file=worker.stdin, flush=True)
-    except BrokenPipeError:
+    except BrokenPipeError:  # the process has died; its status says why
         _require_done(worker)
 
 
@@ -125,6 +125,7 @@ def _require_done(worker: Process) -> None:
     if answer:
         raise FitError(f"A block could not be solved: {answer}.")
     status = worker.wait()
+    # A negative status is the number of the signal that killed the process.
     if status < 0:
         raise MemoryLimitError(
             f"A process that solved blocks was killed by signal {-status}, probably because memory ran out; "

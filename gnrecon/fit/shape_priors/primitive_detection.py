@@ -180,7 +180,7 @@ class _Detector:
         return is_inlier(surface, points, normals, self.max_height, self.parameters.angle_degrees)
 
     def _ends_at_its_rim(self, surface: Primitive, points: Float, normals: Float, on: Mask) -> bool:
-        """Return whether few points beside a primitive nearly belong to it.
+        """Return whether few points near the rim of a primitive nearly belong to it.
 
         A face ends at edges. A shape that bends away from the primitive has many such points.
 

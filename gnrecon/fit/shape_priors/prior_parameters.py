@@ -121,7 +121,7 @@ class HoleCompletionParameters:
 
 @dataclass(frozen=True)
 class SnappingParameters:
-    """Points snapped to the primitives from which noise cannot tell them, see `snapping`.
+    """Points snapped to the primitives from which noise does not distinguish them, see `snapping`.
 
     Deviations are those of the noise. The rims' share is lower than elsewhere: with 1.0, 0.8 of a torus's 3,000 points
     were snapped to cylinders that noise of a quarter of their disks cannot rule out.
@@ -152,7 +152,7 @@ class UnorientedSnappingParameters:
 
     snapping: SnappingParameters = SnappingParameters()
     min_noise_radii: float = 0.1  # assumed in the search, as estimated normals are rough
-    max_noise_radii: float = 0.2  # with more, few points do not tell one shape from another
+    max_noise_radii: float = 0.2  # with more, few points fit several shapes
     first_degrees: float = 20.0  # between estimated normals and their primitive's, in the first search
     later_degrees: tuple[float, ...] = (30.0, 40.0, 30.0, 40.0, 30.0)  # and after each new estimate
     max_turn_degrees: float = 75.0  # of a point on a primitive by place, while normals still improve
@@ -178,7 +178,7 @@ class ResamplingParameters:
     point_spacings: float = 0.6  # from a sample to every point of its face
     neighbour_spacings: float = 1.2  # to a sample of another face, or a point, that closes an open side
     barrier_radii: float = 3.2  # of the piece of another face around its point that ways cannot cross
-    passes: int = 2  # by winding number and open sides: what goes on past a sheet's edge looks two-sided at first
+    passes: int = 2  # by winding number and open sides: what extends past a sheet's edge looks two-sided at first
 
 
 @dataclass(frozen=True)
@@ -201,9 +201,9 @@ class SharpShapeParameters:
     max_roughness_radii: float = 0.03  # of faces after that
     flat_bend_degrees: float = 1.0  # median bend up to which single points, as on a plate's sides, show edges
     min_agreement: float = 0.97  # of samples not contradicted: 0.99 on sharp shapes, 0.94 on edges rounded by scanners
-    position_noise_radii: float = 0.02  # believed of all samples
+    position_noise_radii: float = 0.02  # assumed for all samples
     exact_length_radii: float = 2.6  # of features, for scans that were not averaged
-    exact_angle_radians: float = 0.2  # believed noise of their normals
+    exact_angle_radians: float = 0.2  # assumed noise of their normals
     averaged_length_radii: float = 3.2  # of features, for averaged scans
     averaged_angle_radians: float = 0.5  # larger: near an edge noisy points may have the other face's normal
 
@@ -212,7 +212,7 @@ class SharpShapeParameters:
 class BallFitParameters:
     """Scans of a ball, see `ball_fit`."""
 
-    min_points: int = 30  # fewer do not tell a sphere from a quadric
+    min_points: int = 30  # fewer do not distinguish a sphere from a quadric
     max_height_deviations: float = 5.0  # of a point, over the deviation of all heights
     exact_share: float = 1e-6  # of the radius, below which heights are rounding errors
     max_noise_radii: float = 0.5  # deviation of the heights; with more, neighbours could be on another shape

@@ -189,7 +189,7 @@ def _with_small_planes(
             continue
         near = np.unique(np.concatenate(density.tree.query_ball_point(points[rows], p.reach_radii * density.radius)))
         cosine = normals[near.astype(np.int64)] @ plane.direction
-        # A normal beside it that differs a little shows that the plane is a piece of a bent surface.
+        # A normal near it that differs a little shows that the plane is a piece of a bent surface.
         if ((cosine < cosine_of(2 * p.plane_degrees)) & (cosine > cosine_of(p.bent_degrees))).any():
             continue
         free &= ~np.isin(left, rows)

@@ -31,14 +31,14 @@ class SnappedPoints:
 
     Parameters
     ----------
-    points, normals : arrays of shape (N, 3), unit normals; those on no primitive are averaged
-    snapped : mask of shape (N,), of those on a primitive
+    points, normals : arrays of shape (N, 3), unit normals; those on no primitive averaged
+    on_primitive : mask of shape (N,)
     primitives : their number
     """
 
     points: Float
     normals: Float
-    snapped: Mask
+    on_primitive: Mask
     primitives: int
 
 
@@ -200,14 +200,14 @@ class FaceSearch:
         """
         far = np.linalg.norm(points - self.points, axis=1) > self.max_height
         points, normals = np.where(far[:, None], self.points, points), normals.copy()
-        snapped = np.zeros(len(points), bool)
+        on_primitive = np.zeros(len(points), bool)
         faces = self._with_strays(found, normals)
         for face in faces:
             scanned = self.points[face.rows]
             normals[face.rows] = face.surface.normal(scanned)
             points[face.rows] = project(face.surface, scanned)
-            snapped[face.rows] = True
-        return SnappedPoints(self._clamped_to_edges(faces, points), normals, snapped, len(found))
+            on_primitive[face.rows] = True
+        return SnappedPoints(self._clamped_to_edges(faces, points), normals, on_primitive, len(found))
 
     def _clamped_to_edges(
         self,
@@ -247,7 +247,7 @@ class FaceSearch:
             beyond = (side * height < 0) & (np.abs(cosine) < cosine_of(p.rim_degrees))
             if len(some) < p.detection.min_points or beyond.mean() > max_wrong_side_share:
                 continue
-            # Points that are farther beyond than noise moves them show that the face goes on there.
+            # Points that are farther beyond than noise moves them show that the face continues there.
             beyond &= np.abs(height) < self.max_height
             x, height, cosine = x[beyond], height[beyond], cosine[beyond]
             along = opposite.normal(x) - cosine[:, None] * own.normal(x)

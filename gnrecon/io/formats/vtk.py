@@ -28,7 +28,7 @@ _TYPES = {
 
 
 @dataclass
-class _Data:
+class _PolyData:
     """Data read so far."""
 
     points: Float | None = None
@@ -49,7 +49,7 @@ def read_vtk(path: Path) -> Contents:
         When the file is malformed, ends too early, or holds another kind of data set.
     """
     source = _Source(path.read_bytes())
-    data = _Data()
+    data = _PolyData()
     while words := source.words():
         _section(source, words, data)
     if data.points is None:
@@ -104,7 +104,7 @@ class _Source:
         return parse_numbers(found)
 
 
-def _section(source: _Source, words: list[str], data: _Data) -> None:
+def _section(source: _Source, words: list[str], data: _PolyData) -> None:
     name = words[0].upper()
     match name:
         case "DATASET":
@@ -146,7 +146,7 @@ def _skip_metadata(source: _Source) -> None:
             return
 
 
-def _cells(source: _Source, words: list[str], data: _Data) -> None:
+def _cells(source: _Source, words: list[str], data: _PolyData) -> None:
     """Read polygons with interleaved counts or, since version 5, with separate offsets."""
     rows, size, start = _count(words, 1), _count(words, 2), source.place
     following = source.words()
@@ -183,7 +183,7 @@ def _counted(values: Int, rows: int) -> tuple[Int, Int]:
     return counts, values[mask]
 
 
-def _fields(source: _Source, words: list[str], data: _Data) -> None:
+def _fields(source: _Source, words: list[str], data: _PolyData) -> None:
     for _ in range(_count(words, 2)):
         head = source.words()
         while head[:1] == ["METADATA"]:
@@ -194,7 +194,7 @@ def _fields(source: _Source, words: list[str], data: _Data) -> None:
         _keep(data, _word(head, 0), values, columns)
 
 
-def _array(source: _Source, words: list[str], data: _Data) -> None:
+def _array(source: _Source, words: list[str], data: _PolyData) -> None:
     """Read one of the classic attributes of points or of polygons."""
     name, title = words[0].upper(), _word(words, 1) if len(words) > 1 else ""
     match name:
@@ -225,7 +225,7 @@ def _array(source: _Source, words: list[str], data: _Data) -> None:
             raise InputError(f"the line {' '.join(words)[:60]!r} does not begin a known section.")
 
 
-def _keep(data: _Data, name: str, values: Values, columns: int) -> None:
+def _keep(data: _PolyData, name: str, values: Values, columns: int) -> None:
     if data.of_points:
         data.arrays[unquote(name)] = values if columns == 1 else values.reshape(-1, max(columns, 1))
     elif "values of polygons or of the whole" not in data.unread:

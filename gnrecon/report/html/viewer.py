@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.export import lighten
+from gnrecon.export import decimate_by_clustering
 from gnrecon.geometry.arrays import Float, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.geometry.statistics import Histogram
-from gnrecon.rendering import vertex_sky
+from gnrecon.rendering import vertex_ambient_occlusion
 from gnrecon.report.html.scales import figure, ramp
 
 
@@ -67,7 +67,7 @@ def model(
     """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
-    light = lighten(Mesh(mesh.vertices, mesh.faces, mesh.normals, _attributes(mesh, shown)), most_faces)
+    light = decimate_by_clustering(Mesh(mesh.vertices, mesh.faces, mesh.normals, _attributes(mesh, shown)), most_faces)
     buffers = {
         "positions": pack(((light.vertices - centre) / radius).astype("<f4")),
         "shape": pack(_shape(light)),
@@ -107,7 +107,7 @@ def _attributes(mesh: Mesh, shown: Sequence[Layer]) -> dict[str, Values]:
 
 def _shape(mesh: Mesh) -> npt.NDArray[np.int16]:
     """Normals and ambient occlusion, of shape (V, 4), as normalised 16-bit numbers."""
-    shape = np.concatenate([mesh.vertex_normals(), vertex_sky(mesh)[:, None]], axis=1)
+    shape = np.concatenate([mesh.vertex_normals(), vertex_ambient_occlusion(mesh)[:, None]], axis=1)
     numbers: npt.NDArray[np.int16] = np.round(np.clip(shape, -1, 1) * 32767).astype("<i2")
     return numbers
 

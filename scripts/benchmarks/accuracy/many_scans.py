@@ -10,23 +10,12 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.accuracy.cases import CASES, GROUPS, chosen_cases
+from benchmarks.accuracy.cases import GROUPS, cases_of, chosen_cases
 from benchmarks.accuracy.comparison import Protocol, problems_of, run_case
 from benchmarks.accuracy.methods import METHODS
 from benchmarks.accuracy.problem import Case, Problem, load_mesh, load_scan, load_truth
 from benchmarks.accuracy.summary import accuracy_table, failures, method_title, standing, summarise
-from benchmarks.harness.command_line import (
-    add_outputs,
-    add_quality,
-    add_repeat,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    scratch_folder,
-    shared_data,
-    without_folders,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.contact_sheet import Part, Pixels, Row, draw_row, write_sheet
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -47,11 +36,11 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
     """
     chosen = _parser().parse_args(arguments)
     protocol = (protocol or Protocol(limit=3600.0)).at_quality(chosen.quality)
-    require_folders(chosen.json, chosen.picture)
+    command_line.require_folders(chosen.json, chosen.picture)
     cases = chosen_cases(chosen.cases, GROUPS)
     for case in cases.values():
         case.problem(chosen.data, 0)  # fails now if a file is missing, not after other cases
-    report = provenance("accuracy", arguments)
+    report = command_line.provenance("accuracy", arguments)
     report |= {"protocol": asdict(protocol), "seeds": list(range(chosen.repeat)), "summary": [], "trials": []}
     # In a narrower terminal the numbers would be broken over lines.
     console = Console(highlight=False, width=200)
@@ -59,7 +48,7 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
     for name, case in cases.items():
         rows += _run(name, case, chosen, protocol, report)
         # After each case, so that an interrupted run keeps its results.
-        write_report(chosen.json, _with_standing(report))
+        command_line.write_report(chosen.json, _with_standing(report))
         if chosen.picture:
             write_sheet(rows, chosen.picture)
     console.print(accuracy_table(report["summary"], chosen.repeat))
@@ -74,7 +63,7 @@ def _run(name: str, case: Case, chosen: argparse.Namespace, protocol: Protocol, 
     """Run a case and add its trials and their summary to the report; return its row of the sheet with --picture."""
     problem_of = problems_of(case, chosen.data)
     problem = problem_of(0)
-    with scratch_folder() as scratch:
+    with command_line.scratch_folder() as scratch:
         folder = scratch / "case"
         trials = run_case(name, problem_of, report["seeds"], chosen.methods, protocol, folder)
         summary = summarise(trials, problem)
@@ -86,25 +75,23 @@ def _run(name: str, case: Case, chosen: argparse.Namespace, protocol: Protocol, 
 def _with_standing(report: dict[str, Any]) -> dict[str, Any]:
     """Return the report as it is written, with the standing and without names of temporary folders."""
     place = standing(report["summary"])
-    written: dict[str, Any] = without_folders(report | {"standing": None if place is None else asdict(place)})
+    written: dict[str, Any] = command_line.without_folders(
+        report | {"standing": None if place is None else asdict(place)}
+    )
     return written
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser("accuracy", __doc__)
-    parser.add_argument(
-        "--data",
-        type=Path,
-        default=shared_data(),
-        metavar="DIR",
-        help="folder of paper/, srb/ and vipss500/; the analytic cases need none",
-    )
+    parser = command_line.benchmark_parser("accuracy", __doc__)
+    command_line.add_data(parser, "paper/, srb/ and vipss500/; the analytic cases need none")
     parser.add_argument(
         "--cases",
         nargs="+",
         default=list(GROUPS),
         metavar="CASE",
-        help=f"groups ({', '.join(GROUPS)}) or single cases ({', '.join(CASES)}); default: all".replace("%", "%%"),
+        help=f"groups ({', '.join(GROUPS)}) or single cases ({', '.join(cases_of(GROUPS))}); default: all".replace(
+            "%", "%%"
+        ),
     )
     parser.add_argument(
         "--methods",
@@ -114,9 +101,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="METHOD",
         help=f"of {', '.join(METHODS)}; default: all",
     )
-    add_quality(parser)
-    add_repeat(parser, "scans of each case")
-    add_outputs(parser, picture="write a contact sheet")
+    command_line.add_quality(parser)
+    command_line.add_repeat(parser, "scans of each case")
+    command_line.add_outputs(parser, picture="write a contact sheet")
     return parser
 
 

@@ -5,33 +5,22 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.accuracy.cases import SRB, VIPSS, Within, cases_of, chosen_cases
+from benchmarks.accuracy.cases import GROUPS, Within, chosen_cases
 from benchmarks.accuracy.comparison import Protocol, run_case
 from benchmarks.accuracy.methods import oriented
 from benchmarks.accuracy.problem import Case, Problem
 from benchmarks.accuracy.scans import AnalyticScan, RangeScan
 from benchmarks.accuracy.summary import summarise
-from benchmarks.harness.command_line import (
-    add_outputs,
-    add_quality,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    scratch_folder,
-    shared_data,
-    without_folders,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.measurement import Stopwatch
 from benchmarks.harness.tables import number_or_dash, row_table
-from gnrecon.export.metrics import Surface
+from gnrecon.export.metrics import SurfaceQuery
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.ingest import oriented_normals
@@ -52,15 +41,17 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
     """
     chosen = _parser().parse_args(arguments)
     protocol = (protocol or Protocol(limit=3600.0)).at_quality(chosen.quality)
-    require_folders(chosen.json)
-    problems = {name: case.problem(chosen.data, 0) for name, case in chosen_cases(chosen.cases, GROUPS).items()}
-    report: dict[str, Any] = provenance("orient", arguments) | {"cases": []}
+    command_line.require_folders(chosen.json)
+    problems = {
+        name: case.problem(chosen.data, 0) for name, case in chosen_cases(chosen.cases, ORIENTATION_GROUPS).items()
+    }
+    report: dict[str, Any] = command_line.provenance("orient", arguments) | {"cases": []}
     for name, problem in problems.items():
         found = {"case": name} | sides(problem)
         if chosen.fits:
             found |= {"unit": problem.unit, "factor": problem.factor, "meshes": _meshes(name, problem, protocol)}
         report["cases"].append(found)
-        write_report(chosen.json, report)
+        command_line.write_report(chosen.json, report)
     console = Console(highlight=False, width=160)
     console.print(sides_table(report["cases"]))
     if chosen.fits:
@@ -72,13 +63,13 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
 def _meshes(name: str, problem: Problem, protocol: Protocol) -> dict[str, Any]:
     """Return the figures of meshes of a scan: by both methods without its normals, and by gnrecon with them."""
     unoriented = replace(problem, scan=problem.scan.with_normals(None))
-    with scratch_folder() as folder:
+    with command_line.scratch_folder() as folder:
         trials = run_case(name, lambda _: unoriented, [0], ["gnrecon", "Poisson"], protocol, folder / "unoriented")
         methods = summarise(trials, unoriented)["methods"]
         if problem.scan.normals is not None:
             trials = run_case(name, lambda _: problem, [0], ["gnrecon"], protocol, folder / "given")
             methods["given"] = summarise(trials, problem)["methods"]["gnrecon"]
-    found: dict[str, Any] = without_folders(methods)
+    found: dict[str, Any] = command_line.without_folders(methods)
     return found
 
 
@@ -117,16 +108,18 @@ def _ratio(ours: float | None, other: float | None) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser("orient", __doc__)
+    parser = command_line.benchmark_parser("orient", __doc__)
+    command_line.add_data(parser, "vipss500/, real/ and srb/")
     parser.add_argument(
-        "--data", type=Path, default=shared_data(), metavar="DIR", help="folder of vipss500/, real/ and srb/"
-    )
-    parser.add_argument(
-        "--cases", nargs="+", default=list(GROUPS), metavar="CASE", help="groups (files, analytic) or cases; all"
+        "--cases",
+        nargs="+",
+        default=list(ORIENTATION_GROUPS),
+        metavar="CASE",
+        help="groups (files, analytic) or cases; all",
     )
     parser.add_argument("--fits", action="store_true", help="also make the meshes: minutes for each large scan")
-    add_quality(parser)
-    add_outputs(parser)
+    command_line.add_quality(parser)
+    command_line.add_outputs(parser)
     return parser
 
 
@@ -134,7 +127,7 @@ def true_normals(problem: Problem) -> Float | None:
     """Return the outward unit normals of a scan: its own, or the nearest true surface's; None if there is neither."""
     normals = problem.scan.normals
     if normals is None and isinstance(problem.truth, Mesh):
-        _, faces = Surface(problem.truth).nearest(problem.scan.points)
+        _, faces = SurfaceQuery(problem.truth).nearest(problem.scan.points)
         normals = problem.truth.face_vectors[faces]
     return None if normals is None else normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
@@ -171,24 +164,24 @@ def _figures(estimate: Callable[[], Float], truth: Float | None, rows: Int) -> d
     return {"right": right, "angle_mean": float(angles.mean()), "cpu_seconds": seconds}
 
 
-FILES: dict[str, Case] = {
-    **{name: Within("vipss500", case) for name, case in VIPSS.items()},
-    "doghead": Within("real", RangeScan("doghead_unoriented.xyz")),
-    **{name: Within("srb", SRB[name]) for name in ("anchor", "daratech", "gargoyle")},
+# If a scan has normals, they are the truth, and are removed.
+ORIENTATION_GROUPS: dict[str, dict[str, Case]] = {
+    "files": {
+        **GROUPS["vipss"],
+        "doghead": Within("real", RangeScan("doghead_unoriented.xyz")),
+        **{name: GROUPS["srb"][name] for name in ("anchor", "daratech", "gargoyle")},
+    },
+    "analytic": {
+        "torus, 400 points": AnalyticScan("torus", 400),
+        "plate, 500 points": AnalyticScan("plate", 500),
+        "block, 600 points": AnalyticScan("block", 600),
+        "gear, 1500 points": AnalyticScan("gear", 1500),
+        "gyroid, 1500 points": AnalyticScan("gyroid", 1500),
+        "plate, 4000 points": AnalyticScan("plate", 4000),
+        "block, 6000 points": AnalyticScan("block", 6000),
+        "gear, noise 0.5%": AnalyticScan("gear", 10_000, noise=0.005),
+        "gyroid, noise 1%": AnalyticScan("gyroid", 10_000, noise=0.01),
+        "torus, uneven": AnalyticScan("torus", 1000, uneven=30.0),
+        "block, hole": AnalyticScan("block", 3000, hole=0.3),
+    },
 }
-ANALYTIC: dict[str, Case] = {
-    "torus, 400 points": AnalyticScan("torus", 400),
-    "plate, 500 points": AnalyticScan("plate", 500),
-    "block, 600 points": AnalyticScan("block", 600),
-    "gear, 1500 points": AnalyticScan("gear", 1500),
-    "gyroid, 1500 points": AnalyticScan("gyroid", 1500),
-    "plate, 4000 points": AnalyticScan("plate", 4000),
-    "block, 6000 points": AnalyticScan("block", 6000),
-    "gear, noise 0.5%": AnalyticScan("gear", 10_000, noise=0.005),
-    "gyroid, noise 1%": AnalyticScan("gyroid", 10_000, noise=0.01),
-    "torus, uneven": AnalyticScan("torus", 1000, uneven=30.0),
-    "block, hole": AnalyticScan("block", 3000, hole=0.3),
-}
-GROUPS = {"files": FILES, "analytic": ANALYTIC}
-CASES = cases_of(GROUPS)
-"""If a scan has normals, they are the truth, and are removed."""

@@ -14,17 +14,7 @@ from rich.table import Table
 from benchmarks.accuracy.comparison import Protocol, best_setting, problems_of, run_case
 from benchmarks.accuracy.problem import load_mesh, load_scan
 from benchmarks.accuracy.scans import PAPER_SCANS, load_shape
-from benchmarks.harness.command_line import (
-    add_outputs,
-    add_repeat,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    scratch_folder,
-    shared_data,
-    without_folders,
-    write_report,
-)
+from benchmarks.harness import command_line
 from benchmarks.harness.contact_sheet import Part, Row, draw_row, write_sheet
 from benchmarks.harness.tables import Figure
 from gnrecon.geometry.point_cloud import PointCloud
@@ -55,11 +45,14 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
     """
     chosen = _parser().parse_args(arguments)
     protocol = protocol or Protocol()
-    require_folders(chosen.json, chosen.picture)
+    command_line.require_folders(chosen.json, chosen.picture)
     for name in chosen.cases:
         load_shape(PAPER_SCANS[name].shape, chosen.data)  # fails now if a file is missing, not after other cases
-    report = provenance("paper", arguments) | {"protocol": asdict(protocol), "seeds": list(range(chosen.repeat))}
-    with scratch_folder() as folder:
+    report = command_line.provenance("paper", arguments) | {
+        "protocol": asdict(protocol),
+        "seeds": list(range(chosen.repeat)),
+    }
+    with command_line.scratch_folder() as folder:
         trials = [
             run_case(
                 name, problems_of(PAPER_SCANS[name], chosen.data), report["seeds"], METHODS, protocol, folder / name
@@ -68,8 +61,10 @@ def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
         ]
         summaries = [summarise(records) for records in trials]
         Console(highlight=False).print(comparison_table(summaries, chosen.repeat))
-        report |= without_folders({"summary": summaries, "trials": [record for case in trials for record in case]})
-        write_report(chosen.json, report)
+        report |= command_line.without_folders(
+            {"summary": summaries, "trials": [record for case in trials for record in case]}
+        )
+        command_line.write_report(chosen.json, report)
         if chosen.picture:
             rows = [draw_row(_row(summary, folder / summary["case"])) for summary in summaries]
             write_sheet(rows, chosen.picture)
@@ -93,14 +88,8 @@ def _row(summary: dict[str, Any], folder: Path) -> Row:
 
 
 def _parser(*, default_cases: Sequence[str] = ("rockerarm-5", "rockerarm-20", "bunny-20")) -> argparse.ArgumentParser:
-    parser = benchmark_parser("paper", __doc__)
-    parser.add_argument(
-        "--data",
-        type=Path,
-        default=shared_data("paper"),
-        metavar="DIR",
-        help="folder of rocker-arm.off and bun_zipper.ply",
-    )
+    parser = command_line.benchmark_parser("paper", __doc__)
+    command_line.add_data(parser, "rocker-arm.off and bun_zipper.ply", "paper")
     parser.add_argument(
         "--cases",
         nargs="+",
@@ -109,8 +98,8 @@ def _parser(*, default_cases: Sequence[str] = ("rockerarm-5", "rockerarm-20", "b
         metavar="CASE",
         help=f"of {', '.join(PAPER_SCANS)} (default: {' '.join(default_cases)})",
     )
-    add_repeat(parser, "random choices of points")
-    add_outputs(parser, picture="write a contact sheet")
+    command_line.add_repeat(parser, "random choices of points")
+    command_line.add_outputs(parser, picture="write a contact sheet")
     return parser
 
 

@@ -9,23 +9,31 @@ from typing import Any
 
 from rich.table import Table
 
-from benchmarks.accuracy.cases import HARD
+from benchmarks.accuracy.cases import hard_cases
 from benchmarks.accuracy.comparison import best_setting
 from benchmarks.accuracy.methods import METHODS, PEERS
 from benchmarks.accuracy.problem import Problem
 from benchmarks.harness.tables import Figure, number_or_dash
 from gnrecon.geometry.point_cloud import PointCloud
 
-LENGTHS = (
-    "reference_to_mesh_mean",
-    "mesh_to_reference_mean",
-    "chamfer_mean",
-    "rms",
-    "hausdorff",
-    "samples_chamfer",
-    "samples_hausdorff",
+COLUMNS = (
+    Figure("reference_to_mesh_mean", "truth to mesh", "{:,.3f}", is_length=True),
+    Figure("mesh_to_reference_mean", "mesh to truth", "{:,.3f}", is_length=True),
+    Figure("chamfer_mean", "mean", "{:,.3f}", is_length=True),
+    Figure("rms", "RMS", "{:,.3f}", is_length=True),
+    Figure("hausdorff", "Hausdorff", "{:,.1f}", is_length=True),
+    Figure("normal_consistency", "normals", "{:.4f}"),
+    Figure("f_score", "F-score", "{:.4f}"),
+    Figure("components", "parts", "{:g}"),
+    Figure("genus", "genus", "{:g}"),
+    Figure("closed", "closed", "{}"),
+    Figure("seconds", "s", "{:,.1f}"),
+    Figure("peak_memory_mb", "MB"),
 )
-OTHERS = ("normal_consistency", "f_score", "components", "genus", "boundary_edges", "seconds", "peak_memory_mb")
+SAMPLE_COLUMNS = (
+    Figure("samples_chamfer", "Chamfer of samples", "{:,.3f}", is_length=True),
+    Figure("samples_hausdorff", "Hausdorff of samples", "{:,.2f}", is_length=True),
+)
 
 
 def summarise(records: Sequence[dict[str, Any]], problem: Problem) -> dict[str, Any]:
@@ -35,7 +43,7 @@ def summarise(records: Sequence[dict[str, Any]], problem: Problem) -> dict[str, 
     """
     found = [record | _derived(record) for record in records]
     names = dict.fromkeys(record["method"] for record in found)
-    keys = (*LENGTHS, *OTHERS, "closed")
+    keys = [*(figure.key for figure in (*COLUMNS, *SAMPLE_COLUMNS)), "boundary_edges"]
     return {
         "case": records[0]["case"],
         "points": records[0]["points"],
@@ -68,7 +76,8 @@ def standing(summaries: Sequence[dict[str, Any]]) -> Standing | None:
 
     A method that failed is infinitely far from the truth.
     """
-    ratios = [ratio for ratio in map(_ratio, (s for s in summaries if s["case"] in HARD)) if ratio is not None]
+    hard = hard_cases()
+    ratios = [ratio for ratio in map(_ratio, (s for s in summaries if s["case"] in hard)) if ratio is not None]
     if not ratios:
         return None
     return Standing(len(ratios), sum(ratio < 1 for ratio in ratios), sum(ratio <= 0.75 for ratio in ratios))
@@ -103,28 +112,6 @@ def _derived(record: dict[str, Any]) -> dict[str, Any]:
     return {"rms": math.sqrt((there**2 + back**2) / 2)}
 
 
-COLUMNS = (
-    Figure("reference_to_mesh_mean", "truth to mesh", "{:,.3f}"),
-    Figure("mesh_to_reference_mean", "mesh to truth", "{:,.3f}"),
-    Figure("chamfer_mean", "mean", "{:,.3f}"),
-    Figure("rms", "RMS", "{:,.3f}"),
-    Figure("hausdorff", "Hausdorff", "{:,.1f}"),
-    Figure("normal_consistency", "normals", "{:.4f}"),
-    Figure("f_score", "F-score", "{:.4f}"),
-    Figure("components", "parts", "{:g}"),
-    Figure("genus", "genus", "{:g}"),
-    Figure("closed", "closed", "{}"),
-    Figure("seconds", "s", "{:,.1f}"),
-    Figure("peak_memory_mb", "MB"),
-)
-SAMPLE_COLUMNS = (
-    Figure("samples_chamfer", "Chamfer of samples", "{:,.3f}"),
-    Figure("samples_hausdorff", "Hausdorff of samples", "{:,.2f}"),
-)
-SETTINGS = {"depth": "depth", "filterscale": "scale"}
-"""Names of settings in the table."""
-
-
 def accuracy_table(summaries: Sequence[dict[str, Any]], seeds: int) -> Table:
     """Return a table of the summaries of `summary.summarise`; the best peer of each case is marked with a star."""
     caption = "Mean: half the sum of both ways. F-score at 0.5 % of the radius. *: the best peer by the mean."
@@ -148,7 +135,8 @@ def accuracy_table(summaries: Sequence[dict[str, Any]], seeds: int) -> Table:
 def method_title(method: str, figures: dict[str, Any]) -> str:
     """Return the method's name with its reported setting."""
     settings = figures.get("settings", {})
-    return ", ".join([method, *(f"{SETTINGS[key]} {settings[key]:g}" for key in SETTINGS if key in settings)])
+    titles = {"depth": "depth", "filterscale": "scale"}
+    return ", ".join([method, *(f"{titles[key]} {settings[key]:g}" for key in titles if key in settings)])
 
 
 def failures(summaries: Sequence[dict[str, Any]]) -> list[str]:
@@ -177,5 +165,5 @@ def _cell(figures: dict[str, Any], column: Figure, factor: float) -> str:
     value = figures[column.key]
     if value is not None and column.key == "closed":
         return "yes" if value == 1 else "no"
-    in_unit = factor * value if value is not None and column.key in LENGTHS else value
+    in_unit = factor * value if value is not None and column.is_length else value
     return number_or_dash(in_unit, column.form)

@@ -1,1 +1,1 @@
-"""The engine's benchmark: steps, times to a loss, memory and growth, beside the paper's algorithm written plainly."""
+"""The engine's benchmark: steps, times to a loss, memory and growth, compared with the paper's algorithm."""

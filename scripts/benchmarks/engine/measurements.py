@@ -26,16 +26,7 @@ from benchmarks.engine.plain_baseline import pretrained
 from benchmarks.engine.presentation import draw, tables
 from benchmarks.engine.step_time import dense_steps, freeze, measure_solvers, measure_step
 from benchmarks.engine.time_to_loss import GOALS, measure_quality
-from benchmarks.harness.command_line import (
-    add_outputs,
-    benchmark_parser,
-    provenance,
-    require_folders,
-    require_matplotlib,
-    scratch_folder,
-    shared_data,
-    write_report,
-)
+from benchmarks.harness import command_line
 from gnrecon.runtime.errors import ExitCode, InputError, UsageError
 
 
@@ -170,15 +161,15 @@ def main(arguments: Sequence[str], plan_of: Callable[..., Plan] = Plan) -> int:
     # Into a file or a pipe rich would write 80 columns, and truncate figures.
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
     names = chosen.only or _possible(chosen.data, console)
-    report: dict[str, Any] = provenance("engine", arguments) | {"threads": torch.get_num_threads()}
-    with scratch_folder() as folder:
+    report: dict[str, Any] = command_line.provenance("engine", arguments) | {"threads": torch.get_num_threads()}
+    with command_line.scratch_folder() as folder:
         devices = ("cpu",) if chosen.device == "cpu" else ("cpu", "cuda")
         plan = plan_of(chosen.data, folder, chosen.repeat, chosen.budget, devices)
         for name in names:
             console.print(f"bench: {name}", style="dim")
             report = merged(report, MEASUREMENTS[name](plan))
             # After each one, so that an interrupted run keeps its results.
-            write_report(chosen.json, report)
+            command_line.write_report(chosen.json, report)
     for table in tables(report):
         console.print(table)
     if chosen.plot:
@@ -187,14 +178,8 @@ def main(arguments: Sequence[str], plan_of: Callable[..., Plan] = Plan) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser("engine", __doc__)
-    parser.add_argument(
-        "--data",
-        type=Path,
-        default=shared_data("paper"),
-        metavar="DIR",
-        help="folder of rocker-arm.off and bun_zipper.ply",
-    )
+    parser = command_line.benchmark_parser("engine", __doc__)
+    command_line.add_data(parser, "rocker-arm.off and bun_zipper.ply", "paper")
     parser.add_argument(
         "--only", nargs="+", choices=MEASUREMENTS, help="what to measure (default: all that needs no absent data)"
     )
@@ -207,7 +192,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--device", choices=("cpu", "cuda"), default="cpu", help="cuda: steps, kernel and solvers there too"
     )
-    add_outputs(parser, picture="plot growth and losses", option="--plot")
+    command_line.add_outputs(parser, picture="plot growth and losses", option="--plot")
     return parser
 
 
@@ -217,9 +202,9 @@ def _check(chosen: argparse.Namespace) -> None:
         raise UsageError(f"--repeat and --budget must be positive, not {chosen.repeat} and {chosen.budget}.")
     if chosen.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda needs a CUDA GPU and a torch built for it; there is none here.")
-    require_folders(chosen.json, chosen.plot)
+    command_line.require_folders(chosen.json, chosen.plot)
     if chosen.plot:
-        require_matplotlib()
+        command_line.require_matplotlib()
     missing = _missing(chosen.data)
     if missing and any(name in NEEDS_DATA for name in chosen.only or ()):
         raise InputError(f"There is no file {missing[0]}; name the folder that holds it with --data.")

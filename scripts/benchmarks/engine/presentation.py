@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,14 +18,12 @@ if TYPE_CHECKING:
 Row = tuple[str, str, str, str, str]
 """Measurement, figure, gnrecon's, the baseline's, ratio."""
 
-SIDES = ("measurement", "figure", "ours", "baseline", "ratio")
-
 
 def tables(report: dict[str, Any]) -> Iterator[Table]:
     """Yield the tables of a report, the GPU's after the processor's."""
     rows = [*side_by_side(report)]
     if rows:
-        yield row_table(SIDES, rows, title="On the processor")
+        yield _sides_table("On the processor", rows)
     if "cost" in report:
         yield cost_table(report["cost"])
     if "solvers" in report:
@@ -33,12 +31,16 @@ def tables(report: dict[str, Any]) -> Iterator[Table]:
     cuda = report.get("cuda", {})
     rows = [*side_by_side(cuda)]
     if rows:
-        yield row_table(SIDES, rows, title="On the GPU")
+        yield _sides_table("On the GPU", rows)
     if "solvers" in cuda:
         yield solver_table(cuda["solvers"], "Solvers on the GPU, compared with the processor's dense step")
     if "differences" in cuda:
         differences = [(name, f"{value:.1e}") for name, value in cuda["differences"].items()]
         yield row_table(("result", "relative difference"), differences, title="GPU and processor")
+
+
+def _sides_table(title: str, rows: Sequence[Row]) -> Table:
+    return row_table(("measurement", "figure", "ours", "baseline", "ratio"), rows, title=title)
 
 
 def side_by_side(report: dict[str, Any]) -> Iterator[Row]:

@@ -43,6 +43,11 @@ def add_outputs(parser: argparse.ArgumentParser, picture: str | None = None, opt
         parser.add_argument(option, type=Path, metavar="FILE", help=f"{picture} (PNG); an older file is replaced")
 
 
+def add_data(parser: argparse.ArgumentParser, contents: str, folder: str = "") -> None:
+    """Add --data, a folder of `contents`, by default a folder of the shared data."""
+    parser.add_argument("--data", type=Path, default=shared_data(folder), metavar="DIR", help=f"folder of {contents}")
+
+
 def add_repeat(parser: argparse.ArgumentParser, what: str, default: int = 1) -> None:
     """Add --repeat, a positive number of `what`."""
     parser.add_argument("--repeat", type=positive, default=default, metavar="N", help=f"{what} (default: {default})")

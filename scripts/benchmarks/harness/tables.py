@@ -20,12 +20,14 @@ class Figure:
     label : heading of its row or column
     form : format of the value
     factor : multiplies the value
+    is_length : whether it is a length, for tables that choose the unit by row
     """
 
     key: str
     label: str
     form: str = "{:,.0f}"
     factor: float = 1.0
+    is_length: bool = False
 
     def value(self, record: Mapping[str, Any]) -> Any:
         """Return the figure of a record.

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.export import Neighbourhood, carry
-from gnrecon.export.attributes import COUNT
+from gnrecon.export import Neighbourhood, transfer_attributes
+from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.geometry.colors import to_linear, to_srgb
 from gnrecon.geometry.point_cloud import PointCloud
 
@@ -17,7 +17,7 @@ UTM = np.array([431234.5, 5412345.25, 312.0])
 
 def values(vertices: np.ndarray, points: np.ndarray, **attributes: np.ndarray) -> dict[str, np.ndarray]:
     cloud = PointCloud(points, None, attributes)
-    made, sentences = carry(vertices, cloud, list(attributes), Neighbourhood(points))
+    made, sentences = transfer_attributes(vertices, cloud, list(attributes), Neighbourhood(points))
     assert sentences == []
     assert all(one.origin.endswith("nearest points") for one in made)
     return {one.name: one.values for one in made}
@@ -27,10 +27,11 @@ def slow_weights(place: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Weights of all points at one place, straight from the definition."""
     distances = np.linalg.norm(points - place, axis=1)
     order = np.argsort(distances, kind="stable")
-    edge = distances[order[COUNT]]
-    width = np.sqrt((distances[order[: COUNT + 1]] ** 2 - distances[order[0]] ** 2).mean() / 4)
+    count = ExportParameters.attributes.nearest_points
+    edge = distances[order[count]]
+    width = np.sqrt((distances[order[: count + 1]] ** 2 - distances[order[0]] ** 2).mean() / 4)
     weights = np.zeros(len(points))
-    for row in order[:COUNT]:
+    for row in order[:count]:
         bell = np.exp(-(distances[row] ** 2 - distances[order[0]] ** 2) / (2 * width**2))
         weights[row] = (edge**2 - distances[row] ** 2) * bell
     return weights / weights.sum()
@@ -107,9 +108,9 @@ def test_few_and_coinciding_points_suffice(count: int, copies: int, seed: int) -
 
 def test_text_is_left_behind_and_said_to_be() -> None:
     cloud = PointCloud(np.eye(3), None, {"name": np.array(["a", "b", "c"])})
-    made, sentences = carry(np.eye(3), cloud, ["name"], Neighbourhood(cloud.points))
+    made, sentences = transfer_attributes(np.eye(3), cloud, ["name"], Neighbourhood(cloud.points))
     assert made == []
-    assert sentences == ["The points' attribute 'name' holds no numbers, so it is not carried over."]
+    assert sentences == ["The points' attribute 'name' holds no numbers and was left out."]
 
 
 def test_distances_leave_out_points_that_are_not_finite(rng: np.random.Generator) -> None:

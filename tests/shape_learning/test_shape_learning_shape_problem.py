@@ -12,7 +12,7 @@ from gnrecon.residuals import interface
 from gnrecon.runtime.errors import FitError, UsageError
 from gnrecon.shape_learning import (
     PROBLEMS,
-    Moment,
+    StepState,
     Term,
     at_points,
     circle,
@@ -25,17 +25,20 @@ from gnrecon.shape_learning import (
     rising,
     z_cylinder,
 )
-from gnrecon.shape_learning.shape_problem import LAST, falling, growing
+from gnrecon.shape_learning.learning_parameters import ShapeLearningParameters
+from gnrecon.shape_learning.shape_problem import falling, growing
+
+LAST = ShapeLearningParameters.measurement_step
 
 
-def moment(value: object, box: Box, step: int = 1) -> Moment:
+def moment(value: object, box: Box, step: int = 1) -> StepState:
     def both(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             f = value(x)
             return f.detach(), torch.autograd.grad(f.sum(), x)[0]
 
-    return Moment(step, LevelSet(value, both, box), np.random.default_rng(0))
+    return StepState(step, LevelSet(value, both, box), np.random.default_rng(0))
 
 
 def ball(x: torch.Tensor) -> torch.Tensor:

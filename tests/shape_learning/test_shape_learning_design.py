@@ -12,7 +12,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.io import read_mesh, write_mesh
 from gnrecon.runtime.errors import InputError
-from gnrecon.shape_learning.design import Design, DesignRegion, judge, read_design, solid_pieces
+from gnrecon.shape_learning.design import Design, DesignRegion, measure_design, read_design, solid_pieces
 
 
 def box(*sides: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
@@ -82,16 +82,16 @@ def test_every_interface_has_as_many_points(design: Design, rng: np.random.Gener
 
 
 def test_a_part_that_fills_the_region_keeps_to_it(design: Design, rng: np.random.Generator) -> None:
-    facts = judge(box(40, 20, 20, center=(100, 0, 0)), design, rng)
+    facts = measure_design(box(40, 20, 20, center=(100, 0, 0)), design, rng)
     assert (facts.violations, facts.components) == (0, 1)
     assert facts.mean_attachment < 1e-6
     assert facts.as_dict()["components"] == 1
 
 
-def test_a_part_that_does_not_is_told_by_how_much(design: Design, rng: np.random.Generator) -> None:
+def test_a_part_that_violates_its_design_is_measured(design: Design, rng: np.random.Generator) -> None:
     # Shifted by 2 along x and cut in two: an end of 1 beyond 20, all of one interface at 0.1.
     halves = joined(box(18, 20, 20, center=(91, 0, 0)), box(18, 20, 20, center=(113, 0, 0)))
-    facts = judge(halves, design, rng)
+    facts = measure_design(halves, design, rng)
     assert facts.components == 2
     assert facts.attachment == pytest.approx((0.1, 0.1), abs=1e-6)
     outside = (400 + 4 * 20 * (2 - 0.02)) / (2 * (2 * 400 + 4 * 18 * 20))
@@ -150,7 +150,7 @@ def test_the_sample_problem_is_sound(repository: Path, rng: np.random.Generator)
     # All of them are on the border of the region, and look out of it: into their holes.
     assert np.abs(design.region.distance(walls.points)).max() < 2e-3
     assert (design.region.distance(walls.points + 0.02 * walls.normals) > 0.015).all()
-    facts = judge(read_mesh(data / "design_region.stl"), design, rng)
+    facts = measure_design(read_mesh(data / "design_region.stl"), design, rng)
     assert (facts.violations, facts.components) == (0, 1)
 
 

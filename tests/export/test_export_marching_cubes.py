@@ -8,9 +8,10 @@ from analytic_fields import UNIT, UTM, Field, plate, shells, sines, sphere, toru
 from skimage.measure import marching_cubes
 
 from gnrecon.export import extract, project, require_sound, verify
+from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.lattice import Lattice
-from gnrecon.export.marching_cubes import Growing, Leaves
-from gnrecon.export.sparse_grid import NUDGE, narrow_band
+from gnrecon.export.leaf_storage import GrowingArray, LeafStore
+from gnrecon.export.sparse_grid import narrow_band
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.runtime.errors import MeshError, UsageError
 
@@ -32,7 +33,8 @@ def test_the_narrow_band_gives_the_whole_grids_surface(name: str) -> None:
     lattice = Lattice.over(field, 64, None, 65536)
     nodes = np.stack(np.meshgrid(*[np.arange(n + 1) for n in lattice.cells], indexing="ij"), axis=-1)
     values = lattice.values(nodes.reshape(-1, 3), narrow_band(lattice).slope).reshape(nodes.shape[:3])
-    values = np.where(np.abs(values) < NUDGE, np.where(values < 0, -NUDGE, NUDGE), values)
+    least = ExportParameters.extraction.least_node_cells
+    values = np.where(np.abs(values) < least, np.where(values < 0, -least, least), values)
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
     expected = lattice.world(vertices.astype(np.float64))
     assert len(mesh.faces) == len(faces)
@@ -233,13 +235,13 @@ def test_cost_grows_with_the_surface() -> None:
     assert kept[2] / kept[1] == pytest.approx(4, rel=0.2)
 
 
-def test_leaves_keep_what_they_are_told() -> None:
-    leaves = Leaves(np.array([2, 1, 3]), 8.0)
+def test_leaves_hold_the_values_that_were_stored() -> None:
+    leaves = LeafStore(np.array([2, 1, 3]), 8.0)
     assert not len(leaves.mixed_chunks())
     leaves.mark_inside(np.array([[0, 0, 1]]), 32)
     leaves.mark_inside(np.array([[2, 0, 0]]), 16)
     values = np.arange(2 * 64, dtype=np.float32).reshape(2, 4, 4, 4)
-    leaves.keep(np.array([[8, 1, 0], [3, 3, 3]]), values)
+    leaves.store(np.array([[8, 1, 0], [3, 3, 3]]), values)
     assert len(leaves) == 2
     first, second = (leaves.nodes(leaves.rows(np.array(chunk))) for chunk in ((0, 0, 0), (1, 0, 0)))
     assert np.array_equal(first[12:16, 12:16, 12:16], values[1])
@@ -252,7 +254,7 @@ def test_leaves_keep_what_they_are_told() -> None:
 
 
 def test_rows_are_appended_to_what_grows() -> None:
-    rows = Growing(np.zeros((1, 2), dtype=np.int32))
+    rows = GrowingArray(np.zeros((1, 2), dtype=np.int32))
     for count in (1, 5, 1, 300):
         start = len(rows.rows)
         new = np.full((count, 2), count, dtype=np.int32)

@@ -15,7 +15,7 @@ from gnrecon.residuals import eikonal, gauss_curvature, interface, mean_curvatur
 from gnrecon.shape_learning import LearnedField, cube
 from gnrecon.shape_learning.frozen_points import FrozenProblem, FrozenTerm
 from gnrecon.shape_learning.learn import pretrained
-from gnrecon.shape_learning.shape_problem import Moment, ShapeProblem, on_surface, z_cylinder
+from gnrecon.shape_learning.shape_problem import ShapeProblem, StepState, on_surface, z_cylinder
 
 F64 = torch.float64
 NETWORK = Network((6, 5))
@@ -27,7 +27,7 @@ def tube() -> tuple[Tensor, Tensor]:
     problem = ShapeProblem("tube", (), cube(1.0), z_cylinder(0.6), NETWORK)
     rng = np.random.default_rng(0)
     theta = pretrained(problem, 0, rng)
-    drawn = on_surface(40, nodes=8000)(Moment(1, problem.level_set(theta), rng))
+    drawn = on_surface(40, nodes=8000)(StepState(1, problem.level_set(theta), rng))
     assert drawn.on_surface
     assert float(NETWORK.value(theta, drawn.points).abs().max()) < 1e-10
     return theta, drawn.points

@@ -10,9 +10,9 @@ from gnrecon.export import extract, project
 from gnrecon.export.resolution import (
     cells_for_edges,
     chord_error,
-    error_once_projected,
-    finer,
     measure_fineness,
+    projected_chord_error,
+    refined_resolution,
 )
 from gnrecon.runtime.errors import UsageError
 
@@ -71,7 +71,7 @@ def test_the_error_is_known_before_the_mesh_is_projected() -> None:
     field = Field(torus())
     # A coarse copy of the field, as single precision may be one, puts vertices off the surface.
     rough = extract(Field(torus(minor=0.21)), resolution=32)
-    before = error_once_projected(rough, field, 32, field.bounds)
+    before = projected_chord_error(rough, field, 32, field.bounds)
     assert before == pytest.approx(chord_error(project(rough, field, steps=2), field, field.bounds, 2.2 / 32), rel=0.05)
     assert before < 0.9 * chord_error(rough, field, field.bounds, 2.2 / 32)
 
@@ -88,11 +88,12 @@ def test_caps_have_no_chord_error() -> None:
 
 
 def test_the_next_resolution_follows_the_square_law() -> None:
-    assert finer(100, 4e-3, 1e-3) == 221
-    assert finer(100, 1.01e-3, 1e-3) == 120
-    assert finer(100, 1.0, 1e-9) == 300
+    assert refined_resolution(100, 4e-3, 1e-3) == 221
+    assert refined_resolution(100, 1.01e-3, 1e-3) == 120
+    assert refined_resolution(100, 1.0, 1e-9) == 300
     field = Field(torus())
     errors = [
-        error_once_projected(extract(field, resolution=n), field, n, field.bounds) for n in (32, finer(32, 1.0, 0.3))
+        projected_chord_error(extract(field, resolution=n), field, n, field.bounds)
+        for n in (32, refined_resolution(32, 1.0, 0.3))
     ]
     assert errors[1] < 0.3 * errors[0] * 1.2

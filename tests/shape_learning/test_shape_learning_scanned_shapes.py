@@ -12,7 +12,10 @@ from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import Iterative, NeighbourSums
 from gnrecon.level_set import LevelSet
 from gnrecon.shape_learning import ScannedSurface, learn, scanned
-from gnrecon.shape_learning.shape_problem import LAST, Drawn, Moment
+from gnrecon.shape_learning.learning_parameters import ShapeLearningParameters
+from gnrecon.shape_learning.shape_problem import SampledPoints, StepState
+
+LAST = ShapeLearningParameters.measurement_step
 
 
 def ball(count: int = 300) -> Samples:
@@ -67,7 +70,7 @@ def test_the_free_space_is_let_go_once_the_points_determine_the_network(
         return torch.where((x > 0.7).all(1), -1.0, near) + error
 
     level_set = LevelSet(values, lambda x: (values(x), torch.zeros_like(x)), problem.box)
-    drawn = sampler(Moment(step, level_set, np.random.default_rng(0)))
+    drawn = sampler(StepState(step, level_set, np.random.default_rng(0)))
     assert (len(drawn.points) > 0) == held
 
 
@@ -75,9 +78,9 @@ def test_the_free_space_is_asked_for_where_the_field_has_lost_its_sign() -> None
     problem = scanned(ball(400))
     (free,) = (term for term in problem.terms if term.name == "free space")
 
-    def drawn(value: Callable[[torch.Tensor], torch.Tensor]) -> Drawn:
+    def drawn(value: Callable[[torch.Tensor], torch.Tensor]) -> SampledPoints:
         level_set = LevelSet(value, lambda x: (value(x), torch.zeros_like(x)), problem.box)
-        return free.sampler(Moment(1, level_set, np.random.default_rng(0)))
+        return free.sampler(StepState(1, level_set, np.random.default_rng(0)))
 
     axes = torch.tensor([0.9, 0.7, 0.6], dtype=torch.float64)
     right = drawn(lambda x: (x / axes).norm(dim=1) - 1)
@@ -110,7 +113,7 @@ def test_what_was_lost_once_is_looked_at_again_until_the_next_run() -> None:
 
     def lost(step: int, value: Callable[[torch.Tensor], torch.Tensor], seed: int) -> set[tuple[float, ...]]:
         level_set = LevelSet(value, lambda x: (value(x), torch.zeros_like(x)), problem.box)
-        drawn = free.sampler(Moment(step, level_set, np.random.default_rng(seed)))
+        drawn = free.sampler(StepState(step, level_set, np.random.default_rng(seed)))
         return {tuple(point) for point in drawn.points.tolist()}
 
     def inverted(x: torch.Tensor) -> torch.Tensor:
@@ -141,7 +144,7 @@ def test_points_as_a_surface() -> None:
 def test_neighbours_come_together_for_the_solver() -> None:
     problem = scanned(ball(2000))
     drawn = next(term for term in problem.terms if term.name == "interface").sampler(
-        Moment(
+        StepState(
             5, problem.level_set(problem.network.initial(torch.Generator().manual_seed(0))), np.random.default_rng(0)
         )
     )

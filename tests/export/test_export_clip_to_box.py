@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gnrecon.export import require_bordered
-from gnrecon.export.trim import clip
+from gnrecon.export.trim import clip_to_box
 from gnrecon.geometry.mesh import Mesh
 
 
@@ -26,7 +26,7 @@ def grid(cells: int) -> Mesh:
 @pytest.mark.parametrize("upper", [0.05, 0.3, 0.77])
 def test_a_ball_is_cut_by_a_plane(upper: float) -> None:
     bounds = np.array([[-2.0, -2.0, -2.0], [2.0, 2.0, upper]])
-    part = clip(ball(), bounds)
+    part = clip_to_box(ball(), bounds)
     facts = require_bordered(part)
     assert facts.components == 1
     assert facts.euler_characteristic == 1
@@ -38,7 +38,7 @@ def test_a_ball_is_cut_by_a_plane(upper: float) -> None:
 
 
 def test_two_sides_leave_a_ring() -> None:
-    part = clip(ball(), np.array([[-2.0, -0.4, -2.0], [2.0, 0.4, 2.0]]))
+    part = clip_to_box(ball(), np.array([[-2.0, -0.4, -2.0], [2.0, 0.4, 2.0]]))
     facts = require_bordered(part)
     assert facts.euler_characteristic == 0
     assert facts.area == pytest.approx(2 * np.pi * 0.8, rel=0.01)
@@ -46,7 +46,7 @@ def test_two_sides_leave_a_ring() -> None:
 
 def test_sides_on_the_lattice_cut_no_face() -> None:
     whole = grid(8)
-    part = clip(whole, np.array([[-0.5, -0.5, -1.0], [0.5, 0.5, 1.0]]))
+    part = clip_to_box(whole, np.array([[-0.5, -0.5, -1.0], [0.5, 0.5, 1.0]]))
     require_bordered(part)
     np.testing.assert_allclose(part.vertices[:, :2].min(axis=0), -0.5, atol=1e-12)
     np.testing.assert_allclose(part.vertices[:, :2].max(axis=0), 0.5, atol=1e-12)
@@ -57,10 +57,10 @@ def test_sides_on_the_lattice_cut_no_face() -> None:
 
 def test_a_mesh_inside_is_left_as_it_is() -> None:
     whole = ball(2)
-    part = clip(whole, np.array([[-2.0] * 3, [2.0] * 3]))
+    part = clip_to_box(whole, np.array([[-2.0] * 3, [2.0] * 3]))
     np.testing.assert_array_equal(part.vertices, whole.vertices)
     np.testing.assert_array_equal(part.faces, whole.faces)
 
 
 def test_nothing_inside_is_nothing() -> None:
-    assert len(clip(ball(2), np.array([[3.0] * 3, [4.0] * 3])).faces) == 0
+    assert len(clip_to_box(ball(2), np.array([[3.0] * 3, [4.0] * 3])).faces) == 0

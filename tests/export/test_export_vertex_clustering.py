@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, sphere, union
+from analytic_fields import UTM, Field, ball_mesh, sphere, union
 
-from gnrecon.export import extract, lighten, project
+from gnrecon.export import decimate_by_clustering, extract, project
 from gnrecon.export.remeshing.decimate import barycentric
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.rendering import vertex_sky
+from gnrecon.rendering import vertex_ambient_occlusion
 
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    field = Field(sphere(), frame=UTM)
-    mesh = project(extract(field, resolution=48), field)
+    mesh = ball_mesh(resolution=48)
     unit = UTM.to_unit(mesh.vertices)
     colors = np.uint8(np.round(127 + 100 * unit))
     return mesh.with_attributes({"height": unit[:, 2], "colors": colors, "label": np.int32(unit[:, 0] > 0)})
 
 
 def test_a_light_copy_has_few_faces_and_lies_on_the_surface(ball: Mesh) -> None:
-    light = lighten(ball, 1000)
+    light = decimate_by_clustering(ball, 1000)
     assert len(light.faces) <= 1000
     unit = UTM.to_unit(light.vertices)
     assert np.abs(np.linalg.norm(unit, axis=1) - 0.8).max() < 0.01
@@ -33,7 +32,7 @@ def test_a_light_copy_has_few_faces_and_lies_on_the_surface(ball: Mesh) -> None:
 
 
 def test_attributes_follow_in_their_types(ball: Mesh) -> None:
-    light = lighten(ball, 1000)
+    light = decimate_by_clustering(ball, 1000)
     unit = UTM.to_unit(light.vertices)
     assert np.abs(light.attributes["height"] - unit[:, 2]).max() < 0.01
     assert light.attributes["colors"].dtype == np.uint8
@@ -43,13 +42,13 @@ def test_attributes_follow_in_their_types(ball: Mesh) -> None:
 
 
 def test_a_light_mesh_is_left_alone(ball: Mesh) -> None:
-    assert lighten(ball, len(ball.faces)) is ball
+    assert decimate_by_clustering(ball, len(ball.faces)) is ball
 
 
 def test_the_open_side_of_a_ball_sees_the_sky_and_the_gap_does_not() -> None:
     field = Field(union(sphere(0.4, (-0.42, 0, 0)), sphere(0.4, (0.42, 0, 0))), frame=UTM)
     mesh = project(extract(field, resolution=48), field)
-    sky = vertex_sky(mesh)
+    sky = vertex_ambient_occlusion(mesh)
     across = np.abs(UTM.to_unit(mesh.vertices)[:, 0])
     assert sky.shape == (len(mesh.vertices),)
     assert sky[across > 0.75].min() > 0.97

@@ -14,11 +14,14 @@ from gnrecon.field import Network
 from gnrecon.field.layers import WAVELET
 from gnrecon.level_set import LevelSet
 from gnrecon.shape_learning import ShapeProblem, bracket, learn
-from gnrecon.shape_learning import part_problem as part
 from gnrecon.shape_learning.design import Design, read_design
 from gnrecon.shape_learning.learn import pretrained
-from gnrecon.shape_learning.shape_problem import LAST, Drawn, Moment
+from gnrecon.shape_learning.learning_parameters import ShapeLearningParameters
+from gnrecon.shape_learning.shape_problem import SampledPoints, StepState
 
+LAST = ShapeLearningParameters.measurement_step
+
+part = ShapeLearningParameters.part
 SMALL = Network((8, 8), WAVELET, (6.0, 2.0))
 
 
@@ -39,7 +42,7 @@ def balls(x: torch.Tensor) -> torch.Tensor:
     return (x[:, None] - centers).norm(dim=2).amin(1) - 0.1
 
 
-def moment(problem: ShapeProblem, step: int, shift: float = 0.0) -> Moment:
+def moment(problem: ShapeProblem, step: int, shift: float = 0.0) -> StepState:
     def value_and_gradient(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         with torch.enable_grad():
             leaf = x.detach().requires_grad_()
@@ -48,23 +51,23 @@ def moment(problem: ShapeProblem, step: int, shift: float = 0.0) -> Moment:
         return value.detach(), gradient
 
     level_set = LevelSet(lambda x: balls(x) + shift, value_and_gradient, problem.box)
-    return Moment(step, level_set, np.random.default_rng(0))
+    return StepState(step, level_set, np.random.default_rng(0))
 
 
-def drawn(problem: ShapeProblem, name: str, when: Moment) -> Drawn:
+def drawn(problem: ShapeProblem, name: str, when: StepState) -> SampledPoints:
     (term,) = (term for term in problem.terms if term.name == name)
     return term.sampler(when)
 
 
-def test_what_is_to_be_free_is_outside_or_just_within(problem: ShapeProblem, design: Design) -> None:
+def test_points_to_be_kept_free_are_outside_or_just_inside(problem: ShapeProblem, design: Design) -> None:
     found = drawn(problem, "design region", moment(problem, 1, shift=-0.5))
     distance = design.region.distance(found.points.numpy())
-    assert distance.min() > -1.1 * part.MARGIN
+    assert distance.min() > -1.1 * part.layer_depth
     assert 0.02 < (distance < 0).mean() < 0.3
     # Half the distance is the least value, and the others are farther from the part than a step will take it.
     assert found.target is not None
     np.testing.assert_allclose(found.target, np.maximum(distance, 0) / 2, atol=1e-6)
-    assert (balls(found.points) - 0.5 - found.target < part.ACTIVE).all()
+    assert (balls(found.points) - 0.5 - found.target < part.active_value).all()
     assert 0.1 < found.share < 1
 
 
@@ -74,7 +77,7 @@ def test_the_layer_within_the_border_leaves_the_interfaces_alone(problem: ShapeP
     walls = design.interfaces.sample(6000, np.random.default_rng(1)).points
     nearest = np.linalg.norm(found[:, None] - walls[None, ::3], axis=2).min(axis=1)
     inside = -design.region.distance(found)
-    assert (inside < part.THINNER * nearest + 1e-3).all()
+    assert (inside < part.layer_depth_per_interface_distance * nearest + 1e-3).all()
 
 
 def test_the_strain_is_that_of_the_free_surface(problem: ShapeProblem, design: Design) -> None:
@@ -118,13 +121,13 @@ def test_clipping_begins_far_above_its_maximum(design: Design) -> None:
     assert maxima == pytest.approx([50 * 99.0, 50 * 100 * 0.99**100, 50.0, 50.0])
 
 
-def test_the_start_is_the_region_worn_off_but_at_the_interfaces(problem: ShapeProblem, design: Design) -> None:
+def test_the_start_is_the_region_eroded_except_at_the_interfaces(problem: ShapeProblem, design: Design) -> None:
     walls = design.interfaces.sample(2000, np.random.default_rng(2)).points
     np.testing.assert_allclose(problem.start(torch.as_tensor(walls)), design.region.distance(walls), atol=2e-3)
     points = design.region.around(5000, np.random.default_rng(3))
     off = cKDTree(design.interfaces.sample(30_000, np.random.default_rng(2)).points).query(points)[0]
     worn = problem.start(torch.as_tensor(points)).numpy() - design.region.distance(points)
-    np.testing.assert_allclose(worn[off > 0.1], part.EROSION, atol=1e-6)
+    np.testing.assert_allclose(worn[off > 0.1], part.erosion_depth, atol=1e-6)
     assert (worn > -1e-6).all()
 
 
@@ -137,15 +140,12 @@ def test_pretraining_brings_the_part_to_its_interfaces(design: Design) -> None:
     assert away < 0.2 * plainly
 
 
-def test_a_few_steps_bring_the_part_nearer_to_its_design(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(part, "FIRST_STEPS", 10)
-    monkeypatch.setattr(part, "POOL", 30_000)
-    monkeypatch.setattr(part, "AROUND", 2000)
-    monkeypatch.setattr(part, "CELLS", 32)
-    learned = learn(bracket(design, network=SMALL), budget=None, steps=3)
+def test_a_few_steps_bring_the_part_nearer_to_its_design(design: Design) -> None:
+    quick = replace(part, pretraining_steps=10, pool_points=30_000, region_points=2000, component_cells=32)
+    learned = learn(bracket(design, network=SMALL, parameters=quick), budget=None, steps=3)
     first, last = learned.history[0], learned.best
     assert last.loss < 0.9 * first.loss
     assert set(last.shares) == {"design region", "interface", "normal", "surface strain", "connectedness", "eikonal"}
-    # What is computed beside the steps does not make a run depend on how busy the machine is.
-    again = learn(bracket(design, network=SMALL), budget=None, steps=3)
+    # Work in parallel to the steps does not make a run depend on the load of the machine.
+    again = learn(bracket(design, network=SMALL, parameters=quick), budget=None, steps=3)
     assert torch.equal(again.field.theta, learned.field.theta)

@@ -1,4 +1,4 @@
-"""Units that are taken away: what the field is without them, which one goes, and runs that begin wider."""
+"""Removing units: the field without them, which one is removed, and runs that start wider."""
 
 from __future__ import annotations
 
