@@ -15,11 +15,10 @@ from scipy.spatial import cKDTree
 
 from gnrecon.export.metrics import ray_scene
 from gnrecon.geometry.arrays import Float
-from gnrecon.geometry.colors import as_bytes
-from gnrecon.geometry.colors import to_linear as to_light
+from gnrecon.geometry.colors import as_bytes, to_linear
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, shade, to_bytes, to_linear
+from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, gamma_decoded, gamma_encoded, shade
 from gnrecon.rendering.rendering_parameters import RenderingParameters, SheetParameters
 from gnrecon.runtime.errors import UsageError
 
@@ -72,10 +71,10 @@ def render(
         raise UsageError("There is nothing to draw: give a mesh or points, and a view.")
     if size[0] < panels or size[1] < 1:
         raise UsageError(f"A picture of {size[0]} x {size[1]} pixels has no room for {panels} panels.")
-    strips = _draw_panels(shown, views, up, size, (to_linear(color), to_linear(point_color)))
+    strips = _draw_panels(shown, views, up, size, (gamma_decoded(color), gamma_decoded(point_color)))
     samples = RenderingParameters.supersampling
     light = np.concatenate(strips, axis=1)
-    image: Image = to_bytes(light.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3)))
+    image: Image = gamma_encoded(light.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3)))
     if path is not None:
         write_image(image, Path(path))
     return image
@@ -133,7 +132,7 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float, *, samples: int = Rende
     normals = np.einsum("ij,ijk->ik", shares, mesh.vertex_normals().astype(np.float32)[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-9))
     if "colors" in mesh.attributes:
-        light = to_light(as_bytes(mesh.attributes["colors"])[:, :3])
+        light = to_linear(as_bytes(mesh.attributes["colors"])[:, :3])
         color = np.einsum("ij,ijk->ik", shares, light.astype(np.float32)[corners])
     # Occlusion is computed once per pixel and not per sample: it varies slowly, and costs most.
     coarse = np.zeros_like(hit)

@@ -1,4 +1,4 @@
-"""Boxes and clipping planes: which points they keep, in memory, while files are read, and on the command line."""
+"""Boxes and clipping planes select points in memory, while files are read, and on the command line."""
 
 from __future__ import annotations
 

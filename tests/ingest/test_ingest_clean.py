@@ -1,4 +1,4 @@
-"""What is dropped, for which reason, and what is refused."""
+"""Cleaning: what is dropped, the counts by reason, and what is refused."""
 
 from __future__ import annotations
 

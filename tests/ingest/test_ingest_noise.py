@@ -1,4 +1,4 @@
-"""Noise that is known is told to within a few per cent, on dense and on sparse clouds, and none where there is none."""
+"""Noise is estimated to within a few per cent, on dense and on sparse clouds, and is zero on exact ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Isolated clusters, scans that are there twice, and the outlier rules that are in wide use."""
+"""Isolated clusters, repeated scans, and the two usual outlier rules."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere
+from made_shapes import sphere
 
 import gnrecon.ingest
 from gnrecon.geometry.point_cloud import PointCloud

@@ -1,4 +1,4 @@
-"""Thinning keeps real points, as many as asked for, reproducibly; and the two even methods are even."""
+"""Thinning keeps the requested number of real points, reproducibly; and the two even methods are even."""
 
 from __future__ import annotations
 

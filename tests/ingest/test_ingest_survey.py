@@ -1,4 +1,4 @@
-"""The facts of clouds that are known: their noise, their normals' state, and their borders."""
+"""The survey of known clouds: noise, state of the normals, and borders."""
 
 from __future__ import annotations
 

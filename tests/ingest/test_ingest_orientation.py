@@ -1,4 +1,4 @@
-"""Normals by where the scanner stood, and what is done with those that a cloud has."""
+"""Normals oriented by scanner positions, and how given normals are treated."""
 
 from __future__ import annotations
 

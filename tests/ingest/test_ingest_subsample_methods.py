@@ -1,4 +1,4 @@
-"""Farthest points, curvature, distances in spacings, and points that are kept from the fit."""
+"""Farthest points, curvature, distances in spacings, and validation points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layers that are there are found, with their distance; noise, edges, thin walls and steps are none."""
+"""Double layers are found, with their distance; noise, edges, thin walls and steps are not taken for them."""
 
 from __future__ import annotations
 
