@@ -14,7 +14,7 @@ import gnrecon.fit
 from gnrecon.fit import FitOptions, parameters
 from gnrecon.fit.consistency import find_outliers
 from gnrecon.fit.local_fields import cube_length
-from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.objective import normal_weight
 from gnrecon.fit.parameters import FitParameters, LocalFieldParameters, OutlierParameters, SingleNetworkParameters
 from gnrecon.geometry.arrays import Float
@@ -51,9 +51,9 @@ def test_the_whole_holds_every_group() -> None:
 
 
 def test_a_cube_of_sparse_points_is_as_long_as_the_limit_says() -> None:
-    belief, disks = Belief(0.1, 1e-3, 0.05), np.full(5, 10.0)
-    assert cube_length(belief, disks, 1.0) == pytest.approx(0.1 * LocalFieldParameters.most_length_stretch)
-    assert cube_length(belief, disks, 1.0, most_length_stretch=2.0) == pytest.approx(0.2)
+    hyperparameters, disks = Hyperparameters(0.1, 1e-3, 0.05), np.full(5, 10.0)
+    assert cube_length(hyperparameters, disks, 1.0) == pytest.approx(0.1 * LocalFieldParameters.most_length_stretch)
+    assert cube_length(hyperparameters, disks, 1.0, most_length_stretch=2.0) == pytest.approx(0.2)
 
 
 def test_the_default_thresholds_find_the_outliers() -> None:
