@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from gnrecon.export import extract, project
+from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
 
-Float = npt.NDArray[np.float64]
 Function = Callable[[Float], Float]
 
 UNIT = Frame(np.zeros(3), 1.0)
@@ -43,6 +44,12 @@ class Field:
 
 def sphere(radius: float = 0.8, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Function:
     return lambda x: np.linalg.norm(x - np.array(center), axis=1) - radius
+
+
+def ball_mesh(radius: float = 0.8, frame: Frame = UTM, resolution: int = 24, reach: float = 1.1) -> Mesh:
+    """A sphere's mesh, its vertices projected onto the sphere."""
+    field = Field(sphere(radius), reach, frame)
+    return project(extract(field, resolution=resolution), field)
 
 
 def torus(major: float = 0.6, minor: float = 0.2) -> Function:

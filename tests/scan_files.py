@@ -11,10 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import made_shapes
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from gnrecon.geometry.arrays import Float
 
 TUBE = 0.3
 TORUS_VOLUME = 2 * np.pi**2 * TUBE**2
@@ -31,28 +31,9 @@ main()
 """
 
 
-def sphere(count: int, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Points and normals, uniform on the unit sphere."""
-    points = rng.normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return points, points
-
-
 def torus(count: int, rng: np.random.Generator) -> tuple[Float, Float]:
     """Points and normals on a torus around z, of radius 1 and tube `TUBE`."""
-    u, v = rng.uniform(0, 2 * np.pi, (2, count))
-    normals = np.column_stack([np.cos(u) * np.cos(v), np.sin(u) * np.cos(v), np.sin(v)])
-    return np.column_stack([np.cos(u), np.sin(u), np.zeros(count)]) + TUBE * normals, normals
-
-
-def box(count: int, rng: np.random.Generator, sides: tuple[float, float, float]) -> tuple[Float, Float]:
-    """Points and normals, uniform on a box around the origin."""
-    half = np.array(sides) / 2
-    areas = half[[1, 2, 0]] * half[[2, 0, 1]]
-    axis, sign = rng.choice(3, count, p=areas / areas.sum()), rng.choice([-1.0, 1.0], count)
-    points, normals, rows = rng.uniform(-half, half, (count, 3)), np.zeros((count, 3)), np.arange(count)
-    points[rows, axis], normals[rows, axis] = sign * half[axis], sign
-    return points, normals
+    return made_shapes.torus(count, rng, 1.0, TUBE)
 
 
 def write_scan(path: Path, points: Float, normals: Float) -> Path:

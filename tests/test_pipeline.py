@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scan_files import FAST, TORUS_VOLUME, TUBE, box, gnrecon, sphere, torus, write_scan
+from made_shapes import box, sphere
+from scan_files import FAST, TORUS_VOLUME, TUBE, gnrecon, torus, write_scan
 from scipy.spatial.transform import Rotation
 
 from gnrecon.export import measure

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scan_files import sphere
+from made_shapes import sphere
 
 from gnrecon.export import require_sound
 from gnrecon.fit import NeuralSDF

@@ -49,6 +49,7 @@ def crop(mesh: Mesh, box: Float, *, snap_sizes: float = 1e-9) -> Mesh:
     part = _mesh_of(to_solid(mesh, merge=False) ^ block, mesh)
     if part is None:
         raise MeshError("Nothing of the shape lies in the crop box.")
+    # Scaling back rounds: vertices of the cut are put onto the sides of the box exactly.
     vertices = part.vertices.copy()
     on_cap = np.zeros(len(vertices), dtype=bool)
     for side in (low, high):
@@ -67,12 +68,14 @@ def subtract(outer: Mesh, inner: Mesh) -> Mesh:
         When nothing is left.
     """
     centre, size = centre_and_size(outer)
+    # Both solids in the outer one's centred coordinates.
     moved = to_solid(inner, merge=False)
     inner_centre, inner_size = centre_and_size(inner)
     moved = moved.scale([inner_size / size] * 3).translate(((inner_centre - centre) / size).tolist())
     rest = _mesh_of(to_solid(outer, merge=False) - moved, outer)
     if rest is None:
         raise MeshError("Nothing is left of the solid.")
+    # Inner walls face the other way once the inner solid is taken away.
     walls = Mesh(
         np.concatenate([outer.vertices, inner.vertices]),
         np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]),

@@ -127,6 +127,8 @@ def short_loops(
 def _edge_signatures(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator) -> Signatures:
     """Return each edge's signature, of shape (E,), from its ends and its two faces, each of shape (E, 2)."""
     count, size = len(mesh.vertices), len(mesh.faces)
+    # A spanning tree of the vertices first, and then one of the faces that crosses none of its edges. What is left are
+    # the 2 g edges that close the generators. Edges are numbered from 1, because 0 means no entry in a sparse matrix.
     left: Mask = np.ones(len(ends), dtype=bool)
     left[minimum_spanning_tree(_links(ends, count)).tocoo().data.astype(np.int64) - 1] = False
     across = _links(np.where(left[:, None], faces, 0), size)
@@ -137,6 +139,7 @@ def _edge_signatures(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator
         edge[1:] = np.asarray(across[order[1:], parent[order[1:]]]).reshape(-1) - 1
         left[edge[1:]] = False
         walks.append((order, parent[order], edge))
+    # Each edge that is left crosses its own generator only: its signature is that generator's random word.
     rows = np.flatnonzero(left)
     signatures = np.zeros(len(ends), dtype=np.uint64)
     signatures[rows] = rng.integers(1, 2**64, len(rows), dtype=np.uint64)
@@ -161,6 +164,7 @@ def _links(pairs: Int, count: int) -> csr_array:
 
 def _thin(places: Float, rows: Int, longest: Float, spacing: float) -> Int:
     """Return some of the rows, one in each cube, whose edge is about `spacing` longest lengths."""
+    # The cubes' edges are powers of two, so that neighbouring vertices with similar lengths share one grid.
     octave = np.floor(np.log2(spacing * longest[rows]))
     cube = np.floor(places[rows] / np.exp2(octave)[:, None])
     return rows[np.unique(np.column_stack([octave, cube]), axis=0, return_index=True)[1]]
@@ -168,6 +172,7 @@ def _thin(places: Float, rows: Int, longest: Float, spacing: float) -> Int:
 
 def _shortest_through(graph: _Graph, tree: cKDTree, sources: Int, longest: Float) -> list[Loop]:
     """Return the shortest loop through each source that does not separate the surface, where there is one."""
+    # No vertex of a loop is farther from its source, in a straight line, than half the loop's length.
     near = tree.query_ball_point(graph.vertices[sources], longest[sources] / 2)
     block = np.repeat(np.arange(len(sources)), [len(rows) for rows in near])
     vertex = np.concatenate([np.sort(rows) for rows in near]).astype(np.int64)
@@ -184,12 +189,15 @@ def _shortest_through(graph: _Graph, tree: cKDTree, sources: Int, longest: Float
     reached = np.isfinite(far)
     signatures = _path_signatures(copy, other, graph.signatures[edge], before)
     length = far[copy] + far[other] + graph.lengths[edge]
+    # An edge between two paths of one source closes a loop. It does not separate the surface where the signatures along
+    # it do not cancel.
     closes = (
         reached[copy]
         & (signatures[copy] ^ signatures[other] != graph.signatures[edge])
         & (length <= longest[sources[block[copy]]])
     )
     rows = np.flatnonzero(closes)
+    # The shortest of each source.
     rows = rows[np.lexsort([length[rows], block[copy[rows]]])]
     rows = rows[np.unique(block[copy[rows]], return_index=True)[1]]
     crossed = signatures[copy[rows]] ^ signatures[other[rows]] ^ graph.signatures[edge[rows]]
@@ -206,6 +214,7 @@ def _path_signatures(copy: Int, other: Int, signatures: Signatures, before: Int)
     found = np.zeros(len(before), dtype=np.uint64)
     last = before[other] == copy
     found[other[last]] = signatures[last]
+    # Pointer jumping: each pass doubles the part of the path that is summed, so that a few passes are enough.
     jump = np.where(before < 0, np.arange(len(before)), before)
     while True:
         further = jump[jump]

@@ -133,7 +133,10 @@ class AttributeParameters:
 
 @dataclass(frozen=True)
 class ExportParameters:
-    """All numbers that tune meshing, by method."""
+    """All numbers that tune meshing, by method.
+
+    `mesh_field` passes extraction, resolution, handles and remesh on. The others are the defaults of their functions.
+    """
 
     extraction: ExtractionParameters = ExtractionParameters()
     resolution: ResolutionParameters = ResolutionParameters()

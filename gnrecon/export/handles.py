@@ -64,6 +64,7 @@ def remove_handles(mesh: Mesh, points: Float, *, parameters: HandleParameters | 
     require_sound(mesh)
     if len(points) < 2:
         return mesh, []
+    # The random words only tell classes apart, so that a fixed seed gives the same mesh each time.
     support, rng = _PointSupport(points, parameters or ExportParameters.handles), np.random.default_rng(0)
     mesh, lengths = _cut_uncovered_loops(mesh, support, rng)
     mesh, more = _cut_unsupported_necks(mesh, support, rng)
@@ -99,6 +100,7 @@ def _cut_unsupported_necks(mesh: Mesh, support: _PointSupport, rng: np.random.Ge
     lengths: list[float] = []
     for _ in range(support.parameters.rounds):
         away, disks = support.nearest(mesh)
+        # Only vertices without a point near: these loops may be long, and would cut real rods otherwise.
         unseen = away > support.parameters.near_disks * disks
         if not unseen.any():
             break
@@ -201,12 +203,14 @@ def _is_neck(mesh: Mesh, normals: Float, loop: Loop) -> bool:
 def _independent(mesh: Mesh, loops: Sequence[Loop], most: int) -> list[Loop]:
     """Return at most so many of the shortest loops without common neighbours that together do not separate the mesh."""
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
+    # Loops without common neighbours can be cut at once, since the caps of one do not touch those of another.
     table = csr_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(mesh.vertices),) * 2)
     used = np.zeros(len(mesh.vertices), dtype=bool)
     basis: list[int] = []
     kept = []
     for loop in loops:
         signature = loop.signature
+        # Gaussian elimination over Z/2, with the basis in descending order: zero is left of what depends on it.
         for one in basis:
             signature = min(signature, signature ^ one)
         around = np.append(loop.vertices, table[loop.vertices].indices)

@@ -135,12 +135,14 @@ class Lattice:
         if not np.isfinite(values).all():
             count = np.count_nonzero(~np.isfinite(values))
             raise MeshError(f"The field is not finite at {count} of {values.size} points.")
+        # Cells to the nearest side of the box; negative beyond it.
         depth = np.minimum(nodes, self.cells - nodes).min(axis=-1)
         closed: Float = np.maximum(values / (self.field.frame.scale * self.cell * slope), 0.5 - depth)
         return closed
 
     def gradients(self, nodes: npt.NDArray[np.floating] | Int) -> Float:
         """Gradient of the field, of shape (N, 3), at lattice coordinates of shape (N, 3)."""
+        # Centres of border blocks may be beyond the box, where the field is not evaluated.
         inside = np.clip(nodes, 0, self.cells)
         out = np.empty((len(nodes), 3))
         for rows in slices(len(nodes), self.batch):

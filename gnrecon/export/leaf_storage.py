@@ -77,6 +77,7 @@ class LeafStore:
     ) -> None:
         self.leaf_cells, self.chunk_cells = leaf_cells, chunk_cells
         self.chunk_leaves = chunk_cells // leaf_cells
+        # One chunk more along each axis, always outside, so that upper neighbours exist.
         self._index: Rows = np.full(chunks + 1, UniformRow.OUTSIDE, dtype=np.int32)
         uniform = np.array(list(UniformRow), dtype=np.int32)[:, None, None, None]
         self._tables = GrowingArray(np.broadcast_to(uniform, (len(uniform), *3 * [self.chunk_leaves])))
@@ -111,6 +112,7 @@ class LeafStore:
 
     def _set_rows(self, leaves: Int, rows: Rows) -> None:
         chunks, local = np.divmod(leaves, self.chunk_leaves)
+        # Chunks with a uniform table get a copy of it before a leaf in them changes.
         uniform = np.unique(chunks[~self.has_values(self._index[tuple(chunks.T)])], axis=0)
         if len(uniform):
             where = tuple(uniform.T)
@@ -119,6 +121,7 @@ class LeafStore:
 
     def rows(self, chunk: Int) -> Rows:
         """Rows of a chunk's leaves and of their upper neighbours, of shape (9, 9, 9)."""
+        # The upper neighbours' lowest leaves hold the nodes on the chunk's upper faces.
         i, j, k = chunk
         side = self.chunk_leaves
         tables = self._tables.rows[self._index[i : i + 2, j : j + 2, k : k + 2]]
@@ -133,6 +136,7 @@ class LeafStore:
 
     def mixed_chunks(self) -> Int:
         """Chunks, of shape (C, 3), whose nodes may differ in sign, ordered along the axes."""
+        # A uniform chunk matters too where a neighbour differs: the cells between them have both signs.
         low = self._index[:-1, :-1, :-1]
         mixed = self.has_values(low)
         for i, j, k in itertools.product((0, 1), repeat=3):

@@ -124,10 +124,12 @@ def _march(band: NarrowBand, chunk: Int) -> ChunkMesh | None:
     from skimage import measure
 
     values = band.leaves.nodes(band.leaves.rows(chunk))
+    # Values are never zero, see `NarrowBand.clamp`, so that a chunk of one sign has no surface.
     if not (values.min() < 0 < values.max()):
         return None
     marching_cubes: Any = measure.marching_cubes
     rough, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent", method="lewiner")
+    # A vertex on a lattice edge has one coordinate that is not a whole number; one within a cell has more.
     on_axis = rough != np.round(rough)
     # Rounding along the edge's own axis must go down, across it to the node that the coordinate already is.
     nodes = np.floor(rough).astype(np.int64)
@@ -137,6 +139,7 @@ def _march(band: NarrowBand, chunk: Int) -> ChunkMesh | None:
     positions[edges, axis[edges]] = nodes[edges, axis[edges]] + _crossings(values, nodes[edges], axis[edges])
     origin = chunk * band.parameters.chunk_cells
     nodes += origin
+    # Mixed radix: three node coordinates and one of four axes in one integer.
     sides = band.lattice.cells + 1
     names = ((nodes[:, 0] * sides[1] + nodes[:, 1]) * sides[2] + nodes[:, 2]) * 4 + axis
     return ChunkMesh(names, positions + origin, faces.astype(np.int32))

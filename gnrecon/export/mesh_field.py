@@ -131,9 +131,11 @@ def cells_for_curvature(
     data = sdf.data
     if sdf.detail is None or data is None or cells >= most_cells:
         return cells
+    # The coarse field at the data is the detail that the smooth field does not represent.
     some = data[:: max(1, len(data) // samples)]
     off = float(np.sqrt(np.mean(sdf.coarse().sdf(some) ** 2)))
     mean, gauss = curvatures(sdf.gradient(some), sdf.hessian(some))
+    # sqrt(k1^2 + k2^2) from the mean and the Gauss curvature.
     bend = float(np.nanmean(np.sqrt((4 * mean**2 - 2 * gauss).clip(0.0))))
     longest = float(np.ptp(sdf.bounds, axis=0).max())
     # off = chord_ratio bend (longest / wanted)^2
@@ -196,6 +198,7 @@ def mesh_field(
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
         mesh, fast, cells, dropped = _extract_until_accurate(field, options, data, box, advance, parameters)
+    # Two Newton steps bring a smooth field to rounding; gradients may come from the cheaper field.
     with stages("project"):
         mesh = project(mesh, field, steps=2, rough=None if fast is field else fast, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
@@ -238,6 +241,7 @@ def _extract_until_accurate(
             advance=subrange(advance, begin, end),
             parameters=parameters.extraction,
         )
+        # Before the error is measured, so that ghost sheets do not count.
         mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
         if options.max_error is None or cells >= most_cells:
             return mesh, fast, cells, dropped

@@ -67,6 +67,7 @@ def measure(
     radius = float(np.linalg.norm(anchor - anchor.mean(axis=0), axis=1).max()) if scale is None else scale
     if not radius > 0:
         raise UsageError(f"Distances cannot be given relative to a scale of {radius}, which is not positive.")
+    # One generator for both, so that a seed determines all numbers.
     rng = np.random.default_rng(seed)
     on_mesh = sample_surface(mesh, samples, rng)
     if isinstance(reference, Mesh):
@@ -134,6 +135,7 @@ def _to_points(samples: SurfaceSamples, target: SurfaceSamples) -> _Distances:
 def _consistency(ours: Float | None, theirs: Float | None) -> float | None:
     if ours is None or theirs is None:
         return None
+    # Absolute cosines, because references may be oriented either way.
     return float(np.abs(np.einsum("ij,ij->i", ours, theirs)).mean())
 
 

@@ -67,6 +67,7 @@ class OffsetField:
     def distance(self, points: Float) -> Float:
         """Return the signed distance to the mesh, in file units and of shape (N,), at points of shape (N, 3)."""
         lengths = np.linalg.norm(points - self._surface.nearest(points)[0], axis=1)
+        # Ray casting decides the sign, since the nearest face's normal is ambiguous at edges.
         signed: Float = np.where(self._surface.inside(points), -lengths, lengths)
         return signed
 
@@ -81,5 +82,6 @@ class OffsetField:
         lengths = np.linalg.norm(ways, axis=1, keepdims=True)
         vectors = self.mesh.face_vectors[faces]
         areas = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        # On the mesh the way has no direction; the face's normal takes its place.
         gradient: Float = np.divide(ways, lengths, out=vectors / areas, where=lengths > 0)
         return gradient

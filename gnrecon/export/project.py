@@ -74,19 +74,25 @@ def project(
         advance(rows.stop / len(moved))
     back = _vertices_to_restore(mesh, moved)
     moved[back] = mesh.vertices[back]
-    result = Mesh(moved, mesh.faces)
-    normals = result.vertex_normals()
-    for rows in slices(len(moved)):
+    return _with_field_normals(Mesh(moved, mesh.faces), value, gradient, limit)
+
+
+def _with_field_normals(mesh: Mesh, value: Float, gradient: Float, limit: float) -> Mesh:
+    """The mesh with the field's unit gradients as normals where they fit, and the faces' mean elsewhere."""
+    normals = mesh.vertex_normals()
+    # By slices, because temporaries of all vertices would double the memory.
+    for rows in slices(len(normals)):
         lengths = np.linalg.norm(gradient[rows], axis=1, keepdims=True)
         unit = gradient[rows] / np.maximum(lengths, np.finfo(np.float64).tiny)
         # On a cap, and where the field folds, the gradient is not the surface's normal.
         fit = (np.abs(value[rows]) <= limit) & (np.einsum("ij,ij->i", unit, normals[rows]) > 0)
         normals[rows][fit] = unit[fit]
-    return Mesh(moved, mesh.faces, normals)
+    return Mesh(mesh.vertices, mesh.faces, normals)
 
 
 def side_lengths(mesh: Mesh) -> npt.NDArray[np.float32]:
     """Lengths of the faces' sides, of shape (3 F,)."""
+    # Single precision halves the memory, and the median and the mean need no more.
     lengths = np.empty((len(mesh.faces), 3), dtype=np.float32)
     for rows in slices(len(mesh.faces)):
         corners = mesh.vertices[mesh.faces[rows]]
@@ -118,6 +124,7 @@ def newton_project(
         if not len(rows):
             break
         trial_value = field.sdf(trial)
+        # A step that does not reduce the field's magnitude is not taken: the linear model failed.
         better = np.abs(trial_value) < np.abs(value[rows])
         rows, trial, trial_value = rows[better], trial[better], trial_value[better]
         far = np.linalg.norm(trial - points[rows], axis=1) > gradient_reuse_limits * limit
@@ -149,6 +156,7 @@ def _newton_steps(
     rows = np.flatnonzero(open_rows & (np.abs(value) <= 2 * limit * slopes))
     trial = points[rows] - (value[rows] / slopes[rows])[:, None] * (gradient[rows] / slopes[rows][:, None])
     near = np.linalg.norm(trial - start[rows], axis=1) <= limit
+    # Outside its box a field is not defined by data.
     near &= ((trial >= low) & (trial <= high)).all(axis=1)
     return rows[near], trial[near]
 

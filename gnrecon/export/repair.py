@@ -104,6 +104,7 @@ def _useful_faces(mesh: Mesh) -> Mask:
     repeated = np.ones(len(faces), dtype=bool)
     repeated[np.unique(lowest_first, axis=0, return_index=True)[1]] = False
     keep &= ~repeated
+    # Dropping a fin may turn its neighbours into fins.
     while True:
         rows = np.flatnonzero(keep)
         edges = Edges.of(Mesh(mesh.vertices, faces[rows]))
@@ -129,6 +130,7 @@ def _separate_coincident(mesh: Mesh, *, share: float = ExportParameters.repair.s
     shared = count[place.reshape(-1)] > 1
     if not shared.any():
         return mesh
+    # Towards the mean of the middles of its own faces, so that vertices of touching parts move away from each other.
     middle = np.zeros_like(mesh.vertices)
     np.add.at(middle, mesh.faces.reshape(-1), np.repeat(mesh.corners.mean(axis=1), 3, axis=0))
     middle /= np.maximum(np.bincount(mesh.faces.reshape(-1), minlength=len(middle)), 1)[:, None]
@@ -165,6 +167,7 @@ def _patch(
     work = to_meshlab(mesh)
     work.meshing_remove_duplicate_vertices()
     work.meshing_remove_duplicate_faces()
+    # Splitting vertices keeps all faces; removing faces would open further holes.
     work.meshing_repair_non_manifold_edges(method="Split Vertices")
     work.meshing_repair_non_manifold_vertices(vertdispratio=share)
     try:

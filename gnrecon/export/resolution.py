@@ -123,6 +123,7 @@ def chord_error(
     corners = corners[inner]
     if not len(corners):
         return 0.0
+    # First order: |f| / |grad f|. A vanishing gradient gives a large error, which is right: nothing is known there.
     points = face_sample_points(corners)
     slopes = np.linalg.norm(field.gradient(points), axis=1)
     distances = np.abs(field.sdf(points)) / np.maximum(slopes, np.finfo(np.float64).tiny)
@@ -139,6 +140,7 @@ def projected_chord_error(
 ) -> float:
     """Return the chord error that the mesh will have once it is projected; only the sampled faces are projected."""
     used, inverse = np.unique(_sampled_faces(mesh.faces, parameters.error_faces), return_inverse=True)
+    # Two steps, as for the whole mesh.
     part = project(Mesh(mesh.vertices[used], inverse.reshape(-1, 3)), field, steps=2)
     return measure_fineness(part, field, resolution, bounds, parameters=parameters).chord_error
 
@@ -154,5 +156,6 @@ def refined_resolution(resolution: int, error: float, wanted: float, *, spare: f
     `spare` times more cells than the square law asks for keep a third attempt from being needed. That law holds once
     cells are small compared with the features, so that the factor is kept from 1.2 to 3.
     """
+    # The chord error falls with the square of the cell.
     factor = spare * math.sqrt(error / wanted)
     return math.ceil(resolution * min(max(factor, 1.2), 3.0))

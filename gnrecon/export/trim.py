@@ -87,6 +87,7 @@ def trim(
     """
     parameters = parameters or ExportParameters.trim
     areas = vertex_areas(mesh)
+    # Small holes first: a piece counts as small only with its own holes filled.
     smooth = diffuse(mesh, distances, parameters.smoothing_reaches * reach)
     least_hole, least_piece = (
         share * reach**2 for share in (parameters.hole_squared_reaches, parameters.crumb_squared_reaches)
@@ -109,6 +110,7 @@ def _absorb_small_patches(mesh: Mesh, near: Mask, areas: Float, least: float, of
     start, end = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     same = near[start] == near[end]
     size = len(near)
+    # Patches are the components of the graph of edges that do not cross the border.
     links = coo_array((np.ones(same.sum(), dtype=np.int8), (start[same], end[same])), shape=(size, size))
     count, labels = connected_components(links, directed=False)
     area = np.bincount(labels, areas, minlength=count)
@@ -118,6 +120,7 @@ def _absorb_small_patches(mesh: Mesh, near: Mask, areas: Float, least: float, of
     side = np.zeros(count, dtype=bool)
     side[labels] = near == of
     small = side & bordered & (area < least)
+    # Something must be left: if every piece is small, the largest stays.
     if of and not (side & ~small).any() and small.any():
         small[np.flatnonzero(small)[area[small].argmax()]] = False
     return np.where(small[labels], not of, near), int(small.sum())
@@ -141,6 +144,7 @@ def cut_at_level(
     single = np.flatnonzero((count == 1) | (count == 2))
     alone = np.where(count[single] == 1, flags[single].argmax(axis=1), flags[single].argmin(axis=1))
     a, b, c = np.take_along_axis(mesh.faces[single], (alone[:, None] + np.arange(3)) % 3, axis=1).T
+    # Each crossed edge gets one new vertex, which its two faces share.
     ends, which = np.unique(np.sort(np.stack([a, b, a, c], axis=1).reshape(-1, 2), axis=1), axis=0, return_inverse=True)
     low, high = ends.T
     share = np.clip((reach - distances[low]) / (distances[high] - distances[low]), clearance, 1 - clearance)
@@ -148,6 +152,7 @@ def cut_at_level(
     ab, ac = (len(near) + which.reshape(-1, 2)).T
     tip = count[single] == 1
     corners = full.vertices
+    # The quadrilateral that is left of a face with one far corner is cut along its shorter diagonal.
     shorter = np.linalg.norm(corners[ab] - corners[c], axis=1) < np.linalg.norm(corners[b] - corners[ac], axis=1)
     one, other = ~tip & shorter, ~tip & ~shorter
     pieces = [

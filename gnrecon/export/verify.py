@@ -74,6 +74,7 @@ def verify(mesh: Mesh) -> MeshFacts:
     vertices = len(np.unique(mesh.faces))
     euler = vertices - len(edges.count) + len(mesh.faces)
     components = int(face_components(mesh).max(initial=-1)) + 1
+    # For closed, oriented 2-manifolds, V - E + F = 2 (components - genus).
     closed, manifold, oriented = boundary == 0, crowded == split == degenerate == 0, turned == 0
     return MeshFacts(
         vertices=vertices,
@@ -224,6 +225,7 @@ class Findings:
 def examine(mesh: Mesh) -> Findings:
     """Find all defects of any mesh; nothing is changed."""
     broken = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    # Infinite and missing coordinates are a finding here, not an error.
     with np.errstate(invalid="ignore", over="ignore"):
         facts = verify(mesh)
         flat = _flat_faces(mesh)
@@ -265,6 +267,7 @@ def _names_twice(mesh: Mesh) -> Mask:
 def _flat_faces(mesh: Mesh, *, rounding: float = 4 * np.finfo(np.float64).eps) -> int:
     """Count faces whose height is at most `rounding`, a few units in the last place, times the largest coordinate."""
     corners = mesh.corners
+    # Height times longest side is twice the area; `face_vectors` are as long as the area.
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
     heights = 2 * np.linalg.norm(mesh.face_vectors, axis=1)
     largest = np.abs(mesh.vertices).max(initial=0.0)

@@ -106,8 +106,8 @@ def _in_cylinder(offsets: Float, normal: Float, spacing: float, parameters: Doub
     axes = np.linalg.svd(normal[None, :])[2]  # the normal, and two directions across it
     local: Float = offsets @ np.roll(axes, -1, axis=0).T / spacing
     local[:, 2] *= np.sign(axes[0] @ normal)
-    beside = np.hypot(local[:, 0], local[:, 1]) > parameters.cylinder_radius_spacings
-    local[beside | (np.abs(local[:, 2]) > parameters.cylinder_half_height_spacings)] = np.nan
+    outside = np.hypot(local[:, 0], local[:, 1]) > parameters.cylinder_radius_spacings
+    local[outside | (np.abs(local[:, 2]) > parameters.cylinder_half_height_spacings)] = np.nan
     return local
 
 

@@ -38,7 +38,7 @@ class NoiseParameters:
     """Noise by the spread about quadrics (`ingest.noise`)."""
 
     small_neighbourhood: int = 10  # points, the fewest with a few degrees of freedom beyond the quadric's 6
-    large_neighbourhood: int = 15  # points: half as many again, so that the reaches differ clearly
+    large_neighbourhood: int = 15  # points: 1.5 times as many, so that the reaches differ clearly
     queries: int = 4000  # neighbourhoods of the smallest size
     least_queries: int = 500  # of the largest; the larger they are, the fewer suffice
     least_reach_deviations: float = 6.0  # reach of a neighbourhood over the noise; less tilts its plane

@@ -15,11 +15,10 @@ from scipy.spatial import cKDTree
 
 from gnrecon.export.metrics import ray_scene
 from gnrecon.geometry.arrays import Float
-from gnrecon.geometry.colors import as_bytes
-from gnrecon.geometry.colors import to_linear as to_light
+from gnrecon.geometry.colors import as_bytes, to_linear
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, shade, to_bytes, to_linear
+from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, gamma_decoded, gamma_encoded, shade
 from gnrecon.rendering.rendering_parameters import RenderingParameters, SheetParameters
 from gnrecon.runtime.errors import UsageError
 
@@ -72,27 +71,40 @@ def render(
         raise UsageError("There is nothing to draw: give a mesh or points, and a view.")
     if size[0] < panels or size[1] < 1:
         raise UsageError(f"A picture of {size[0]} x {size[1]} pixels has no room for {panels} panels.")
+    strips = _draw_panels(shown, views, up, size, (gamma_decoded(color), gamma_decoded(point_color)))
+    samples = RenderingParameters.supersampling
+    light = np.concatenate(strips, axis=1)
+    image: Image = gamma_encoded(light.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3)))
+    if path is not None:
+        write_image(image, Path(path))
+    return image
+
+
+def _draw_panels(
+    shown: Sequence[Mesh | PointCloud],
+    views: Sequence[View],
+    up: str,
+    size: tuple[int, int],
+    colors: tuple[Float, Float],
+) -> list[Float]:
+    """Linear light of each panel, with all its samples; the colours are those of a mesh and of points."""
     # Everything is centred and scaled to about one, because the ray caster uses float32.
     places = np.concatenate([_places(part) for part in shown])
     centre = (places.min(axis=0) + places.max(axis=0)) / 2
     scale = float(np.linalg.norm(places - centre, axis=1).max()) or 1.0
     samples = RenderingParameters.supersampling
-    edges = np.linspace(0, size[0], panels + 1).astype(int) * samples
-    height = size[1] * samples
+    edges = np.linspace(0, size[0], len(shown) * len(views) + 1).astype(int) * samples
     strips = []
     for index, width in enumerate(np.diff(edges)):
         view, part = views[index // len(shown)], shown[index % len(shown)]
-        camera = Camera.framing((places - centre) / scale, view, up, int(width), height)
+        # All panels of a view share the camera, so that scan and mesh can be compared.
+        camera = Camera.framing((places - centre) / scale, view, up, int(width), size[1] * samples)
         unit = (_places(part) - centre) / scale
         if isinstance(part, Mesh):
-            strips.append(_draw_mesh(part.with_vertices(unit), camera, to_linear(color)))
+            strips.append(_draw_mesh(part.with_vertices(unit), camera, colors[0]))
         else:
-            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, to_linear(point_color)))
-    light = np.concatenate(strips, axis=1)
-    image: Image = to_bytes(light.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3)))
-    if path is not None:
-        write_image(image, Path(path))
-    return image
+            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, colors[1]))
+    return strips
 
 
 def _places(part: Mesh | PointCloud) -> Float:
@@ -120,7 +132,7 @@ def _draw_mesh(mesh: Mesh, camera: Camera, color: Float, *, samples: int = Rende
     normals = np.einsum("ij,ijk->ik", shares, mesh.vertex_normals().astype(np.float32)[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-9))
     if "colors" in mesh.attributes:
-        light = to_light(as_bytes(mesh.attributes["colors"])[:, :3])
+        light = to_linear(as_bytes(mesh.attributes["colors"])[:, :3])
         color = np.einsum("ij,ijk->ik", shares, light.astype(np.float32)[corners])
     # Occlusion is computed once per pixel and not per sample: it varies slowly, and costs most.
     coarse = np.zeros_like(hit)

@@ -219,13 +219,13 @@ def sphere_directions(count: int = RenderingParameters.light.sky_directions) -> 
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-def to_linear(color: tuple[int, int, int]) -> Float:
-    """Linear light, of shape (3,), of an sRGB colour from 0 to 255."""
+def gamma_decoded(color: tuple[int, int, int]) -> Float:
+    """Linear light, of shape (3,), of a colour from 0 to 255, by the power 2.2 that approximates sRGB."""
     return np.asarray((np.array(color) / 255.0) ** 2.2)
 
 
-def to_bytes(light: Float) -> Any:
-    """sRGB bytes of an image of linear light; what is brighter than white becomes white."""
+def gamma_encoded(light: Float) -> Any:
+    """Bytes of an image of linear light, by the power 1 / 2.2; what is brighter than white becomes white."""
     return np.uint8(np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)))
 
 

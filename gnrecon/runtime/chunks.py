@@ -1,4 +1,4 @@
-"""Rows in chunks, so that what is computed of millions of them takes little memory at a time."""
+"""Chunks of rows, which bound the memory of temporary arrays."""
 
 from __future__ import annotations
 

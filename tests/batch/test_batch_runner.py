@@ -18,7 +18,8 @@ import numpy as np
 import psutil
 import pytest
 from fake_work import notes
-from scan_files import box, sphere, start, torus, write_scan
+from made_shapes import box, sphere
+from scan_files import start, torus, write_scan
 
 from gnrecon.batch import executors, runner
 from gnrecon.batch.execute import run_job

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_shapes import sphere
 from markupsafe import escape
-from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, sphere, start, torus, wait_for, write_scan
+from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
 
 from gnrecon.cli.app import main
 from gnrecon.export import verify_file

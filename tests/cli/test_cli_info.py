@@ -8,7 +8,8 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from scan_files import sphere, write_scan
+from made_shapes import sphere
+from scan_files import write_scan
 
 from gnrecon.cli.app import main
 from gnrecon.report.report import report_schema

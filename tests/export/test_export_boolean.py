@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_fields import UNIT, UTM, Field, sphere
+from analytic_fields import UNIT, UTM, ball_mesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gnrecon.export import extract, project, require_sound
+from gnrecon.export import require_sound
 from gnrecon.export.boolean import crop, subtract
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame
@@ -18,8 +18,7 @@ RADIUS = 0.8
 
 
 def ball(frame: Frame = UNIT, radius: float = RADIUS) -> Mesh:
-    field = Field(sphere(radius), frame=frame)
-    return project(extract(field, resolution=24), field)
+    return ball_mesh(radius, frame)
 
 
 @pytest.mark.parametrize("frame", [UNIT, UTM], ids=["unit", "UTM"])

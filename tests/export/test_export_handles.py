@@ -144,7 +144,7 @@ def test_a_neck_that_holds_a_part_is_not_cut() -> None:
         assert remove_handles(mesh, scanned(truth)) == (mesh, [])
 
 
-def test_the_two_parts_of_a_mesh_are_told_apart() -> None:
+def test_two_parts_of_a_mesh_stay_separate() -> None:
     """A handle of one of two components is cut; the other, which has none, stays as it is."""
     bored = without(box((0.3, 0.7, 0.06), (0.5, 0.0, 0.0)), rod(0.03, 0.5, 0.2))
     ball = sphere(0.3, (-0.4, 0.0, 0.0))

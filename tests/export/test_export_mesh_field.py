@@ -143,12 +143,12 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
 def test_an_impossible_edge_length_is_refused_before_the_fit() -> None:
     stages: list[str] = []
 
-    class Heard(Progress):
+    class Recorded(Progress):
         def stage(self, name: str) -> None:
             stages.append(name)
 
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     with pytest.raises(UsageError, match="possible"):
-        reconstruct(points, points, edge_length=1e-9, progress=Heard())
+        reconstruct(points, points, edge_length=1e-9, progress=Recorded())
     assert stages == ["read", "ingest"]

@@ -6,9 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, sphere, torus
+from analytic_fields import UNIT, UTM, Field, ball_mesh, torus
 
-from gnrecon.export import extract, measure, project
+from gnrecon.export import extract, measure
 from gnrecon.export.metrics import nearest_on_surface, sample_surface
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -16,8 +16,7 @@ from gnrecon.runtime.errors import InputError, UsageError
 
 
 def ball(radius: float, frame: object = None, resolution: int = 96) -> Mesh:
-    field = Field(sphere(radius), reach=1.2) if frame is None else Field(sphere(radius), reach=1.2, frame=UTM)
-    return project(extract(field, resolution=resolution), field)
+    return ball_mesh(radius, UNIT if frame is None else UTM, resolution, reach=1.2)
 
 
 def brute_force(mesh: Mesh, points: np.ndarray) -> np.ndarray:

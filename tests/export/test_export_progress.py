@@ -1,4 +1,4 @@
-"""Extraction, projection and measurement tell how far they are, batch by batch, and end when they are told to."""
+"""Extraction, projection and measurement report their progress batch by batch, and can be cancelled."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ def test_shares_follow_the_work() -> None:
     steps = np.diff(shares[2:evaluated])
     assert len(steps) > 50
     assert steps.max() < 1.1 * np.median(steps)
-    told: list[float] = []
-    project(mesh, field, steps=1, batch=BATCH, advance=told.append)
-    assert told == [min(end, len(mesh.vertices)) / len(mesh.vertices) for end in batches(len(mesh.vertices))]
-    assert told[-1] == 1.0
+    projected: list[float] = []
+    project(mesh, field, steps=1, batch=BATCH, advance=projected.append)
+    assert projected == [min(end, len(mesh.vertices)) / len(mesh.vertices) for end in batches(len(mesh.vertices))]
+    assert projected[-1] == 1.0
 
 
 def batches(count: int) -> range:
     return range(BATCH, count + BATCH, BATCH)
 
 
-def test_telling_changes_nothing() -> None:
-    told: list[float] = []
+def test_reporting_changes_nothing() -> None:
+    shares: list[float] = []
     plain = extract(Field(torus()), resolution=32)
-    watched = extract(Field(torus()), resolution=32, advance=told.append)
+    watched = extract(Field(torus()), resolution=32, advance=shares.append)
     assert (plain.vertices == watched.vertices).all()
     assert (plain.faces == watched.faces).all()
-    assert measure(plain, plain, 1000) == measure(plain, plain, 1000, advance=told.append)
-    assert told[-2:] == [0.5, 1.0]
+    assert measure(plain, plain, 1000) == measure(plain, plain, 1000, advance=shares.append)
+    assert shares[-2:] == [0.5, 1.0]
 
 
-def test_extraction_ends_when_it_is_told_to() -> None:
+def test_extraction_can_be_cancelled() -> None:
     field = Field(torus())
 
     def advance(share: float) -> None:

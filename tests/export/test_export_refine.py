@@ -23,7 +23,7 @@ def test_nothing_asked_for_is_nothing_done() -> None:
     assert actions == []
 
 
-def test_steps_come_in_their_order_and_are_told() -> None:
+def test_steps_run_in_their_order_and_are_reported() -> None:
     field = Field(cylinder())
     mesh = extracted(field)
     shares: list[float] = []

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, plate, shells, sines, sphere, union
+from analytic_fields import UTM, Field, ball_mesh, plate, shells, sines, sphere, union
 from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
 
 from gnrecon.export import (
@@ -26,8 +26,7 @@ from gnrecon.runtime.errors import MeshError, UsageError
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    field = Field(sphere(), frame=UTM)
-    return project(extract(field, resolution=24), field)
+    return ball_mesh()
 
 
 def test_a_sound_mesh_comes_back_as_it_is(ball: Mesh) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, sphere, union
+from analytic_fields import UTM, Field, ball_mesh, sphere, union
 
 from gnrecon.export import decimate_by_clustering, extract, project
 from gnrecon.export.remeshing.decimate import barycentric
@@ -14,8 +14,7 @@ from gnrecon.rendering import vertex_ambient_occlusion
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    field = Field(sphere(), frame=UTM)
-    mesh = project(extract(field, resolution=48), field)
+    mesh = ball_mesh(resolution=48)
     unit = UTM.to_unit(mesh.vertices)
     colors = np.uint8(np.round(127 + 100 * unit))
     return mesh.with_attributes({"height": unit[:, 2], "colors": colors, "label": np.int32(unit[:, 0] > 0)})

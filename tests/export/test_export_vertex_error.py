@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, sphere, torus
+from analytic_fields import UTM, Field, ball_mesh, torus
 
-from gnrecon.export import extract, project, vertex_error
+from gnrecon.export import extract, vertex_error
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 
 
 def ball(radius: float, resolution: int = 32) -> Mesh:
-    field = Field(sphere(radius), frame=UTM)
-    return project(extract(field, resolution=resolution), field)
+    return ball_mesh(radius, resolution=resolution)
 
 
 @pytest.fixture(scope="module")

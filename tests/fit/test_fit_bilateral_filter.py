@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import made_shapes
 import numpy as np
 import pytest
 
@@ -14,19 +15,12 @@ WIDE = BilateralFilter(3.0, 0.4)
 
 
 def ball(count: int, rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    x = rng.standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return x * (0.8 + noise * rng.standard_normal((count, 1))), x
+    return made_shapes.sphere(count, rng, 0.8, noise)
 
 
 def cube(count: int, rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Points of the surface of [-1, 1]^3, moved along their normals."""
-    axis, side = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count)
-    x, normals = rng.uniform(-1, 1, (count, 3)), np.zeros((count, 3))
-    rows = np.arange(count)
-    x[rows, axis] = side + noise * rng.standard_normal(count)
-    normals[rows, axis] = side
-    return x, normals
+    return made_shapes.cube(count, 1.0, rng, noise)
 
 
 def tilted(normals: np.ndarray, angle: float, rng: np.random.Generator) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import made_shapes
 import numpy as np
 import pytest
 
@@ -17,9 +18,7 @@ OPTIONS = FitOptions(quality="draft")
 
 
 def sphere(count: int, rng: np.random.Generator) -> Samples:
-    points = rng.standard_normal((count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return Samples(0.9 * points, points, Frame(np.array([5.0, 0, -3]), 2.0))
+    return Samples(*made_shapes.sphere(count, rng, 0.9), Frame(np.array([5.0, 0, -3]), 2.0))
 
 
 def plate(count: int, rng: np.random.Generator) -> Samples:

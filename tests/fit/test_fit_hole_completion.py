@@ -25,9 +25,7 @@ def cube(count: int, seed: int = 0) -> tuple[Float, Float]:
 
 
 def ball(count: int) -> tuple[Float, Float]:
-    x = np.random.default_rng(0).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return SIDE * x, x
+    return made_shapes.sphere(count, 0, SIDE)
 
 
 def bored(count: int, seed: int = 0) -> tuple[Float, Float]:
@@ -35,9 +33,7 @@ def bored(count: int, seed: int = 0) -> tuple[Float, Float]:
 
 
 def off_cube(x: Float) -> Float:
-    outside = np.abs(x) - SIDE
-    off: Float = np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
-    return off
+    return made_shapes.off_cube(x, SIDE)
 
 
 def without(points: Float, normals: Float, middle: list[float], reach: float) -> tuple[Float, Float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_shapes import cube
+from made_shapes import cube, sphere
 
 from gnrecon.fit.shape_priors import prior_parameters
 from gnrecon.fit.shape_priors.ball_fit import BallFit
@@ -42,9 +42,7 @@ def scan() -> tuple[Float, Float]:
 
 
 def ball(count: int) -> Samples:
-    x = np.random.default_rng(0).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return Samples(0.8 * x, x, FRAME)
+    return Samples(*sphere(count, 0, 0.8), FRAME)
 
 
 def planes(*parameters: DetectionParameters) -> int:

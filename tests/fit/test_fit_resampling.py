@@ -26,8 +26,7 @@ def cube(count: int, seed: int = 0) -> Oriented:
 
 
 def off_cube(x: Float) -> Float:
-    outside = np.abs(x) - SIDE
-    return np.asarray(np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0)))
+    return made_shapes.off_cube(x, SIDE)
 
 
 def off_plate(x: Float) -> Float:
@@ -42,16 +41,11 @@ def gaps(points: Float, places: Float) -> Float:
 
 
 def ball(count: int) -> Oriented:
-    x = np.random.default_rng(0).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return SIDE * x, x
+    return made_shapes.sphere(count, 0, SIDE)
 
 
 def torus(count: int) -> Oriented:
-    u, v = np.random.default_rng(1).uniform(0, 2 * np.pi, (2, count))
-    ring = np.stack([np.cos(u), np.sin(u), 0 * u], axis=1)
-    normals = np.cos(v)[:, None] * ring + np.sin(v)[:, None] * [0.0, 0.0, 1.0]
-    return 0.6 * ring + 0.25 * normals, normals
+    return made_shapes.torus(count, 1, 0.6, 0.25)
 
 
 @pytest.mark.parametrize(("count", "seed"), [(60, 0), (60, 1), (400, 2)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import made_shapes
 import numpy as np
 import pytest
 
@@ -24,19 +25,13 @@ AVERAGING = BilateralFilter(SharpShapeParameters.averaging_width_radii, SharpSha
 
 def cube(count: int, noise: float = 0.0, tilt: float = 0.0, seed: int = 0) -> Samples:
     rng = np.random.default_rng(seed)
-    axis, side, rows = rng.integers(3, size=count), rng.choice([-1.0, 1.0], count), np.arange(count)
-    x, normals = rng.uniform(-SIDE, SIDE, (count, 3)), np.zeros((count, 3))
-    x[rows, axis] = SIDE * side + noise * rng.standard_normal(count)
-    normals[rows, axis] = side
+    x, normals = made_shapes.cube(count, SIDE, rng, noise)
     normals += tilt * rng.standard_normal((count, 3))
     return Samples(x, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)
 
 
 def ball(count: int, noise: float = 0.0) -> Samples:
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return Samples(x * (SIDE + noise * rng.standard_normal((count, 1))), x, FRAME)
+    return Samples(*made_shapes.sphere(count, 0, SIDE, noise), FRAME)
 
 
 def rounded(count: int, radius: float) -> Samples:
@@ -81,7 +76,7 @@ def test_faces_of_a_cube_are_extended_to_its_edges_and_its_gaps_are_halved() -> 
     nearest = [Density(points).tree.query(places)[0].max() for points in (scan.points, found.samples.points)]
     assert nearest[1] < nearest[0]
     radius = Density(found.samples.points).radius
-    assert found.belief.length == pytest.approx(SharpShapeParameters.exact_length_radii * radius)
+    assert found.hyperparameters.length == pytest.approx(SharpShapeParameters.exact_length_radii * radius)
 
 
 def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:

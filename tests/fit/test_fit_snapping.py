@@ -35,17 +35,11 @@ def bored(count: int) -> Oriented:
 
 
 def ball(count: int) -> Oriented:
-    x = np.random.default_rng(2).standard_normal((count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return SIDE * x, x
+    return made_shapes.sphere(count, 2, SIDE)
 
 
 def torus(count: int) -> Oriented:
-    rng = np.random.default_rng(3)
-    u, v = rng.uniform(0, 2 * np.pi, (2, count))
-    ring = np.stack([np.cos(u), np.sin(u), 0 * u], axis=1)
-    normals = np.cos(v)[:, None] * ring + np.sin(v)[:, None] * [0.0, 0.0, 1.0]
-    return SIDE * ring + 0.35 * SIDE * normals, normals
+    return made_shapes.torus(count, 3, SIDE, 0.35 * SIDE)
 
 
 def bulged(count: int, by: float) -> tuple[Oriented, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Colours: every way that files hold them becomes the same bytes, and linear light leads back to them."""
+"""Every encoding of colours in files gives the same bytes, and linear light is converted back exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes as plain arrays: what fits together, and what goes with the vertices."""
+"""Meshes as plain arrays: checks of shapes, vertex normals and attributes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def hull_of_a_sphere() -> Mesh:
 def test_smooth_normals_are_a_spheres_own_however_irregular_its_faces() -> None:
     sphere = hull_of_a_sphere()
     np.testing.assert_allclose(sphere.smooth_normals(), sphere.vertices, atol=1e-10)
-    # What the weights are for: by area they are off by a degree and more.
+    # Area weights have errors of a degree and more.
     assert np.linalg.norm(sphere.vertex_normals() - sphere.vertices, axis=1).mean() > np.radians(1.0)
 
 

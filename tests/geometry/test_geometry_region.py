@@ -1,4 +1,4 @@
-"""Boxes and clipping planes: which points they keep, in memory, while files are read, and on the command line."""
+"""Boxes and clipping planes select points in memory, while files are read, and on the command line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scan_files import gnrecon, sphere, write_scan
+from made_shapes import sphere
+from scan_files import gnrecon, write_scan
 
 from gnrecon.batch.request import Request
 from gnrecon.cli.app import main

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from made_shapes import sphere
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -16,13 +17,6 @@ Shape = Callable[[int], tuple[Float, Float]]
 Distance = Callable[[Float], Float]
 
 MAJOR, MINOR = 0.7, 0.25
-
-
-def sphere(count: int, seed: int = 0) -> tuple[Float, Float]:
-    """Random points of the unit sphere with their normals."""
-    normals = np.random.default_rng(seed).standard_normal((count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals.copy(), normals
 
 
 def torus(count: int, seed: int = 0) -> tuple[Float, Float]:

@@ -1,4 +1,4 @@
-"""Lengths and boxes as people write them."""
+"""Parsing of lengths and boxes."""
 
 from __future__ import annotations
 

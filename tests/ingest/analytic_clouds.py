@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
+from made_shapes import sphere
 
-Float = npt.NDArray[np.float64]
-
-
-def sphere(count: int, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Uniform points on the unit sphere."""
-    points = rng.normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return points, points
+from gnrecon.geometry.arrays import Float
 
 
 def torus(count: int, rng: np.random.Generator, tube: float = 0.3) -> tuple[Float, Float]:

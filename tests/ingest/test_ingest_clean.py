@@ -1,12 +1,12 @@
-"""What is dropped, for which reason, and what is refused."""
+"""Cleaning: what is dropped, the counts by reason, and what is refused."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import IngestCounts, clean, find_outliers

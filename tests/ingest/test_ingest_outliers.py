@@ -1,10 +1,11 @@
-"""Isolated clusters, scans that are there twice, and the outlier rules that are in wide use."""
+"""Isolated clusters, repeated scans, and the two usual outlier rules."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud
@@ -40,7 +41,7 @@ def test_missing_normals_are_estimated_from_all_points_before_thinning() -> None
     samples, counts = prepare(PointCloud(points), max_points=100, subsample="poisson")
     assert (counts.thinned, counts.kept, counts.normals) == (4900, 100, "estimated")
     outward = samples.frame.to_world(samples.points)
-    # One in fifty points alone could not tell directions to within three degrees.
+    # A fiftieth of the points alone does not determine normals to within three degrees.
     assert np.einsum("ij,ij->i", samples.normals, outward).min() > np.cos(np.radians(3))
 
 

@@ -1,10 +1,11 @@
-"""Smoothing takes noise away, and leaves shape, attributes and far-off coordinates as they are."""
+"""Smoothing removes noise, and keeps shape, attributes and coordinates far from the origin."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, thin_shell, torus
+from analytic_clouds import thin_shell, torus
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
@@ -87,7 +88,9 @@ def test_samples_are_smoothed_and_it_is_told(rng: np.random.Generator) -> None:
     assert "Smoothed the points; they moved by 0.0" in " ".join(counts.remarks())
     assert samples.held_out is not None
     kept_out = (samples.held_out.frame.to_world(samples.held_out.points) - UTM) / 10
-    assert np.sqrt((off_torus(kept_out) ** 2).mean()) == pytest.approx(0.01, rel=0.15)  # what checks a fit is as it was
+    assert np.sqrt((off_torus(kept_out) ** 2).mean()) == pytest.approx(
+        0.01, rel=0.15
+    )  # validation points are not smoothed
     assert prepare(noisy)[1].moved is None
     with pytest.raises(UsageError, match="is not a positive distance"):
         prepare(noisy, smooth_scan=0)

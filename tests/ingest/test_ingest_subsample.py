@@ -1,12 +1,12 @@
-"""Thinning keeps real points, as many as asked for, reproducibly; and the two even methods are even."""
+"""Thinning keeps the requested number of real points, reproducibly; and the two even methods are even."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_shapes import sphere
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.point_cloud import PointCloud

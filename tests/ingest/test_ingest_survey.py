@@ -1,7 +1,8 @@
-"""The facts of clouds that are known: their noise, their normals' state, and their borders."""
+"""The survey of known clouds: noise, state of the normals, and borders."""
 
 from __future__ import annotations
 
+import made_shapes
 import numpy as np
 import pytest
 from analytic_clouds import torus
@@ -11,9 +12,7 @@ from gnrecon.ingest.survey import Survey, survey
 
 
 def sphere(rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    normals = rng.normal(size=(6000, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals * (1 + noise * rng.normal(size=(6000, 1))), normals
+    return made_shapes.sphere(6000, rng, noise=noise)
 
 
 def box(count: int, rng: np.random.Generator) -> np.ndarray:

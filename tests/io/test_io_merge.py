@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scan_files import sphere, torus, write_scan
+from made_shapes import sphere
+from scan_files import torus, write_scan
 from scipy.spatial.transform import Rotation
 
 from gnrecon.io import read_scans

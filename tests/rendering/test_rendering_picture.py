@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_fields import UTM, Field, Function, sphere, union
+from analytic_fields import UTM, Field, Function, ball_mesh, sphere, union
 
 from gnrecon.export import extract, project
 from gnrecon.geometry.mesh import Mesh
@@ -21,8 +21,7 @@ SIZE = (120, 90)
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    field = Field(sphere(), frame=UTM)
-    return project(extract(field, resolution=24), field)
+    return ball_mesh()
 
 
 def box(half: tuple[float, float, float], center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Function:

@@ -1,4 +1,4 @@
-"""A target is either complete or untouched, whatever happens in between."""
+"""Atomic writing: a target is either complete or unchanged, whatever happens in between."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the library logs, and what the command line makes of it; without either, nothing is said."""
+"""Log records of the library and their display by the command line; without either there is no output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Peaks of memory against allocations of known size: within a stretch, nested, in threads, sampled, and over all."""
+"""Peaks of memory against allocations of known size: in blocks, nested, in threads, sampled, and of the process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from held_memory import resident, use
 from gnrecon.runtime import memory
 from gnrecon.runtime.memory import PeakMemory, process_peak_mb
 
-SLACK = 12.0  # MB that the interpreter, the allocator and other threads may take meanwhile
+SLACK = 12.0  # MB that the interpreter, the allocator and other threads may allocate in between
 
 
 def test_a_peak_is_that_of_its_own_stretch() -> None:
@@ -59,7 +59,7 @@ def test_stretches_of_two_threads_do_not_lose_each_others_peaks() -> None:
     thread = Thread(target=first)
     thread.start()
     together.wait()
-    with PeakMemory():  # sets the mark back while the other is being watched
+    with PeakMemory():  # resets the mark while the other block is measured
         pass
     together.wait()
     thread.join()
@@ -75,7 +75,7 @@ def test_a_failure_within_ends_the_watch() -> None:
 
 @pytest.fixture
 def no_reset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A system that does not let the mark be set back."""
+    """A system on which the mark cannot be reset."""
     missing = tmp_path / "missing" / "clear_refs"
     monkeypatch.setattr(memory, "_reset_mark", partial(memory._reset_mark, path=missing))
 
@@ -95,7 +95,7 @@ def test_without_a_reset_a_mark_that_rises_tells_the_peak_all_the_same() -> None
     excess = process_peak_mb() - resident() + 50
     with PeakMemory() as peak:
         use(max(excess, 0))
-    assert peak.mb == pytest.approx(process_peak_mb(), abs=1.0)  # the system counts what is resident in two ways
+    assert peak.mb == pytest.approx(process_peak_mb(), abs=1.0)  # the system has two counts of resident memory
 
 
 def test_without_a_mark_the_system_is_asked_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Several threads, and an importing program: results do not depend on what runs beside them, and nothing is shared."""
+"""Threads: results do not depend on concurrent runs, and the process is left unchanged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scan_files import box, torus
+from made_shapes import box
+from scan_files import torus
 
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
@@ -29,7 +30,7 @@ HEAVY = ("torch", "open3d", "scipy", "trimesh", "pymeshlab", "skimage", "rich", 
 
 
 class Together(Progress):
-    """Lets the threads go on only when all of them are at the same place."""
+    """Makes all threads wait for each other at each stage and step."""
 
     def __init__(self, barrier: Barrier) -> None:
         self._barrier = barrier
@@ -44,7 +45,7 @@ class Together(Progress):
 
 
 def made(progress: Progress | None) -> list[Callable[[], Reconstruction]]:
-    """Two different reconstructions of as many stages and steps."""
+    """Two different reconstructions with the same number of stages and steps."""
     ring, brick = torus(600, np.random.default_rng(1)), box(600, np.random.default_rng(2), (2.0, 1.5, 1.0))
     return [
         lambda: reconstruct(*ring, seed=1, progress=progress, **FEW),

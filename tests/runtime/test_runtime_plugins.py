@@ -1,4 +1,4 @@
-"""Readers, writers and residuals of other packages: found, used, checked, and one sentence where they are broken."""
+"""Plugins of other packages are found, used and checked; broken ones give one sentence."""
 
 from __future__ import annotations
 

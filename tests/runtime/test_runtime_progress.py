@@ -1,4 +1,4 @@
-"""Progress within stages: shares that only grow, at no cost, shown as a bar; and a caller that ends the run."""
+"""Progress within stages: increasing shares, at no cost, shown as a bar; and cancellation by the caller."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def cloud() -> Cloud:
 
 
 class Ledger(Progress):
-    """Writes down the shares of each stage, and ends the run at one of the calls when asked to."""
+    """Records the shares of each stage, and cancels the run at a given call."""
 
     def __init__(self, method: str = "", stage: str = "") -> None:
         self.shares: dict[str, list[float]] = {}
@@ -79,7 +79,7 @@ def test_shares_only_grow_from_nothing_to_all(ledger: Ledger) -> None:
 
 
 def test_nothing_is_told_so_often_that_it_costs(ledger: Ledger) -> None:
-    # A bar takes some ten microseconds to be told, and the smallest run half a second.
+    # An update of a bar takes about ten microseconds, and the smallest run half a second.
     assert sum(map(len, ledger.shares.values())) < 200
 
 

@@ -142,6 +142,7 @@ def decimate_by_clustering(mesh: Mesh, faces: int) -> Mesh:
         return mesh
     means, triangles = _clustered(mesh, faces)
     vertices, nearest = SurfaceQuery(mesh).nearest(means)
+    # Normals and attributes are those of the place on the original surface.
     corners, weights = mesh.faces[nearest], barycentric(mesh.corners[nearest], vertices)
     normals = interpolate(mesh.vertex_normals(), corners, weights)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
@@ -160,6 +161,7 @@ def _clustered(mesh: Mesh, faces: int, *, faces_per_square: float = 2.3) -> tupl
     heavy = open3d.geometry.TriangleMesh(places, open3d.utility.Vector3iVector(mesh.faces))
     cube = np.sqrt(faces_per_square * mesh.area / faces) / size
     light = heavy.simplify_vertex_clustering(cube)
+    # The first width is an estimate; wider cubes leave fewer faces.
     while len(light.triangles) > faces:
         cube *= 1.1
         light = heavy.simplify_vertex_clustering(cube)

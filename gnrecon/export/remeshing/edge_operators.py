@@ -57,6 +57,7 @@ def collapse_short(
     CreasedSurface, array
         The surface without unused vertices, and the target lengths at those that are left.
     """
+    # Edges that were unsafe once are not tried again, so that they do not keep their neighbours from collapsing.
     refused = np.empty(0, dtype=np.int64)
     size = len(surface.vertices)
     for _ in range(most_rounds):
@@ -109,6 +110,7 @@ def _independent(surface: CreasedSurface, edges: EdgeTable, wanted: Mask) -> Int
 def _collapse_targets(surface: CreasedSurface, ends: Int) -> _Collapses:
     """Decide for each edge, of shape (N, 2), which end stays, and where."""
     kinds = surface.kinds()[ends]
+    # The end of the higher kind stays in place, so that corners and creases keep their position.
     kept = np.where(kinds[:, 0] > kinds[:, 1], ends[:, 0], ends[:, 1])
     even = (kinds[:, 0] == kinds[:, 1])[:, None]
     place = np.where(even, surface.vertices[ends].mean(axis=1), surface.vertices[kept])
@@ -122,6 +124,7 @@ def _keeps_topology(edges: EdgeTable, chosen: Int, size: int) -> Mask:
     links = coo_array((np.ones(len(both), dtype=np.int8), both.T), shape=(size, size)).tocsr()
     a, b = edges.ends[chosen].T
     common = np.asarray(links[a].multiply(links[b]).sum(axis=1)).reshape(-1)
+    # Fewer than three neighbours would leave two faces on the same three vertices.
     valence = np.bincount(both[:, 0], minlength=size)
     safe: Mask = (common == 2) & (valence[edges.opposite[chosen]] > 3).all(axis=1)
     return safe
@@ -142,6 +145,7 @@ def _keeps_shape(
     after = _collapse(surface, collapses, drop=False)
     changed = np.flatnonzero(owners >= 0)
     faces = after.faces[changed]
+    # The two faces of the collapsed edge vanish and are not checked.
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     changed, faces = changed[whole], faces[whole]
     areas = area_vectors(after.vertices, faces)

@@ -53,6 +53,7 @@ def flip_for_angles(surface: CreasedSurface, *, most_rounds: int = 8) -> Creased
     for _ in range(most_rounds):
         edges = EdgeTable.of(surface.faces)
         before, after = _least_angles(surface, edges)
+        # The threshold is above rounding, so that equal diagonals are not flipped back and forth.
         chosen = _independent_flips(surface, edges, after > before + 1e-6, after - before)
         if not len(chosen):
             break
@@ -63,6 +64,8 @@ def flip_for_angles(surface: CreasedSurface, *, most_rounds: int = 8) -> Creased
 def _valence_gain(surface: CreasedSurface, edges: EdgeTable) -> Int:
     """By how much the sum of squared deviations from the ideal valence falls, of shape (E,)."""
     valence = np.bincount(edges.ends.reshape(-1), minlength=len(surface.vertices))
+    # In a regular triangulation every vertex has six neighbours. A flip takes one from each end and gives one to each
+    # opposite vertex.
     off = valence - 6
     ends, opposite = off[edges.ends], off[edges.opposite]
     gain: Int = (ends**2 - (ends - 1) ** 2).sum(axis=1) + (opposite**2 - (opposite + 1) ** 2).sum(axis=1)
@@ -82,6 +85,7 @@ def _least_angle(vertices: Float, a: Int, b: Int, c: Int) -> Float:
     """Least angle of triangles by their corners' numbers, of shape (N,), radians."""
     corners = vertices[np.stack([a, b, c], axis=1)]
     sides = np.sort(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
+    # The law of cosines at the corner that faces the shortest side.
     short, middle, long = np.maximum(sides, np.finfo(np.float64).tiny).T
     angles: Float = np.arccos(np.clip((long**2 + middle**2 - short**2) / (2 * long * middle), -1.0, 1.0))
     return angles
@@ -164,6 +168,7 @@ def _to_middle_of_crease(surface: CreasedSurface, kinds: Int) -> Float:
     order = np.argsort(both[:, 0], kind="stable")
     pairs = both[order].reshape(-1, 2, 2)
     own, one, other = pairs[:, 0, 0], vertices[pairs[:, 0, 1]], vertices[pairs[:, 1, 1]]
+    # Only along the crease: across it the vertex would leave the surface.
     along = unit(other - one)
     places = vertices.copy()
     step = 0.5 * (one + other) - vertices[own]

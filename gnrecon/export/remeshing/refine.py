@@ -126,6 +126,7 @@ class _Step:
 def _steps(field: SignedDistance, options: RefineOptions, parameters: RemeshParameters) -> list[_Step]:
     angle, adaptive = options.feature_angle, options.adaptive
     length, tolerance, faces = options.remesh, options.simplify, options.faces
+    # Sharpening comes first, because the later steps keep the edges that they find.
     steps = [_Step("Sharpened edges", lambda mesh, _: _sharpened(mesh, field, angle), (1.0,))]
     if length is not None:
         done = f"Remeshed to edges of {'at most ' if adaptive else ''}{length:g}"

@@ -99,6 +99,7 @@ def move_vertices(
     edges = np.linalg.norm(np.diff(places[surface.faces], axis=1), axis=2)
     points, _, gradient = newton_project(places, field, steps, 0.5 * float(np.median(edges)))
     moved = without_flips(surface, points)
+    # A vertex that was not moved keeps the normal of its old place.
     stayed = (moved.vertices != points).any(axis=1)
     return replace(moved, normals=np.where(stayed[:, None], surface.normals, unit(gradient)))
 
@@ -146,6 +147,7 @@ def adaptive_lengths(
     smooth = inner & (turn < 2 * np.sin(np.radians(angle) / 2)) & (far > 0)
     wanted = np.radians(bend_degrees) * far[smooth] / np.maximum(turn[smooth], 1e-12)
     wanted = np.clip(wanted, finest_share * length, length)
+    # A vertex takes the shortest length that any of its edges asks for.
     lengths = np.full(len(surface.vertices), length)
     for end in (a, b):
         np.minimum.at(lengths, end[smooth], wanted)

@@ -1,4 +1,4 @@
-"""Normals by where the scanner stood, and what is done with those that a cloud has."""
+"""Normals oriented by scanner positions, and how given normals are treated."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_clouds import Float, sphere, torus
+from analytic_clouds import torus
+from made_shapes import sphere
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
 from gnrecon.ingest.orientation import oriented_normals

@@ -1,4 +1,4 @@
-"""Rows by stretches."""
+"""Slices of rows."""
 
 from __future__ import annotations
 

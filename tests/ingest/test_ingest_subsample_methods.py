@@ -1,7 +1,8 @@
-"""Farthest points, curvature, distances in spacings, and points that are kept from the fit."""
+"""Farthest points, curvature, distances in spacings, and validation points."""
 
 from __future__ import annotations
 
+import made_shapes
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -13,8 +14,7 @@ from gnrecon.runtime.errors import UsageError
 
 
 def sphere(count: int, rng: np.random.Generator) -> PointCloud:
-    points = rng.normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points, _ = made_shapes.sphere(count, rng)
     return PointCloud(points, points, {"row": np.arange(count)})
 
 

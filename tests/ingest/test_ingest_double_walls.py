@@ -1,4 +1,4 @@
-"""Layers that are there are found, with their distance; noise, edges, thin walls and steps are none."""
+"""Double layers are found, with their distance; noise, edges, thin walls and steps are not taken for them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from analytic_clouds import sphere, thin_shell, torus
+from analytic_clouds import thin_shell, torus
+from made_shapes import sphere
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare
