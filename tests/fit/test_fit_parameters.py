@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
-from pathlib import Path
 
 import numpy as np
 import pytest
+from parameter_checks import assert_frozen, read_attributes
 
 import gnrecon.fit
 from gnrecon.fit import FitOptions, parameters
@@ -23,23 +22,13 @@ from gnrecon.geometry.signed_distance import Density
 CLASSES = [found for _, found in inspect.getmembers(parameters, dataclasses.is_dataclass)]
 
 
-def used_names() -> set[str]:
-    """The names of all attributes that the sources of the fit read."""
-    sources = [path for path in Path(gnrecon.fit.__file__).parent.rglob("*.py") if path.name != "parameters.py"]
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sources]
-    return {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-
-
 @pytest.mark.parametrize("group", CLASSES, ids=lambda group: group.__name__)
 def test_groups_are_frozen_and_have_defaults(group: type) -> None:
-    instance = group()
-    for field in dataclasses.fields(group):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(instance, field.name, None)
+    assert_frozen(group())
 
 
 def test_every_constant_is_used() -> None:
-    used = used_names()
+    used = read_attributes(gnrecon.fit, "parameters.py")
     groups = [group for group in CLASSES if group is not FitParameters]
     unused = [(group.__name__, field.name) for group in groups for field in dataclasses.fields(group)]
     assert [both for both in unused if both[1] not in used] == []
