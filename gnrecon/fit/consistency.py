@@ -21,7 +21,7 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import smooth_spectrum
 from gnrecon.fit.initialisation import wide_start
-from gnrecon.fit.objective import Scene, Term, distance_term
+from gnrecon.fit.objective import ObjectiveTerm, Scene, distance_term
 from gnrecon.fit.parameters import GlobalFieldParameters, OutlierParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -63,8 +63,11 @@ def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Gen
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene, field = Scene.of(seen, options.device, rng), Siren((units,))
 
-    def terms(x: torch.Tensor, distance: torch.Tensor, most: int) -> list[Term]:
-        return [Term("interface", interface, scene.points[:most], None, 1.0), distance_term(scene, x, distance)]
+    def terms(x: torch.Tensor, distance: torch.Tensor, most: int) -> list[ObjectiveTerm]:
+        return [
+            ObjectiveTerm("interface", interface, scene.points[:most], None, 1.0),
+            distance_term(scene, x, distance),
+        ]
 
     theta = wide_start(field, scene, terms, rng, smooth_spectrum(min(GlobalFieldParameters.length_scales_radii), scene))
     sdf = NeuralSDF(field, theta, samples.frame, scene.box)

@@ -1,11 +1,10 @@
-"""Whether a scan's points are averaged before their detail is fitted, and how: what predicts left-out points better.
+"""Decides whether noisy points are averaged before the local fit, by cross-validation.
 
-The left-out points are as they were scanned, and the patches are the same, so that scores compare patch by patch. Only
-scans in which noise was found are tried.
-
-Some tens of patches tell a gain of less than their scatter from a loss no better than a coin does, so that it decides
-what is known of the shape beside them. Where faces meet at edges, the fit is better for averaging unless the patches
-contradict; anywhere else it smooths better by itself, unless they show that it does not.
+A bilateral filter (`shape_priors.bilateral_filter`) is applied to the training points; the validation points stay as
+they were scanned. Filters are compared with no filter on the same patches, patch by patch, and only for scans in which
+noise was found. On some tens of patches a small gain is not significant, so that the shape decides: where faces meet at
+sharp edges, points are averaged unless the patches contradict; elsewhere only if the gain is significant, because the
+local fit smooths without a filter.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Choice, Leftover, Trials
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import DenoisingParameters
 from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.fit.shape_priors.sharp_shape import SharpShape, has_edges
@@ -30,31 +29,31 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LocalData:
-    """What a fit of the detail is told.
+    """Data of the local fit.
 
     Parameters
     ----------
-    samples : averaged, or as they were
-    leftover : of a global field at the samples
-    belief : about them
-    averaging : how they were averaged, or None
+    samples : averaged, or as scanned
+    residuals : of the global field at the samples
+    hyperparameters : length scale and noise
+    averaging : the filter, or None
     """
 
     samples: Samples
-    leftover: Leftover
-    belief: Belief
+    residuals: FieldResiduals
+    hyperparameters: Hyperparameters
     averaging: BilateralFilter | None = None
 
     @classmethod
     def of_faces(cls, sdf: NeuralSDF, sharp: SharpShape) -> LocalData:
-        """Return what faces that were continued to their edges tell by themselves, beside a global field."""
-        return cls(sharp.samples, Leftover.of(sdf, sharp.samples), sharp.belief, sharp.averaging)
+        """Return the data of a shape with sharp edges, whose samples and hyperparameters are known."""
+        return cls(sharp.samples, FieldResiduals.of(sdf, sharp.samples), sharp.hyperparameters, sharp.averaging)
 
 
 def choose_local_data(
     sdf: NeuralSDF,
     samples: Samples,
-    held: Mask,
+    held_out: Mask,
     features: int,
     rng: np.random.Generator,
     device: str,
@@ -62,79 +61,80 @@ def choose_local_data(
     *,
     parameters: DenoisingParameters = DenoisingParameters(),
 ) -> LocalData:
-    """Choose how the points are averaged, if at all, and the belief that then predicts left-out points best.
+    """Select the filter, if any, and the hyperparameters that predict the validation points best.
 
-    A clean scan is not averaged, and its belief is what its points tell by themselves.
+    A clean scan is not averaged, and its hyperparameters follow from its points.
 
     Parameters
     ----------
     sdf : the global field, in the samples' frame
     samples : all of them
-    held : mask of shape (N,), of samples that the global field has not seen
+    held_out : mask of shape (N,), of the validation points, to which the global field was not fitted
     features : number of features a cube
     rng : draws patches and features
     device : a torch device
-    outliers : whether some were found; those that are left would make horns on what is fitted as clean
+    outliers : whether some were found; those that remain would make spikes if the scan were fitted as clean
+    parameters : of the filters and their selection
     """
-    leftover = Leftover.of(sdf, samples)
-    radius = leftover.density.radius
-    trials = Trials.draw(leftover, held, radius, rng, device, features)
-    clean = None if outliers else trials.clean()
+    residuals = FieldResiduals.of(sdf, samples)
+    radius = residuals.density.radius
+    validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
+    clean = None if outliers else validation.clean()
     if clean is not None:
-        return LocalData(samples, leftover, clean)
-    choice = trials.choice()
-    # Outliers that are left have no part in the noise that evidence tells.
-    plain = choice.belief if outliers else choice.best
-    # Estimated normals are means over edges already. The noise may be the limit itself, but for rounding.
-    if samples.estimated or choice.belief.position <= 1.001 * parameters.least_noise_disk_radii * radius:
-        return LocalData(samples, leftover, plain)
+        return LocalData(samples, residuals, clean)
+    selected = validation.select()
+    # The marginal likelihood is not robust to outliers that remain.
+    plain = selected.hyperparameters if outliers else selected.best
+    # Estimated normals are means over edges already. The factor keeps noise that equals the limit but for rounding.
+    if samples.estimated or selected.hyperparameters.position <= 1.001 * parameters.least_noise_disk_radii * radius:
+        return LocalData(samples, residuals, plain)
 
-    def with_kept(averaging: BilateralFilter) -> Trials:
+    def with_kept(averaging: BilateralFilter) -> CrossValidation:
         points, normals = samples.points.copy(), samples.normals.copy()
-        points[~held], normals[~held] = averaging.apply(points[~held], normals[~held])
-        # The noise of averaged points is alike among neighbours, of which no evidence is made.
-        of_averaged = Leftover.of(sdf, replace(samples, points=points, normals=normals))
-        return replace(trials, leftover=of_averaged, evidence=None)
+        points[~held_out], normals[~held_out] = averaging.apply(points[~held_out], normals[~held_out])
+        # Averaged points have correlated noise, for which the marginal likelihood is wrong.
+        of_averaged = FieldResiduals.of(sdf, replace(samples, points=points, normals=normals))
+        return replace(validation, residuals=of_averaged, likelihood=None)
 
     first = _candidates(parameters)[0]
-    found = _best(choice, with_kept, lambda: has_edges(*first.apply(samples.points, samples.normals)), parameters)
+    found = _best(selected, with_kept, lambda: has_edges(*first.apply(samples.points, samples.normals)), parameters)
     if found is None:
-        return LocalData(samples, leftover, plain)
+        return LocalData(samples, residuals, plain)
     averaging, better = found
     points, normals = averaging.apply(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
     _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width_radii)
-    return LocalData(samples, Leftover.of(sdf, samples), better.choice().belief, averaging)
+    return LocalData(samples, FieldResiduals.of(sdf, samples), better.select().hyperparameters, averaging)
 
 
 def _best(
-    choice: Choice,
-    kept_averaged: Callable[[BilateralFilter], Trials],
+    selected: SelectedModel,
+    kept_averaged: Callable[[BilateralFilter], CrossValidation],
     edges: Callable[[], bool],
     parameters: DenoisingParameters = DenoisingParameters(),
-) -> tuple[BilateralFilter, Trials] | None:
-    """Return the averaging that predicts best and its trials, or None where the points are better left as they are.
+) -> tuple[BilateralFilter, CrossValidation] | None:
+    """Return the filter that predicts best and its cross-validation, or None if no filter is better.
 
-    Whether there are edges is asked where the patches alone do not decide. All are compared at the length that suits
-    the points as they are; a better one is chosen afterwards.
+    Edges are looked for only if the patches do not decide. All filters are compared at the length scale of the scanned
+    points; a better one is selected afterwards.
     """
-    plain = _of_best_noise(choice.scores)
+    plain = _of_best_noise(selected.scores)
     first, *others = _candidates(parameters)
 
-    def tried(averaging: BilateralFilter) -> tuple[Float, Trials]:
-        trials = kept_averaged(averaging)
-        return plain - _of_best_noise(trials.scores(choice.belief.length)), trials
+    def tried(averaging: BilateralFilter) -> tuple[Float, CrossValidation]:
+        validation = kept_averaged(averaging)
+        return plain - _of_best_noise(validation.scores(selected.hyperparameters.length)), validation
 
-    gain, trials = tried(first)
-    doubt = gain.std() / np.sqrt(len(gain))
-    if not (gain.mean() > parameters.gain_standard_errors * doubt or (gain.mean() > -doubt and edges())):
+    gain, validation = tried(first)
+    error = gain.std() / np.sqrt(len(gain))
+    if not (gain.mean() > parameters.gain_standard_errors * error or (gain.mean() > -error and edges())):
         return None
     best, averaging = float(gain.mean()), first
     for other in others:
         gain, of_other = tried(other)
         if gain.mean() > best:
-            best, averaging, trials = float(gain.mean()), other, of_other
-    return averaging, trials
+            best, averaging, validation = float(gain.mean()), other, of_other
+    return averaging, validation
 
 
 def _candidates(parameters: DenoisingParameters) -> list[BilateralFilter]:

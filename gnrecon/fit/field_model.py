@@ -1,4 +1,4 @@
-"""The fitted field, answering in the file's own frame and units."""
+"""The fitted field in the frame and units of its file (`NeuralSDF`), and its model files (`save_sdf`, `load_sdf`)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class NeuralSDF:
     theta : parameters of shape (p,), of the field in unit coordinates
     frame : the similarity from unit to file coordinates
     box : where the field was fitted, in unit coordinates
-    options : what the fit was asked to do, as plain values
+    options : of the fit, as plain values
     support : points that the field was fitted to, of shape (N, 3), unit coordinates; where there were many, some of
         them; None where they are not known
     detail : what is added to the network near the data of a dense scan, unit coordinates
@@ -190,9 +190,8 @@ class NeuralSDF:
 FORMAT = "gnrecon-sdf-1"
 
 
-# Fitted fields in files: one safetensors file (`.gnr`) with parameters, frame, box, options and some of the data.
-#
-# Nothing in it is code or pickle. Files without data, as earlier versions wrote them, are read too.
+# A model file (`.gnr`) is one safetensors file with parameters, frame, box, options and some of the data, without code
+# or pickle. Files without data, as earlier versions wrote them, are read too.
 
 
 def save_sdf(sdf: NeuralSDF, path: str | Path, overwrite: bool = False) -> None:
@@ -259,7 +258,7 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
 
 
 def _require_sense(path: str | Path, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Refuse numbers that no fit makes, before they become a mesh that nobody understands."""
+    """Raise an error for shapes and numbers that no fit makes."""
     shapes = {"frame.center": (3,), "frame.scale": (), "box": (2, 3)}
     for name, tensor in tensors.items():
         if name in shapes and tensor.shape != shapes[name]:
@@ -273,7 +272,7 @@ def _require_sense(path: str | Path, tensors: Mapping[str, torch.Tensor]) -> Non
         raise InputError(f"{path} holds {tuple(support.shape)} numbers as the data's points, not rows of three.")
 
 
-# The detail of a dense scan's field as tensors of a model file, and back.
+# The local fields as tensors of a model file, and back.
 
 
 def detail_tensors(detail: Detail) -> dict[str, Tensor]:
@@ -308,9 +307,9 @@ def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
     cubes, features = len(lengths), len(phases)
     shapes = (lattice.shape, noise.shape, keys.shape, lengths.shape, tuple(frequencies.shape), tuple(amplitudes.shape))
     if shapes != ((5,), (2,), (cubes, 3), (cubes,), (features, 3), (cubes, features)):
-        raise InputError(f"{path} holds a detail whose parts do not fit together: {shapes}.")
+        raise InputError(f"{path} holds local fields whose parts do not fit together: {shapes}.")
     if not ((lengths > 0).all() and (noise > 0).all() and lattice[3] > 0 and 0 < lattice[4] <= 1):
-        raise InputError(f"{path} holds a detail whose lengths or noise are not positive.")
+        raise InputError(f"{path} holds local fields whose lengths or noise are not positive.")
     partition = Partition(lattice[:3], float(lattice[3]), float(lattice[4]))
     of_all = Features(frequencies, phases)
     return Detail(partition, keys, lengths, of_all, amplitudes, float(noise[0]), float(noise[1]))

@@ -1,7 +1,9 @@
-"""The smooth global field of a scan: one wide layer of sine features, as long as the shape lets them be (`smoothness`).
+"""The smooth global field: one wide layer of sine features, whose length scale and normal weight are selected.
 
-Normals may weigh as much in it as they are worth. But a shape with more detail than the layer can follow pays for exact
-normals with sheets in free space; where the winding number contradicts the field beyond doubt, normals weigh little.
+Small fields of each candidate length scale and weight are fitted to some of the points; the validation points select
+among them (`global_smoothness`). Heavy normals make the field exact on smooth shapes. On a shape with more detail than
+the layer can follow they cause sheets in free space: if the winding number contradicts the sign there in too many
+places, the field is fitted again with the default weight (`fit_global`).
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class GlobalField:
 
 def fit_global(
     samples: Samples,
-    held: Mask,
+    held_out: Mask,
     rows: Int,
     options: FitOptions,
     rng: np.random.Generator,
@@ -56,11 +58,12 @@ def fit_global(
     Parameters
     ----------
     samples : Samples
-    held : mask of shape (N,), of samples that the field does not see, on which its smoothness is chosen
-    rows : of the samples that it sees, none of them held
+    held_out : mask of shape (N,), of the validation points
+    rows : of the samples that the field is fitted to, none of them a validation point
     options : of which the device, the residual of the normals and the solver are used
     rng : draws features and samples of the volume
-    advance : told of the share that is done
+    advance : called with the share that is done
+    parameters : candidates and sizes
 
     Raises
     ------
@@ -69,7 +72,7 @@ def fit_global(
     """
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
-    smoothness = global_smoothness(samples, held, scene, rng.spawn(1)[0], parameters=parameters)
+    smoothness = global_smoothness(samples, held_out, scene, rng.spawn(1)[0], parameters=parameters)
     spectrum = smooth_spectrum(smoothness.length, scene, parameters=parameters)
     field = Siren((parameters.units,))
     linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
@@ -79,14 +82,14 @@ def fit_global(
         sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
         return sdf, solution, wrong_sign(sdf, scene, rng.spawn(1)[0])
 
-    # Where more is asked of the surface in holes than the data says, normals may not carry it out of the box.
-    plain_reach = ObjectiveParameters.normal_reach_spacings
-    reach = plain_reach if options.regularisers else smoothness.reach
+    # With curvature penalties in holes, heavy normals could carry the surface out of the box.
+    default_reach = ObjectiveParameters.normal_reach_spacings
+    reach = default_reach if options.regularisers else smoothness.reach
     sdf, solution, wrong = fitted(reach, subrange(advance, 0.0, 0.5))
-    if reach > plain_reach and wrong > parameters.wrong_sign_share:
-        plain, plainly, ghosts = fitted(plain_reach, subrange(advance, 0.5, 1.0))
-        if wrong > ghosts + parameters.wrong_sign_share:
-            reach, sdf, solution = plain_reach, plain, plainly
+    if reach > default_reach and wrong > parameters.wrong_sign_share:
+        default_sdf, default_solution, default_wrong = fitted(default_reach, subrange(advance, 0.5, 1.0))
+        if wrong > default_wrong + parameters.wrong_sign_share:
+            reach, sdf, solution = default_reach, default_sdf, default_solution
     _log.info(
         "The global field has %d features of length %.3g radii, and sees %d points; normals reach %.3g spacings.",
         parameters.units,
@@ -98,20 +101,19 @@ def fit_global(
 
 
 def wrong_sign(sdf: NeuralSDF, scene: Scene, rng: np.random.Generator) -> float:
-    """Return the share of the free space where the field has the wrong sign beyond doubt, in [0, 1]."""
+    """Return the share of the free space where the sign is certain and the field has the other one, in [0, 1]."""
     x, distance = scene.volume(scene.volume_count, rng)
     other = sdf.sdf(sdf.frame.to_world(x)) * distance < 0
     certain = is_sign_certain(scene.coarse.winding_number(x[other]))
     return float(certain.sum() / max(len(x), 1))
 
 
-# How smooth a scan's shape is as a whole, and what its normals are worth, chosen by left-out points.
+# Selection of the global length scale and of the normals' weight by validation points.
 #
-# A blob, a pipe or a plate has few degrees of freedom, and a field of long features averages the noise of many points
-# and closes wide holes well; a gear or a foam needs short ones. Exact normals tell more of a smooth shape than noisy
-# points do; of coarse or scattered ones it is the other way round. Small fields of each length and weight of the
-# normals are fitted to some of the points, as a cube's correction is (`patch`), and the longest one counts that
-# predicts the points that are left out as well as the best, with the weight at which it does.
+# A blob, a pipe or a plate has few degrees of freedom: a field of long features averages the noise of many points and
+# closes wide holes well. A gear or a foam needs short features. Exact normals carry more information about a smooth
+# shape than noisy points do; coarse or scattered ones carry less. The longest length scale is selected that predicts
+# the validation points as well as the best one, with its best weight.
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def smooth_spectrum(
 
 def global_smoothness(
     samples: Samples,
-    held: Mask,
+    held_out: Mask,
     scene: Scene,
     rng: np.random.Generator,
     *,
@@ -147,11 +149,11 @@ def global_smoothness(
     Parameters
     ----------
     samples : Samples
-    held : mask of shape (N,), of the samples that are left out of `scene`
+    held_out : mask of shape (N,), of the validation points, which `scene` does not contain
     scene : Scene
     rng : draws features and samples
     """
-    if held.sum() < parameters.least_validation_points:
+    if held_out.sum() < parameters.least_validation_points:
         return Smoothness(parameters.length_scales_radii[0], ObjectiveParameters.normal_reach_spacings)
     seen = rng.permutation(len(scene.samples))[: parameters.selection_points]
     x, distance = scene.volume(parameters.selection_volume_samples, rng)
@@ -161,9 +163,9 @@ def global_smoothness(
     volume = scene.tensor(x), signed, signed, signed, signed.abs()
     patch = Patch(points, torch.zeros(len(points)).to(points), normals, *volume, center)
     features = Features.draw(parameters.selection_features, rng, points)
-    out = np.flatnonzero(held)[: parameters.selection_points]
+    out = np.flatnonzero(held_out)[: parameters.selection_points]
     left, turned = scene.tensor(samples.points[out]), scene.tensor(samples.normals[out])
-    # Estimated ones are means of their neighbours', which smooth fields predict too well.
+    # Estimated normals are means over neighbours, which smooth fields predict too well.
     ignored = samples.estimated and len(samples) <= ModelSelectionParameters.sparse_points
     reaches = parameters.normal_reaches_spacings[: 1 if ignored else None]
     noise = parameters.position_noise_spacings

@@ -1,4 +1,4 @@
-"""The start of a fit, which decides how it ends.
+"""Starts of a fit: exact linear solves for the last layer of a sine network (`wide_start`, `spectral_start`).
 
 *Wide and linear.* One hidden layer of random sine features sin(w . x + b) is linear in its output weights, so that
 f = 0, grad f = n and the coarse signed distance have one exact least-squares solution (variable projection). The
@@ -6,7 +6,7 @@ frequencies w follow the spectral density of a Matern kernel, a Student t distri
 normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of
 kernel interpolation with Hermite data.
 Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
-Where the solution's sign disagrees with the coarse distance ("ghosts"), samples are added and the solve is repeated.
+Where the solution's sign disagrees with the coarse distance, samples are added and the solve is repeated.
 
 *Spectral.* Deeper networks begin with normal frequencies of fixed standard deviation in the first layer, hidden weights
 that keep the variance of sines (Sitzmann et al. 2020, theorem 1.8), uniform phases, and one exact solve of the last
@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.fit.objective import FieldProblem, Scene, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
 from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
@@ -34,7 +34,7 @@ from gnrecon.least_squares.system import identity
 from gnrecon.runtime.errors import FitError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
-TermsOf = Callable[[Tensor, Tensor, int], Sequence[Term]]
+TermsOf = Callable[[Tensor, Tensor, int], Sequence[ObjectiveTerm]]
 """Terms of volume samples x, their coarse distances, and at most so many data points."""
 
 
@@ -69,7 +69,7 @@ def wide_start(
 ) -> Tensor:
     """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
 
-    `advance` is told of the share of the rounds that is done.
+    `advance` is called with the share of the rounds that is done.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def wide_start(
     frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
-    search = GhostSearch(scene.coarse, x, np.sign(distance))
+    search = WrongSignSearch(scene.coarse, x, np.sign(distance))
     for round_number in range(parameters.rounds):
         last = round_number + 1 == parameters.rounds
         most_points = parameters.final_points if last else parameters.search_points
@@ -89,7 +89,7 @@ def wide_start(
         advance((round_number + 1) / parameters.rounds)
         if not last:
             trial = scene.places(parameters.trial_factor * scene.volume_count, rng)
-            wrong, expected = search.ghosts(trial, partial(_value, field, theta, scene))
+            wrong, expected = search.wrong_signs(trial, partial(_value, field, theta, scene))
             some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], parameters.wrong_sign_repeats)
             x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
     return theta
@@ -150,7 +150,7 @@ def random_network(
 
 def solve_last_layer(
     field: Siren,
-    terms: Sequence[Term],
+    terms: Sequence[ObjectiveTerm],
     theta: Tensor,
     ridge: float | None = None,
     *,
@@ -180,16 +180,16 @@ def solve_last_layer(
     raise FitError("The linear start could not be solved: the system holds values that are not finite.")
 
 
-# Where in free space a field has the wrong sign: what makes the ghost sheets and the horns of a mesh.
+# Places in free space where a field has the wrong sign. They cause detached sheets and spikes in the mesh.
 #
-# The sign is that of the winding number, which costs as much as several values of a field. But from place to place it
-# changes only through the data, or where a hole is closed: so the nearest sample of known sign nearly always tells it,
-# and the winding number is asked for only where the field contradicts that sample.
+# The true sign is that of the winding number, which costs as much as several evaluations of the field. But it changes
+# only across the data or the closing of a hole, so that it nearly always equals that of the nearest sample of known
+# sign. The winding number is evaluated only where the field contradicts that sample.
 
 
 @dataclass
-class GhostSearch:
-    """A search that remembers the signs which it has found.
+class WrongSignSearch:
+    """A search for places of the wrong sign that remembers the signs it has computed.
 
     Parameters
     ----------
@@ -202,12 +202,12 @@ class GhostSearch:
     points: Float
     signs: Float
 
-    def ghosts(self, x: Float, value: Callable[[Float], Float]) -> tuple[Float, Float]:
+    def wrong_signs(self, x: Float, value: Callable[[Float], Float]) -> tuple[Float, Float]:
         """Return those of x where the value has the wrong sign, of shape (G, 3), and the coarse distances there.
 
         Parameters
         ----------
-        x : array of shape (Q, 3); what is too near to the data for a coarse distance is left out
+        x : array of shape (Q, 3); those too near to the data for a coarse distance are ignored
         value : gives the field's values, of shape (N,), at points, of shape (N, 3)
         """
         known, size, _ = self.coarse.size(x)

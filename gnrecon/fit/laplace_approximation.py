@@ -11,12 +11,12 @@ for Backpropagation Networks (1992).
 *Noise.* s^2 = |r|^2 / (M - g), the residuals at the mode over the rows that are left when the parameters have taken
 theirs: g = tr(C J^T J) / s^2. What the features cannot follow counts as noise. The formula is applied until s settles.
 The plain mean square would be too small, because these networks nearly interpolate; but the noise is not less than
-that, because a fit that leaves residuals which the data alone would not ask for is no better than they are.
+that: a fit cannot be more accurate than its residuals.
 
 *Prior.* Within each layer one variance for all parameters, such that they move f at the data by 10 radii in the
 root mean square: the fit's own ridge is as weak. The output weights have mean zero, all others stay where they are.
 
-The coarse distances of the volume are left out. Their errors are alike over whole regions, and taken as independent
+The coarse distances of the volume are left out. Their errors are correlated over whole regions; taken as independent,
 they make the field look certain in the middle of holes (docs/research/2026-11-21-uncertainty-models.md).
 """
 
@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.fit.objective import FieldProblem, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.fit.parameters import LaplaceParameters
 from gnrecon.least_squares import LayeredJacobian
 from gnrecon.least_squares.direct import damped_factor, solve_factored
@@ -123,7 +123,7 @@ def _noise(equations: _NormalEquations, posterior: Laplace) -> float:
     return float((squares / max(len(equations.residual) - taken, 1.0)) ** 0.5)
 
 
-# The rows of the data in a fit's Jacobian, for what is asked of a fit once it is done.
+# The rows of the data in a fit's Jacobian.
 #
 # One interface row (f = 0) and the rows of the normal's residual a point, weighted as in the fit (`loss`), so that
 # residuals are positions in radii. Their columns are the free parameters: all of a network of up to 3,000
@@ -142,7 +142,7 @@ class DataRows:
     theta : all parameters, of shape (p,)
     points, normals : of shape (N, 3), unit coordinates
     normal_residual : the fit's residual of the normals
-    normal_weight : of its square beside that of the interface
+    normal_weight : of its square, relative to that of the interface
     """
 
     field: Siren
@@ -160,14 +160,14 @@ class DataRows:
         points, normals = (self.points, self.normals) if rows is None else (self.points[rows], self.normals[rows])
         # The fit's terms are means over their points; here each row counts as it is.
         count = float(len(points))
-        normal = Term("normal", self.normal_residual, points, normals, count * self.normal_weight)
-        return self._linearise([Term("interface", interface, points, None, count), normal])
+        normal = ObjectiveTerm("normal", self.normal_residual, points, normals, count * self.normal_weight)
+        return self._linearise([ObjectiveTerm("interface", interface, points, None, count), normal])
 
     def values(self, points: Tensor) -> LayeredJacobian:
         """Return the derivatives of f at points, of shape (N, 3), by the free parameters."""
-        return self._linearise([Term("value", interface, points, None, float(len(points)))])[0]
+        return self._linearise([ObjectiveTerm("value", interface, points, None, float(len(points)))])[0]
 
-    def _linearise(self, terms: Sequence[Term]) -> tuple[LayeredJacobian, Tensor]:
+    def _linearise(self, terms: Sequence[ObjectiveTerm]) -> tuple[LayeredJacobian, Tensor]:
         units = free_units(self.field, self.theta.device)
         problem = FieldProblem(self.field, terms, self.theta, units, keep_bytes=LaplaceParameters.factor_bytes)
         return problem.linearise(problem.free())

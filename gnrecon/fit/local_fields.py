@@ -20,10 +20,10 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.local_solve import Belief, PatchSystem
-from gnrecon.fit.model_selection import Leftover, Volume
+from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
+from gnrecon.fit.model_selection import FieldResiduals, Volume
 from gnrecon.fit.parameters import LocalFieldParameters
-from gnrecon.fit.regularised import Shaping
+from gnrecon.fit.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.runtime.parallel import map_in_threads
@@ -31,7 +31,7 @@ from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 _log = logging.getLogger(__name__)
 
-ShapingFor = Callable[[float], Shaping]
+PenaltiesFor = Callable[[float], SurfacePenalties]
 """Returns the curvature penalties for features of a length scale, in radii."""
 
 
@@ -42,7 +42,7 @@ def fit_detail(
     rng: np.random.Generator,
     device: str,
     advance: ProgressCallback = ignore_progress,
-    shape: ShapingFor | None = None,
+    shape: PenaltiesFor | None = None,
     *,
     parameters: LocalFieldParameters = LocalFieldParameters(),
 ) -> Detail:
@@ -58,22 +58,22 @@ def fit_detail(
     advance : called with the share that is done
     shape : gives the curvature penalties for the length scale of the local fields
     """
-    samples, leftover, belief = data.samples, data.leftover, data.belief
+    samples, residuals, hyperparameters = data.samples, data.residuals, data.hyperparameters
     _log.info(
-        "Chosen for the detail: length %.3g radii, noise %.2g radii and %.2g radians; %d features a cube.",
-        belief.length,
-        belief.position,
-        belief.angle,
+        "Local fields: length scale %.3g radii, noise %.2g radii and %.2g radians; %d features each.",
+        hyperparameters.length,
+        hyperparameters.position,
+        hyperparameters.angle,
         features,
     )
-    coarse = CoarseDistance(samples.points, samples.normals, rng, leftover.density)
-    shaping = None if shape is None else shape(belief.length)
-    cubes = _Cubes.of(leftover, belief, features, rng, device, shaping, parameters)
+    coarse = CoarseDistance(samples.points, samples.normals, rng, residuals.density)
+    penalties = None if shape is None else shape(hyperparameters.length)
+    cubes = _Cubes.of(residuals, hyperparameters, features, rng, device, penalties, parameters)
     return cubes.detail(sdf, coarse, rng, subrange(advance, parameters.selection_time_share, 1.0))
 
 
 def cube_length(
-    belief: Belief,
+    hyperparameters: Hyperparameters,
     disks: Float,
     radius: float,
     *,
@@ -83,77 +83,79 @@ def cube_length(
 
     Parameters
     ----------
-    belief : of the whole scan
+    hyperparameters : of the whole scan
     disks : array of shape (N,), radii of the disks that the cube's points stand for
     radius : their median in the whole scan
     most_length_stretch : most that a cube's length scale may exceed the scan's
     """
-    return belief.length * min(max(float(np.median(disks) / radius), 1.0), most_length_stretch)
+    return hyperparameters.length * min(max(float(np.median(disks) / radius), 1.0), most_length_stretch)
 
 
 @dataclass(frozen=True)
 class _Cubes:
     """The cubes of a detail with the data that they are fitted to."""
 
-    leftover: Leftover
-    belief: Belief
+    residuals: FieldResiduals
+    hyperparameters: Hyperparameters
     features: Features
     partition: Partition
     device: str
-    shaping: Shaping | None
+    penalties: SurfacePenalties | None
     parameters: LocalFieldParameters
 
     @classmethod
     def of(
         cls,
-        leftover: Leftover,
-        belief: Belief,
+        residuals: FieldResiduals,
+        hyperparameters: Hyperparameters,
         count: int,
         rng: np.random.Generator,
         device: str,
-        shaping: Shaping | None,
+        penalties: SurfacePenalties | None,
         parameters: LocalFieldParameters,
     ) -> _Cubes:
-        """Return the cubes of a belief's length, each of `count` features."""
+        """Return the cubes of a length scale, each with `count` features."""
         like = torch.zeros(0, dtype=torch.float64, device=device)
-        cell = parameters.cube_edge_lengths * belief.length
+        cell = parameters.cube_edge_lengths * hyperparameters.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
-        partition = Partition(leftover.points.min(axis=0) - 0.137 * cell, cell)
+        partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
         features = Features.draw(count, rng, like)
-        return cls(leftover, belief, features, partition, device, shaping, parameters)
+        return cls(residuals, hyperparameters, features, partition, device, penalties, parameters)
 
     def detail(
         self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: ProgressCallback
     ) -> Detail:
         """Fit all cubes that hold data."""
-        keys, _ = self.partition.members(self.leftover.points)
+        keys, _ = self.partition.members(self.residuals.points)
         volumes = self._volumes(sdf, coarse, keys, rng)
-        reach = self.partition.reach + self.parameters.data_margin_disk_radii * self.leftover.density.radius
-        radius, disks = self.leftover.density.radius, self.leftover.density.disks
+        reach = self.partition.reach + self.parameters.data_margin_disk_radii * self.residuals.density.radius
+        radius, disks = self.residuals.density.radius, self.residuals.density.disks
 
         def solved(number: int) -> tuple[float, Tensor] | None:
             """Return the length and amplitudes of a cube, or None where it holds too few points."""
             center = self.partition.center(keys[number])
-            rows = self.leftover.within(center, reach)
+            rows = self.residuals.within(center, reach)
             if len(rows) < self.parameters.least_points:
                 return None
             stretch = self.parameters.most_length_stretch
-            length = cube_length(self.belief, disks[rows], radius, most_length_stretch=stretch)
-            patch = self.leftover.patch(rows, center, volumes[number], self.device)
+            length = cube_length(self.hyperparameters, disks[rows], radius, most_length_stretch=stretch)
+            patch = self.residuals.patch(rows, center, volumes[number], self.device)
             return length, self._solved(PatchSystem(patch, self.features, length, patch.size), length, center)
 
         cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
-        _log.info("Solved %d cubes of detail; %d held too few points.", len(kept), len(keys) - len(kept))
-        noise = self.belief.position, self.belief.angle
+        _log.info("Fitted %d local fields; %d cubes had too few points.", len(kept), len(keys) - len(kept))
+        noise = self.hyperparameters.position, self.hyperparameters.angle
         return Detail(self.partition, keys[kept], np.array(lengths), self.features, torch.stack(amplitudes), *noise)
 
     def _solved(self, system: PatchSystem, length: float, center: Float) -> Tensor:
         """Return the amplitudes of the cube about a centre, of shape (m,)."""
-        if self.shaping is None:
-            return system.solve_within(self.belief.position, self.belief.angle)
-        return self.shaping.bend_cube(self.features, length, center, self.partition.reach, self.belief, system)
+        if self.penalties is None:
+            return system.solve_with_bounds(self.hyperparameters.position, self.hyperparameters.angle)
+        return self.penalties.penalise_cube(
+            self.features, length, center, self.partition.reach, self.hyperparameters, system
+        )
 
     def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
         """Return samples of each cube that lie clear of the data, with bounds that the coarse distance sets."""
@@ -165,8 +167,8 @@ class _Cubes:
         x, cube = x[inside], cube[inside]
         clear, signed, distance, certain = coarse.at(x, self.parameters.clearance_disk_radii)
         x, cube = x[clear], cube[clear]
-        if self.shaping is not None:
-            signed = self.shaping.volume_distances(x, signed)
+        if self.penalties is not None:
+            signed = self.penalties.volume_distances(x, signed)
         own = sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
         ends = np.searchsorted(cube, np.arange(1, len(keys)))
         parts = (np.split(values, ends) for values in (x, own, signed, certain, distance))

@@ -1,10 +1,11 @@
-"""The exact fit of one patch's sine features to what a global field leaves over at the points.
+"""The exact fit of one cube's sine features to the residuals of the global field.
 
-A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) has, with independent normal a_j of variance 2 s^2 / m, the
-distribution of a smooth random function of size s and length l. Given points where f + c = 0 and grad(f + c) = n, up to
-a noise of the positions and one of the normals, and samples of the volume where f + c is about the coarse distance, up
-to a share of it, its most probable amplitudes solve one linear system. It smooths as much as the noise asks for, and
-free space keeps its sign: where the correction leaves its bounds, the samples are asked for again, with more weight.
+A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) with independent normal a_j of variance 2 s^2 / m is, for many
+features, a Gaussian process of standard deviation s and length scale l. The data are f + c = 0 and grad(f + c) = n at
+the points, with noise in position and in normals, and f + c near the coarse distance at samples of free space, within a
+share of it. The most probable amplitudes solve one linear system (`PatchSystem`, or `LocalRowSystem` for few points).
+Free space keeps its sign: samples where the correction violates its bounds are added again with more weight
+(`PatchSystem.solve_with_bounds`).
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 2.1, with the features of Rahimi
 and Recht (2007) and observations of the gradient.
 """
@@ -25,8 +26,8 @@ from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)
-class Belief:
-    """What is assumed of a scan and its surface, all standard deviations or lengths.
+class Hyperparameters:
+    """Length scale and noise of a scan, the hyperparameters of the Gaussian process.
 
     Parameters
     ----------
@@ -48,8 +49,8 @@ class Patch:
     ----------
     points : of shape (N, 3), unit coordinates
     value, gradient : what c and grad c should be there, of shape (N,) and (N, 3)
-    volume, wanted, distance : samples of shape (Q, 3), what c should be there, and how far from the data they are, both
-        of shape (Q,)
+    volume : samples of shape (Q, 3)
+    wanted, distance : target of c there, and the distance from the data, both of shape (Q,)
     lower, upper : of shape (Q,), what c must be at least and at most at the samples
     center : of shape (3,), origin of the features' coordinates
     """
@@ -109,13 +110,13 @@ class PatchSystem:
         amplitudes: Tensor = self._scale * solve_factored(factor, right)
         return amplitudes
 
-    def solve_within(
+    def solve_with_bounds(
         self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
-        A one-sided penalty by an active set: where c is beyond a bound, the bound is asked for with more weight. What
-        was asked for stays in the system.
+        A one-sided penalty by an active set: where c violates a bound, a row with the bound as target is added, with
+        more weight. The other rows stay in the system.
         """
         amplitudes, patch = self.solve(position, angle), self._patch
         deviation = patch.deviation
@@ -149,7 +150,7 @@ class PatchSystem:
         return product.add_(self._volume[0], alpha=self._scale**2)
 
 
-class RowSystem:
+class LocalRowSystem:
     """The same system in the space of its rows, for a patch of few points: K + 1 with K = s^2 J J^T.
 
     The most probable amplitudes are s^2 J^T (s^2 J J^T + 1)^-1 r. Parameters are those of `PatchSystem`.
@@ -185,16 +186,16 @@ def data_kernel(patch: Patch, features: Features, length: float, size: float) ->
     return size**2 * 2.0 / len(features) * (rows @ rows.T)
 
 
-def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | RowSystem:
+def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | LocalRowSystem:
     """Return the smaller one of the two systems that `solve` may use; parameters as those of `PatchSystem`."""
     rows = 4 * len(patch.points) + len(patch.volume)
-    return (RowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
+    return (LocalRowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
 
 
 def _factor(
     product: Callable[[], Tensor], like: Tensor, *, attempts: int = LocalSolveParameters.damping_attempts
 ) -> Tensor | None:
-    """Return the Cholesky factor of a product, made anew for each attempt, plus one or what more rounding asks."""
+    """Return the Cholesky factor of a product plus the identity, or plus more where rounding requires it."""
     damping = torch.ones_like(like)
     for _ in range(attempts):
         factor = damped_factor(product(), damping, overwrite=True)
@@ -220,7 +221,7 @@ def _data_rows(patch: Patch, features: Features, length: float, rows: slice) -> 
 
 
 def _volume_rows(patch: Patch, features: Features, length: float) -> tuple[Tensor, Tensor]:
-    """Return the features at the samples of the volume, of shape (Q, m), and what is wanted, over their deviation."""
+    """Return the features at the samples of the volume, of shape (Q, m), and their targets, over their deviation."""
     deviation = patch.deviation
     return features.phase(patch.volume, patch.center, length).sin() / deviation[:, None], patch.wanted / deviation
 

@@ -1,14 +1,14 @@
-"""Noise of a scan's positions and normals, by its evidence: how probable noise and a smooth surface make what is seen.
+"""Noise of a scan's positions and normals: by the marginal likelihood, or directly for clean scans (`clean_noise`).
 
-What a global field leaves over at the points of a patch is taken for a random function c, as `patch` does, plus noise.
-Values and gradients of c have a covariance K = s^2 J J^T, J being the derivatives of the features' weighted sum, so
-that with noise of covariance D what is left over, y, has the log density
+The residuals y of the global field at the points of a patch are modelled as the values and gradients of a Gaussian
+process c plus noise, as in `local_solve`. With the covariance K = s^2 J J^T of values and gradients of c, where J holds
+the derivatives of the features' sum, and the noise covariance D, the log marginal likelihood of a patch is
 
-    -1/2 (y^T (K + D)^-1 y + log det (K + D)) + constant,
+    -1/2 (y^T (K + D)^-1 y + log det (K + D)) + constant.
 
-whose sum over patches is the evidence. All points tell it, and where left-out points say the same of several noises,
-because the noise of their own normals hides the difference, it still tells them apart. Lengths it tells less well: for
-it a surface is as bent everywhere, which no shape is.
+The noise that maximises its sum over patches is selected (`MarginalLikelihood.noise`). All points contribute, so that
+it separates noises which validation points cannot, because those have noise of their own. It selects length scales
+less well: under it a surface is equally curved everywhere, which no shape is.
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 5.4.1.
 """
 
@@ -34,12 +34,12 @@ Place = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Patches of a scan, which tell its noise.
+class MarginalLikelihood:
+    """Patches of a scan and the features of their Gaussian process.
 
     Parameters
     ----------
-    patches : what is left over at some points each; samples of the volume count for nothing
+    patches : with the residuals at their points; samples of the volume are ignored
     features : whose weighted sums are the functions
     radius : of the disk that a point stands for, unit coordinates
     device : a torch device
@@ -60,15 +60,15 @@ class Evidence:
         device: str,
         *,
         parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters(),
-    ) -> Evidence:
-        """Return the evidence of patches, drawing its features."""
+    ) -> MarginalLikelihood:
+        """Return the marginal likelihood of patches, with random features."""
         features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
         return cls(patches, features, radius, device, parameters)
 
     def noise(self, length: float) -> tuple[float, float]:
-        """Return the noise of positions, unit coordinates, and of normals, radians, that has most evidence.
+        """Return the noise of positions, unit coordinates, and of normals, radians, of the largest marginal likelihood.
 
-        It is a place in both tables that no neighbour in them excels.
+        It is a local maximum over both tables of candidates.
 
         Parameters
         ----------
@@ -129,34 +129,34 @@ Noise = tuple[float, float]
 #
 # Two neighbours of a smooth surface lie nearly as high over each other's tangent planes, with opposite signs: half the
 # sum of both heights is nothing on planes, spheres and round cylinders, and of third order in their distance elsewhere.
-# Noise is of order zero there, and that of the normals of order one. So points tell by themselves, without a surface,
-# how noisy they are. Left-out points tell it of clean scans hardly at all: they lie a spacing away from the others,
-# where the shape that is not known matters far more than a noise of a hundredth of that.
+# Noise of positions is of order zero there, and that of normals of order one. So pairs of points show the noise without
+# a fitted surface. Validation points hardly show the noise of a clean scan: they lie a spacing away from the others,
+# where the unknown shape matters far more than a noise of a hundredth of that.
 
 
 def clean_noise(
     points: Float,
     normals: Float,
     density: Density,
-    over: float,
+    rms: float,
     estimated: bool,
     *,
     parameters: CleanScanParameters = CleanScanParameters(),
 ) -> Noise | None:
     """Return the noise of positions, unit coordinates, and normals, radians, of a clean scan; None of any other.
 
-    It is also None where a field that is to be corrected leaves nothing over at the points.
+    It is also None where the global field has no residuals to correct.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), unit normals
     density : of the points
-    over : root mean square of what is left over, unit coordinates
+    rms : root mean square of the residuals of the global field, unit coordinates
     estimated : whether the normals were found from the points
     """
-    if over < parameters.least_residual_disk_radii * density.radius:
+    if rms < parameters.least_residual_disk_radii * density.radius:
         return None
-    height = heights(points, normals, density, parameters=parameters)
+    height = median_pair_height(points, normals, density, parameters=parameters)
     if not height <= parameters.most_height:
         return None
     least = parameters.least_position_noise_disk_radii
@@ -166,26 +166,26 @@ def clean_noise(
     return max(height, least) * density.radius, angle
 
 
-def heights(
+def median_pair_height(
     points: Float,
     normals: Float,
     density: Density,
     *,
     parameters: CleanScanParameters = CleanScanParameters(),
 ) -> float:
-    """Return the median height of neighbours over the surface that both their normals tell; NaN of too few pairs.
+    """Return the median height of neighbours over the surface through both their tangent planes; NaN for few pairs.
 
     It is half the sum of both heights over each other's planes, over the larger of their distance and a disk's radius.
     The parameters are those of `clean_noise`.
     """
-    asked = slice(None, None, -(-len(points) // parameters.most_points))
-    disks = density.disks[asked, None]
+    some = slice(None, None, -(-len(points) // parameters.most_points))
+    disks = density.disks[some, None]
     ranks = list(range(2, min(parameters.neighbours + 1, len(points)) + 1))
-    distance, near = density.tree.query(points[asked], ranks)
-    cosine = np.einsum("ikd,id->ik", normals[near], normals[asked])
+    distance, near = density.tree.query(points[some], ranks)
+    cosine = np.einsum("ikd,id->ik", normals[near], normals[some])
     least_cosine = np.cos(np.radians(parameters.most_normal_angle_degrees))
     paired = (distance > 0) & (distance < parameters.reach_disk_radii * disks) & (cosine > least_cosine)
     if paired.sum() < parameters.least_pairs:
         return np.nan
-    height, own = heights_over_planes(points, normals, asked, near)
+    height, own = heights_over_planes(points, normals, some, near)
     return float(np.median((np.abs(height - own) / 2 / np.maximum(distance, disks))[paired]))

@@ -1,13 +1,12 @@
-"""Length and noise of a scan, chosen by what they predict where data is left out.
+"""Length scale and noise of a scan by cross-validation on held-out points.
 
-Around some points of the scan a patch is fitted without some points, which the global field has not seen either, for
-several lengths and noises. The score of each is what the left-out points then say: their mean distance to the predicted
-surface, |f| / (n . grad f), and how far the gradient there is from their normal n, as a height over the radius of the
-disk that a point stands for. The distance alone would not do: where noisy points are closer than they are exact, a
-field that is zero and flat around all of them has none.
+Around some points of the scan a patch is fitted, without the validation points, for several length scales and noises.
+The score of each is the mean distance of the validation points from the predicted surface, |f| / (n . grad f), plus the
+difference of the gradient there from their normal n, as a height over the radius of the disk that a point stands for.
+The distance alone would not do: a field that is zero and flat around all points has none.
 
-Left-out points are few, and have noise of their own. Where normals are given, all points tell the noise better, by its
-evidence (`evidence`), and the left-out ones choose the length for it.
+Validation points are few, and have noise of their own. Where normals are given, the noise is therefore that of the
+largest marginal likelihood of all points (`marginal_likelihood`), and validation points select the length scale for it.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.local_solve import Belief, Patch, patch_system
-from gnrecon.fit.marginal_likelihood import Evidence, clean_noise
+from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, clean_noise
 from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -34,10 +33,10 @@ from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
-class Leftover:
-    """What a global field leaves over at the points: everything of shape (N,) or (N, 3), unit coordinates.
+class FieldResiduals:
+    """The global field at the points, whose values are residuals: all of shape (N,) or (N, 3), unit coordinates.
 
-    `estimated` says that the normals were found from the points.
+    `estimated` is true if the normals were estimated from the points.
     """
 
     points: Float
@@ -47,8 +46,8 @@ class Leftover:
     estimated: bool = False
 
     @classmethod
-    def of(cls, sdf: NeuralSDF, samples: Samples) -> Leftover:
-        """Return what a field leaves over at samples."""
+    def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
+        """Evaluate a field at samples."""
         value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
         return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
 
@@ -61,8 +60,8 @@ class Leftover:
         return Density(self.points)
 
     @cached_property
-    def over(self) -> float:
-        """Root mean square of the values that are left over."""
+    def rms(self) -> float:
+        """Root mean square of the values."""
         return float(np.sqrt(np.mean(self.value**2)))
 
     def within(self, center: Float, reach: float) -> Int:
@@ -82,7 +81,7 @@ class Volume:
 
     Parameters
     ----------
-    wanted : what it should be
+    wanted : target of the correction
     lower, upper : what it must be at least, and at most
     distance : how far the data is
     """
@@ -106,15 +105,15 @@ class Volume:
     ) -> Volume:
         """Return samples at which a field is to be about the coarse distance, and of its sign where that is certain.
 
-        A field that is somewhat steeper or flatter than a distance needs no correction: one that brought it to the
-        distance would go too far between samples, and make a horn. Nor does one of the other sign where neither sign is
-        beyond doubt, as in a cavity of which little was seen: the field there is smooth, and closes it no worse.
+        A field that is somewhat steeper or flatter than a distance needs no correction; forcing it to the distance
+        would overshoot between samples. Nor does one of the other sign where the sign is uncertain, as in a cavity of
+        which little was scanned: the smooth field closes it no worse.
 
         Parameters
         ----------
         points : array of shape (Q, 3)
         own, signed : arrays of shape (Q,), the field, and the coarse distance
-        certain : mask of shape (Q,), where the sign of that is beyond doubt
+        certain : mask of shape (Q,), where the sign of that is certain
         distance : array of shape (Q,), of the data
         """
         near, far = parameters.least_field_share * signed, parameters.most_field_share * signed
@@ -136,59 +135,61 @@ class Volume:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What left-out points choose.
+class SelectedModel:
+    """Hyperparameters that cross-validation selected.
 
     Parameters
     ----------
-    belief : of the tabled noises
+    hyperparameters : with noise from the table of candidates
     scores : of its length at each patch with each tabled noise, of shape (patches, noises), in radii
-    evident : belief of the noise that has most evidence at its length; None where points do not tell it
+    most_likely : with the noise of the largest marginal likelihood, or None if that is not available
     """
 
-    belief: Belief
+    hyperparameters: Hyperparameters
     scores: Float
-    evident: Belief | None = None
+    most_likely: Hyperparameters | None = None
 
     @property
-    def best(self) -> Belief:
-        """Return the belief for points as they were scanned."""
-        return self.evident or self.belief
+    def best(self) -> Hyperparameters:
+        """Return the hyperparameters for points as they were scanned."""
+        return self.most_likely or self.hyperparameters
 
 
-def choose(leftover: Leftover, held: Mask, radius: float, rng: np.random.Generator, device: str = "cpu") -> Belief:
-    """Return the belief that a clean scan tells by itself, and of any other that which predicts left-out points best.
+def select_hyperparameters(
+    residuals: FieldResiduals, held_out: Mask, radius: float, rng: np.random.Generator, device: str = "cpu"
+) -> Hyperparameters:
+    """Return the hyperparameters of a clean scan, or for any other those that predict the validation points best.
 
-    The noise is then that of most evidence (`evidence`), unless normals were estimated.
+    The noise is then that of the largest marginal likelihood, unless normals were estimated.
 
     Parameters
     ----------
-    leftover : Leftover
-    held : mask of shape (N,), of the points that are left out
+    residuals : at the points
+    held_out : mask of shape (N,), of the validation points
     radius : of the disk that a point stands for, unit coordinates
-    rng : draws patches, features and what is left out
+    rng : draws patches and features
     device : a torch device
     """
-    trials = Trials.draw(leftover, held, radius, rng, device)
-    return trials.clean() or trials.choice().best
+    validation = CrossValidation.draw(residuals, held_out, radius, rng, device)
+    return validation.clean() or validation.select().best
 
 
-def _evidence(
-    leftover: Leftover,
+def _marginal_likelihood(
+    residuals: FieldResiduals,
     radius: float,
     rng: np.random.Generator,
     device: str,
     *,
     parameters: MarginalLikelihoodParameters = MarginalLikelihoodParameters(),
-) -> Evidence:
-    """Return the evidence of points about places that are drawn; the other parameters as those of `choose`."""
-    count = min(parameters.patches, len(leftover))
-    centers = leftover.points[rng.choice(len(leftover), count, replace=False)]
-    ranks = list(range(1, min(parameters.patch_points, len(leftover)) + 1))
-    near = leftover.density.tree.query(centers, ranks)[1]
+) -> MarginalLikelihood:
+    """Return the marginal likelihood of random patches; the parameters are those of `select_hyperparameters`."""
+    count = min(parameters.patches, len(residuals))
+    centers = residuals.points[rng.choice(len(residuals), count, replace=False)]
+    ranks = list(range(1, min(parameters.patch_points, len(residuals)) + 1))
+    near = residuals.density.tree.query(centers, ranks)[1]
     pairs = zip(np.sort(near), centers, strict=True)
-    patches = [leftover.patch(rows, center, Volume.none(), device) for rows, center in pairs]
-    return Evidence.of(patches, radius, rng, device, parameters=parameters)
+    patches = [residuals.patch(rows, center, Volume.none(), device) for rows, center in pairs]
+    return MarginalLikelihood.of(patches, radius, rng, device, parameters=parameters)
 
 
 def _noise_candidates(parameters: ModelSelectionParameters) -> list[tuple[float, float]]:
@@ -199,10 +200,10 @@ def _noise_candidates(parameters: ModelSelectionParameters) -> list[tuple[float,
 def _smoothest(
     scores: dict[int, Float], *, parameters: ModelSelectionParameters = ModelSelectionParameters()
 ) -> tuple[int, int]:
-    """Return the number of the length and of the noise that assume most noise, and are as good as the best.
+    """Return the numbers of the length and of the noise that assume most noise and are as good as the best.
 
-    As good is what lies within its standard error of the best, patch against patch, or within a share. Noise that is
-    alike among neighbours, as that of scans that do not quite match, shows little where single points are left out.
+    As good means within one standard error of the best, patch against patch, or within a share of it. Noise that is
+    correlated among neighbours, as where several scans do not quite match, is underestimated by single points.
     Source: the one-standard-error rule, Hastie et al., The Elements of Statistical Learning (2009), section 7.10.
 
     Parameters
@@ -213,43 +214,43 @@ def _smoothest(
     table = np.stack([scores[number] for number in numbers], axis=1)
     mean = table.mean(axis=0)
     best = np.unravel_index(int(np.argmin(mean)), mean.shape)
-    over = table - table[:, best[0], best[1]][:, None, None]
-    tolerance = np.maximum(over.std(axis=0) / np.sqrt(len(table)), parameters.tie_share * mean[best])
+    excess = table - table[:, best[0], best[1]][:, None, None]
+    tolerance = np.maximum(excess.std(axis=0) / np.sqrt(len(table)), parameters.tie_share * mean[best])
     noises, lengths = _noise_candidates(parameters), parameters.lengths_disk_radii
-    alike = [(noises[c][0], lengths[numbers[n]], n, c) for n, c in np.argwhere(over.mean(axis=0) <= tolerance)]
-    _, _, row, choice = max(alike)
-    return numbers[int(row)], int(choice)
+    equal = [(noises[c][0], lengths[numbers[n]], n, c) for n, c in np.argwhere(excess.mean(axis=0) <= tolerance)]
+    _, _, row, noise = max(equal)
+    return numbers[int(row)], int(noise)
 
 
 @dataclass(frozen=True)
-class Trials:
-    """Patches with what they are to predict.
+class CrossValidation:
+    """Patches and the validation points that they predict.
 
     Parameters
     ----------
-    leftover : what the patches are fitted to
-    told : what the left-out points say, whose rows are those of `leftover`
+    residuals : that the patches are fitted to
+    scanned : residuals at the points as they were scanned, with the same rows
     radius : of the disk that a point stands for, unit coordinates
     features : of the patches
     centers : of the patches, of shape (patches, 3)
-    predicted : rows of the left-out points that each patch predicts
-    held : mask of shape (N,), of the points that are left out
+    predicted : rows of the validation points that each patch predicts
+    held_out : mask of shape (N,), of the validation points
     device : a torch device
-    known : noise of positions and normals, where it is known; then no other is tried
-    evidence : which tells one more noise for each length; None of estimated normals, which are alike by what they are
-        means of, and not by the surface alone
+    known : noise of positions and normals, if it is known; then no other is tried
+    likelihood : which gives one more candidate of the noise for each length; None of estimated normals, whose errors
+        are correlated
     """
 
-    leftover: Leftover
-    told: Leftover
+    residuals: FieldResiduals
+    scanned: FieldResiduals
     radius: float
     features: Features
     centers: Float
     predicted: Sequence[Int]
-    held: Mask
+    held_out: Mask
     device: str
     known: tuple[float, float] | None = None
-    evidence: Evidence | None = None
+    likelihood: MarginalLikelihood | None = None
     parameters: ModelSelectionParameters = ModelSelectionParameters()
     _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
@@ -257,50 +258,52 @@ class Trials:
     @classmethod
     def draw(
         cls,
-        leftover: Leftover,
-        held: Mask,
+        residuals: FieldResiduals,
+        held_out: Mask,
         radius: float,
         rng: np.random.Generator,
         device: str,
         cube_features: int = ModelSelectionParameters.features,
         *,
         parameters: ModelSelectionParameters = ModelSelectionParameters(),
-    ) -> Trials:
-        """Draw the patches, for cubes of so many features; the other parameters as those of `choose`."""
-        out = np.flatnonzero(held)
-        dense = len(leftover) > parameters.dense_points
+    ) -> CrossValidation:
+        """Draw the patches, for cubes of so many features; see `select_hyperparameters` for the other parameters."""
+        out = np.flatnonzero(held_out)
+        dense = len(residuals) > parameters.dense_points
         patches = parameters.dense_patches if dense else parameters.patches
-        # What is to predict a cube of few features resolves no more than it.
+        # A patch need not resolve more than a cube of few features does.
         few = dense or cube_features <= parameters.dense_features
         count = parameters.dense_features if few else parameters.features
-        chosen = rng.choice(len(leftover), min(patches, len(leftover)), replace=False)
+        chosen = rng.choice(len(residuals), min(patches, len(residuals)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(parameters.patch_validation_points, len(out)) + 1))
-        near = cKDTree(leftover.points[out]).query(leftover.points[chosen], ranks)[1]
+        near = cKDTree(residuals.points[out]).query(residuals.points[chosen], ranks)[1]
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
-        centers = leftover.points[chosen]
-        evidence = None if leftover.estimated else _evidence(leftover, radius, rng.spawn(1)[0], device)
+        centers = residuals.points[chosen]
+        likelihood = None if residuals.estimated else _marginal_likelihood(residuals, radius, rng.spawn(1)[0], device)
         found = list(out[near])
-        return cls(leftover, leftover, radius, features, centers, found, held, device, None, evidence, parameters)
+        return cls(
+            residuals, residuals, radius, features, centers, found, held_out, device, None, likelihood, parameters
+        )
 
-    def clean(self) -> Belief | None:
-        """Return the belief of a scan so clean that its points tell their noise by themselves, or None.
+    def clean(self) -> Hyperparameters | None:
+        """Return the hyperparameters of a clean scan, whose noise follows from its points, or None of any other.
 
-        Its length is the shortest whose next is not better beyond its standard error. All that clean points tell asks
-        for that; only where they, or a cube's features, are too few for it are longer ones clearly better.
+        The length scale is the shortest that no longer one beats by more than the standard error. Clean points justify
+        the shortest; longer ones are better only where the points, or a cube's features, are too few for it.
         """
-        left = self.leftover
-        noise = clean_noise(left.points, left.normals, left.density, left.over, left.estimated)
+        left = self.residuals
+        noise = clean_noise(left.points, left.normals, left.density, left.rms, left.estimated)
         if noise is None:
             return None
         known = replace(self, known=noise)
         number, count = 0, len(self.parameters.lengths_disk_radii)
         while number + 1 < count and known._clearly_better(number + 1, number):
             number += 1
-        return Belief(self._length(number), *noise)
+        return Hyperparameters(self._length(number), *noise)
 
-    def choice(self) -> Choice:
-        """Return the belief that predicts best."""
+    def select(self) -> SelectedModel:
+        """Return the hyperparameters that predict best."""
         scores: dict[int, Float] = {}
 
         def least(number: int) -> float:
@@ -317,16 +320,16 @@ class Trials:
         count = len(_noise_candidates(self.parameters))
         tabled = {number: of_length[:, :count] for number, of_length in scores.items()}
         number, noise = _smoothest(tabled, parameters=self.parameters)
-        evident = None
-        if self.evidence is not None:
+        most_likely = None
+        if self.likelihood is not None:
             last, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
-            evident = self._belief(last, -1)
-        return Choice(self._belief(number, noise), tabled[number], evident)
+            most_likely = self._belief(last, -1)
+        return SelectedModel(self._belief(number, noise), tabled[number], most_likely)
 
-    def _belief(self, number: int, noise: int) -> Belief:
-        """Return the belief of the numbers of a length and of one of its noises."""
+    def _belief(self, number: int, noise: int) -> Hyperparameters:
+        """Return the hyperparameters with the numbers of a length and of one of its noises."""
         length = self._length(number)
-        return Belief(length, *self.noises(length)[noise])
+        return Hyperparameters(length, *self.noises(length)[noise])
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
@@ -338,23 +341,23 @@ class Trials:
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
-        """Return the noises to try with a length, of positions and normals; that of most evidence is the last one.
+        """Return the noises of positions and normals to try with a length, the most likely one last.
 
-        Unless they are known, points are taken to be no noisier than what is left over says.
+        Unless it is known, noise is at most the residuals of the global field.
         """
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
             tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
-            tried += [] if self.evidence is None else [self.evidence.noise(length)]
-            most = max(self.leftover.over, self.parameters.least_position_noise_disk_radii * self.radius)
+            tried += [] if self.likelihood is None else [self.likelihood.noise(length)]
+            most = max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
             self._noises[length] = [(min(position, most), angle) for position, angle in tried]
         return self._noises[length]
 
     def scores(self, length: float) -> Float:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""
         if length not in self._scored:
-            self.noises(length)  # once, before the patches ask for them side by side
+            self.noises(length)  # once, before patches use them in parallel
             found = map_in_threads(lambda number: self._scores(number, length), range(len(self.centers)), self.device)
             self._scored[length] = np.array(found) / self.radius
         return self._scored[length]
@@ -363,31 +366,31 @@ class Trials:
         """Return the scores of one patch for each choice of noise."""
         center, predicted = self.centers[number], self.predicted[number]
         reach = (
-            np.linalg.norm(self.leftover.points[predicted] - center, axis=1).max()
+            np.linalg.norm(self.residuals.points[predicted] - center, axis=1).max()
             + self.parameters.margin_lengths * length
         )
-        rows = self.leftover.within(center, reach)
-        rows = rows[~self.held[rows]]
-        # Beyond this many the nearest tell enough, and time would grow with the length's square.
+        rows = self.residuals.within(center, reach)
+        rows = rows[~self.held_out[rows]]
+        # The nearest of more points suffice, and time would grow with the square of the length.
         most = self.parameters.most_patch_points
         if len(rows) > most:
-            far = np.linalg.norm(self.leftover.points[rows] - center, axis=1)
+            far = np.linalg.norm(self.residuals.points[rows] - center, axis=1)
             rows = rows[np.sort(np.argsort(far, kind="stable")[:most])]
-        patch = self.leftover.patch(rows, center, Volume.none(), self.device)
+        patch = self.residuals.patch(rows, center, Volume.none(), self.device)
         system = patch_system(patch, self.features, length, patch.size)
-        target = self.told.patch(predicted, center, Volume.none(), self.device)
-        normals = torch.as_tensor(self.told.normals[predicted], device=self.device)
-        # Of a scan that is nearly exact, what is left over makes several noises one.
+        target = self.scanned.patch(predicted, center, Volume.none(), self.device)
+        normals = torch.as_tensor(self.scanned.normals[predicted], device=self.device)
+        # On a nearly exact scan, the limit by the residuals makes several noises equal.
         noises = self.noises(length)
         found = {each: self._score(system.solve(*each), target, normals, length) for each in set(noises)}
         return [found[each] for each in noises]
 
     def _score(self, amplitudes: Tensor, target: Patch, normals: Tensor, length: float) -> float:
         value, gradient = self.features.sums(amplitudes, target.points, target.center, length, 1)
-        # What is wanted less what is had: f + c and grad(f + c) - n, but for the sign.
+        # Target minus prediction: f + c and grad(f + c) - n, but for the sign.
         missing, turn = target.value - value, target.gradient - gradient
         slope = 1.0 - (turn * normals).sum(dim=1)
-        if self.leftover.estimated and len(self.leftover) <= self.parameters.sparse_points:
+        if self.residuals.estimated and len(self.residuals) <= self.parameters.sparse_points:
             # Such normals are means of their neighbours', which a field that is too smooth predicts best. So distances
             # alone count, and a field that is steep because it winds through every point is not nearer for that.
             return float((missing.abs() / slope.clamp(self.parameters.least_slope, 1.0)).mean())

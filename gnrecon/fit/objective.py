@@ -2,7 +2,7 @@
 
 Row i of a term with weight w and N points is sqrt(w / N) r_i, so that |r|^2 / 2 is the paper's loss (its equations for
 the Monte Carlo quadrature of the loss and of the Gauss-Newton matrix). The Jacobian is an operator made of the factors
-of its rows (`linalg.jacobian`); it is never held whole.
+of its rows (`least_squares.jacobian`); it is never stored as a matrix.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class FieldProblem:
     """
 
     field: Siren
-    terms: Sequence[Term]
+    terms: Sequence[ObjectiveTerm]
     theta: Tensor
     units: tuple[Tensor | None, ...] | None = None
     precision: torch.dtype | None = None
@@ -67,7 +67,7 @@ class FieldProblem:
         whole = self.whole(theta)
         return torch.cat([rows for group in groups(self.terms) for rows in self._residuals(whole, group)])
 
-    def _residuals(self, whole: Tensor, group: list[Term]) -> Iterator[Tensor]:
+    def _residuals(self, whole: Tensor, group: list[ObjectiveTerm]) -> Iterator[Tensor]:
         needs_gradient = any(not _is_value_only(term) for term in group)
         for rows in self._chunks(group):
             points = group[0].points[rows]
@@ -96,7 +96,7 @@ class FieldProblem:
         source = blocks if kept is None else lambda: kept
         return LayeredJacobian(source, len(residual), self._layer_sizes(), theta.device, stored=whole.dtype), residual
 
-    def _blocks(self, whole: Tensor, gathered: list[list[Term]]) -> Iterator[Block]:
+    def _blocks(self, whole: Tensor, gathered: list[list[ObjectiveTerm]]) -> Iterator[Block]:
         """Yield the factors of J's rows: for each chunk of points, one block for each residual of each term."""
         for group in gathered:
             for rows in self._chunks(group):
@@ -121,7 +121,9 @@ class FieldProblem:
         shapes = self.field.layout.shapes
         return tuple(out * (into + 1) for out, (_, into) in zip(self._free_outs(), shapes, strict=True))
 
-    def _chunks(self, group: list[Term], *, parameters: ObjectiveParameters = ObjectiveParameters()) -> list[slice]:
+    def _chunks(
+        self, group: list[ObjectiveTerm], *, parameters: ObjectiveParameters = ObjectiveParameters()
+    ) -> list[slice]:
         """Return slices of the group's points, with limited memory for the activations of a layer."""
         size = max(256, min(parameters.chunk_points, parameters.chunk_bytes // (8 * max(self.field.widths))))
         return slices(len(group[0].points), size)
@@ -150,7 +152,7 @@ def _row_scale(weight: float | Tensor, count: int, like: Tensor) -> Tensor:
     return torch.as_tensor(weight, dtype=like.dtype, device=like.device).div(count).sqrt().reshape(-1, 1)
 
 
-def _evaluate(term: Term, rows: slice, value: Tensor, gradient: Tensor) -> tuple[Linearised, Tensor]:
+def _evaluate(term: ObjectiveTerm, rows: slice, value: Tensor, gradient: Tensor) -> tuple[Linearised, Tensor]:
     """Return a term's residuals at some of its points, linearised, and the scale of their rows."""
     target = None if term.target is None else term.target[rows]
     linear = term.residual(value, gradient, target)
@@ -158,7 +160,7 @@ def _evaluate(term: Term, rows: slice, value: Tensor, gradient: Tensor) -> tuple
     return linear, _row_scale(weight, len(term), linear.residual)
 
 
-def _in_precision(group: list[Term], dtype: torch.dtype) -> list[Term]:
+def _in_precision(group: list[ObjectiveTerm], dtype: torch.dtype) -> list[ObjectiveTerm]:
     """Return the terms of a group with points and targets in `dtype`, the points still one tensor for all of them."""
     points = group[0].points.to(dtype)
     return [
@@ -166,12 +168,12 @@ def _in_precision(group: list[Term], dtype: torch.dtype) -> list[Term]:
     ]
 
 
-def _is_value_only(term: Term) -> bool:
+def _is_value_only(term: ObjectiveTerm) -> bool:
     """Whether the residual can be evaluated without the gradient."""
     return _probe(term).by_gradient is None
 
 
-def _probe(term: Term) -> Linearised:
+def _probe(term: ObjectiveTerm) -> Linearised:
     """Return what the residual looks like at one point."""
     probe = term.points.new_zeros(1)
     target = None if term.target is None else term.target[:1]
@@ -182,7 +184,7 @@ def _probe(term: Term) -> Linearised:
 
 
 @dataclass(frozen=True)
-class Term:
+class ObjectiveTerm:
     """One constraint on one frozen set of points.
 
     The loss is  weight / (2 N) sum_i |r_i|^2  over the term's N points, the paper's Monte Carlo quadrature.
@@ -207,15 +209,15 @@ class Term:
         return len(self.points)
 
 
-def groups(terms: Sequence[Term]) -> list[list[Term]]:
+def groups(terms: Sequence[ObjectiveTerm]) -> list[list[ObjectiveTerm]]:
     """Gather the terms that share one tensor of points, so that the network is differentiated once for all of them."""
-    by_points: dict[int, list[Term]] = {}
+    by_points: dict[int, list[ObjectiveTerm]] = {}
     for term in terms:
         by_points.setdefault(id(term.points), []).append(term)
     return list(by_points.values())
 
 
-# The terms of a fit, drawn afresh for each step.
+# The terms of a fit, sampled for each step.
 #
 # In the paper's Monte Carlo form (weights on mean squares, unit coordinates, h the spacing of the data):
 #
@@ -229,7 +231,7 @@ def groups(terms: Sequence[Term]) -> list[list[Term]]:
 
 def start_terms(
     scene: Scene, options: FitOptions, rng: np.random.Generator, x: Tensor, distance: Tensor, most: int
-) -> list[Term]:
+) -> list[ObjectiveTerm]:
     """Return the terms of a linear start: at most `most` data points, and volume samples x with their distances."""
     # The start is a linear solve, and other residuals than these two are not linear in f, or not known to be.
     linear = options if options.normals in ("vector", "projection") else replace(options, normals="vector")
@@ -245,7 +247,7 @@ def step_terms(
     data_weight: float = 1.0,
     *,
     parameters: ObjectiveParameters = ObjectiveParameters(),
-) -> list[Term]:
+) -> list[ObjectiveTerm]:
     """Draw the terms of one step: at most `most` data points, with `data_weight` times their weight, and the volume.
 
     Parameters
@@ -259,22 +261,22 @@ def step_terms(
     return [
         *data_terms(scene, options, rng, most, data_weight),
         distance_term(scene, *volume),
-        Term("eikonal", eikonal, scene.tensor(around), None, eikonal_weight),
+        ObjectiveTerm("eikonal", eikonal, scene.tensor(around), None, eikonal_weight),
     ]
 
 
 def data_terms(
     scene: Scene, options: FitOptions, rng: np.random.Generator, most: int, weight: float = 1.0
-) -> list[Term]:
-    """Return interface and normals at the data points, or at `most` of them drawn afresh."""
+) -> list[ObjectiveTerm]:
+    """Return interface and normals at the data points, or at a random `most` of them."""
     points, normals = scene.points, scene.normals
     if len(points) > most:
         rows = torch.as_tensor(np.sort(rng.permutation(len(points))[:most])).to(points.device)
         points, normals = points[rows], normals[rows]
-    beside = normal_weight(scene.coarse.spacing, scene.reach)
+    relative = normal_weight(scene.coarse.spacing, scene.reach)
     return [
-        Term("interface", interface, points, None, weight),
-        Term("normal", normal_residual(options.normals), points, normals, weight * beside),
+        ObjectiveTerm("interface", interface, points, None, weight),
+        ObjectiveTerm("normal", normal_residual(options.normals), points, normals, weight * relative),
     ]
 
 
@@ -293,10 +295,10 @@ def normal_weight(
 
 def distance_term(
     scene: Scene, x: Tensor, distance: Tensor, *, parameters: ObjectiveParameters = ObjectiveParameters()
-) -> Term:
+) -> ObjectiveTerm:
     """Return the term of coarse distances at volume samples; it weighs more where data is sparse."""
     weight = max(parameters.distance_weight_per_sample * len(x) / len(scene.points), parameters.least_distance_weight)
-    return Term("distance", signed_distance, x, distance, weight)
+    return ObjectiveTerm("distance", signed_distance, x, distance, weight)
 
 
 # What a fit is made in: the samples as tensors, their coarse distance, and the box around them.

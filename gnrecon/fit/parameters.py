@@ -212,7 +212,7 @@ class SingleNetworkParameters:
 
 @dataclass(frozen=True)
 class PenaltyFitParameters:
-    """Curvature penalties on the fitted surface (`fit.regularisers`, `fit.regularised`)."""
+    """Curvature penalties on the fitted surface (`fit.regularisers`, `fit.surface_penalties`)."""
 
     minimal_weight: float = 1e-2  # default of `fill`
     developable_weight: float = 1e-3  # default of `prior`

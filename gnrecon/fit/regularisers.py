@@ -1,10 +1,10 @@
-"""What a fit asks of its surface beside its data: to be smooth, minimal where there is no data, or developable.
+"""Curvature penalties of the fitted surface: smooth, minimal where there is no data, or developable.
 
     smooth   strain=W      W / 2 mean of k1^2 + k2^2 over the surface
     fill     minimal       W / 2 mean of (k1 + k2)^2, only where the surface is far from all points
     prior    developable   W / 2 mean of (k1 k2)^2, where it is no crease
 
-each beside half the mean square distance of the points from the surface. All lengths are in radii of the scan. A bump
+each added to half the mean square distance of the points from the surface. All lengths are in radii of the scan. A bump
 of wavenumber k costs f^2 by the data and W k^4 f^2 by the strain, so that bumps of the wavelength 2 pi W^(1/4) are
 halved, and shorter ones all but vanish. A closed surface cannot be developable everywhere: its Gauss curvature must add
 up, and it does so in creases and corners. So the square of k1 k2 counts as Geman and McClure's robust r^2 / (1 + r^2),
@@ -34,14 +34,14 @@ from gnrecon.runtime.errors import UsageError
 
 @dataclass(frozen=True)
 class Regulariser:
-    """One thing that is asked of the surface.
+    """One curvature penalty.
 
     Parameters
     ----------
-    name : as it was asked for
+    name : as in the options
     residual : of curvature, in radii
     weight : W
-    holes : whether it is asked for only where the surface is far from all points
+    holes : whether it applies only where the surface is far from all points
     crease : size of the residual from which on it hardly counts, or None
     """
 
@@ -59,12 +59,12 @@ def regularisers(
     *,
     parameters: PenaltyFitParameters = PenaltyFitParameters(),
 ) -> tuple[Regulariser, ...]:
-    """Return what was asked for, each None or a text such as ``"strain=1e-4"``, ``"minimal"`` or ``"developable"``.
+    """Return the penalties of the options: each is None or, for example, ``"strain=1e-4"`` or ``"developable"``.
 
     Raises
     ------
     UsageError
-        When a text asks for something else, or a weight is no positive number.
+        When a text names another penalty, or a weight is not a positive number.
     """
     found = []
     if smooth is not None:
@@ -79,7 +79,7 @@ def regularisers(
 
 
 def _weight(option: str, text: str, known: str, default: float | None) -> float:
-    """Return the weight in ``known=weight``, or the default where it may be left out and is."""
+    """Return the weight in ``known=weight``, or the default, if there is one, of ``known`` alone."""
     name, equals, number = text.partition("=")
     if name != known or (default is None and not equals):
         shape = f"{known}=WEIGHT" + ("" if default is None else f" or {known} alone")
@@ -99,11 +99,11 @@ Jet = tuple[Tensor, Tensor, Tensor]
 """Value (N,), gradient (N, 3) and second derivatives (N, 3, 3)."""
 
 
-# Sine features, solved for data already, bent to what regularisers ask of the surface that they make.
+# Gauss-Newton on the amplitudes of sine features, with curvature penalties.
 #
-# The data, the volume and the prior are linear in the amplitudes a, so that all of their rows together are as good as
-# the few of one triangular matrix, |L^T a - y|^2 up to a constant. The residuals of curvature are not linear, and ask
-# for a few steps of Gauss-Newton, each at points of the surface as it is then; the best of these surfaces is taken.
+# The data, the volume and the prior are linear in the amplitudes a, so that all their rows are equivalent to those of
+# one triangular matrix, |L^T a - y|^2 up to a constant. The residuals of curvature are not linear, and need a few steps
+# of Gauss-Newton, each at points of the current surface; the best of these surfaces is returned.
 #
 # With phases z_j = w_j . x + p_j a feature has the gradient cos z_j w_j and the second derivatives -sin z_j w_j w_j^T,
 # and so a residual linearised to dr = c df + v . d(grad f) + M : d(Hess f) the row
@@ -112,17 +112,17 @@ Jet = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
-class Wish:
-    """A residual of curvature that is asked of points of the surface, or one of the value, at points that stay.
+class PenaltyTerm:
+    """A residual of curvature at points that follow the surface, or a residual of the value at fixed points.
 
     Parameters
     ----------
     residual : SecondOrder
-    points : of shape (N, 3), near the surface, onto which they are brought
+    points : of shape (N, 3), near the surface, onto which they are moved
     scale : factor of each point's rows, of shape (N, 1)
     robust : size of the residual from which on it hardly counts, or None
     target : of each point, of shape (N,), or None
-    still : value of the known function at each point, of shape (N,), where the points are to stay; else None
+    fixed_value : value of the known function at each point, of shape (N,), if the points are fixed; else None
     """
 
     residual: SecondOrder
@@ -130,30 +130,30 @@ class Wish:
     scale: Tensor
     robust: float | None = None
     target: Tensor | None = None
-    still: Tensor | None = None
+    fixed_value: Tensor | None = None
 
-    def asked(self, jet: Jet) -> Linearised:
+    def linearised(self, jet: Jet) -> Linearised:
         """Return the residuals at the points' jet."""
         return self.residual(*jet, self.target)
 
-    def unmet(self, jet: Jet) -> tuple[Wish, Linearised]:
-        """Return those of the points that stay whose residuals of the value are not zero, and these, at the jet."""
-        linear = self.asked(jet)
+    def active_rows(self, jet: Jet) -> tuple[PenaltyTerm, Linearised]:
+        """Return the term at the fixed points whose residuals are not zero, and these residuals, at the jet."""
+        linear = self.linearised(jet)
         assert linear.by_value is not None, "residuals of the value"
         rows = linear.residual.ne(0).any(dim=1)
         kept = replace(self, points=self.points[rows], scale=self.scale[rows])
         return kept, Linearised(linear.residual[rows], linear.by_value[rows], None)
 
-    def weighed(self, jet: Jet) -> Wish:
-        """Return a robust wish with what its residuals count, at the points' jet, in its scale."""
-        assert self.robust is not None, "what is not robust counts alike"
-        square = self.asked(jet).residual.square().sum(1, keepdim=True)
+    def reweighted(self, jet: Jet) -> PenaltyTerm:
+        """Return a robust term with its weights at the points' jet in its scale."""
+        assert self.robust is not None, "only robust terms have weights"
+        square = self.linearised(jet).residual.square().sum(1, keepdim=True)
         # The tangent of r^2 / (1 + r^2) is a multiple of r^2: iteratively reweighted least squares.
         return replace(self, scale=self.scale / (1 + square / self.robust**2))
 
 
 @dataclass(frozen=True)
-class Sines:
+class SineSum:
     """Sine features about a centre, on top of a known function.
 
     Parameters
@@ -218,48 +218,52 @@ class Sines:
         return x
 
 
-def valued(value: Tensor) -> Jet:
-    """Return values, of shape (N,), as a jet whose derivatives nobody asks for."""
+def constant_jet(value: Tensor) -> Jet:
+    """Return values, of shape (N,), as a jet with derivatives of zero."""
     count = len(value)
     return value, value.new_zeros(1, 3).expand(count, 3), value.new_zeros(1, 3, 3).expand(count, 3, 3)
 
 
 @dataclass(frozen=True)
-class BendProblem:
-    """The least-squares problem of one step: L^T a = y, and the wishes at their points, of which none moves.
+class PenaltyProblem:
+    """The least-squares problem of one step: L^T a = y, and the penalty terms at points that are fixed in this step.
 
     Parameters
     ----------
-    sines : Sines
+    sines : SineSum
     factor, target : L, of shape (p, p), and y, of shape (p,)
-    wishes : with points on the surface, and what is robust of them in their scales
-    theta : amplitudes where it was posed
-    known : jets of the known function at each wish's points
+    terms : with points on the surface, and robust weights in their scales
+    theta : amplitudes at which the problem was made
+    known : jets of the known function at each term's points
     """
 
-    sines: Sines
+    sines: SineSum
     factor: Tensor
     target: Tensor
-    wishes: Sequence[Wish]
+    terms: Sequence[PenaltyTerm]
     theta: Tensor
     known: Sequence[Jet]
 
     @classmethod
-    def at(cls, sines: Sines, factor: Tensor, target: Tensor, wishes: Sequence[Wish], theta: Tensor) -> BendProblem:
-        """Pose the problem of the surface that the amplitudes theta make."""
+    def at(
+        cls, sines: SineSum, factor: Tensor, target: Tensor, terms: Sequence[PenaltyTerm], theta: Tensor
+    ) -> PenaltyProblem:
+        """Return the problem at the surface of the amplitudes theta."""
         placed = [
-            replace(wish, points=sines.on_surface(theta, wish.points)) if wish.still is None else wish
-            for wish in wishes
+            replace(term, points=sines.on_surface(theta, term.points)) if term.fixed_value is None else term
+            for term in terms
         ]
-        known = [sines.known(wish.points) if wish.still is None else valued(wish.still) for wish in placed]
-        weighed = [
-            wish if wish.robust is None else wish.weighed(sines.jet(theta, wish.points, jet))
-            for wish, jet in zip(placed, known, strict=True)
+        known = [
+            sines.known(term.points) if term.fixed_value is None else constant_jet(term.fixed_value) for term in placed
         ]
-        return cls(sines, factor, target, weighed, theta, known)
+        reweighted = [
+            term if term.robust is None else term.reweighted(sines.jet(theta, term.points, jet))
+            for term, jet in zip(placed, known, strict=True)
+        ]
+        return cls(sines, factor, target, reweighted, theta, known)
 
     def free(self) -> Tensor:
-        """Return the amplitudes where it was posed."""
+        """Return the amplitudes at which the problem was made."""
         return self.theta
 
     def whole(self, free: Tensor) -> Tensor:
@@ -267,54 +271,54 @@ class BendProblem:
         return free
 
     def residual(self, free: Tensor) -> Tensor:
-        """Return r, of shape (M,), without values that are as they should be; M depends on how many are."""
-        return self._residual(free, self._asked(free))
+        """Return r, of shape (M,), where M depends on how many one-sided residuals are active."""
+        return self._residual(free, self._linearised(free))
 
     def linearise(self, free: Tensor) -> tuple[DenseJacobian, Tensor]:
         """Return J, of shape (M, p), and r."""
-        asked = list(self._asked(free))
-        rows = [self.sines.rows(wish.points, linear, wish.scale) for wish, linear in asked]
-        return DenseJacobian(torch.cat([self.factor.T, *rows])), self._residual(free, asked)
+        linearised = list(self._linearised(free))
+        rows = [self.sines.rows(term.points, linear, term.scale) for term, linear in linearised]
+        return DenseJacobian(torch.cat([self.factor.T, *rows])), self._residual(free, linearised)
 
-    def _residual(self, free: Tensor, asked: Iterable[tuple[Wish, Linearised]]) -> Tensor:
-        parts = [(wish.scale * linear.residual).T.flatten() for wish, linear in asked]
+    def _residual(self, free: Tensor, linearised: Iterable[tuple[PenaltyTerm, Linearised]]) -> Tensor:
+        parts = [(term.scale * linear.residual).T.flatten() for term, linear in linearised]
         return torch.cat([self.factor.T @ free - self.target, *parts])
 
-    def _asked(self, free: Tensor) -> Iterator[tuple[Wish, Linearised]]:
-        for wish, known in zip(self.wishes, self.known, strict=True):
-            if wish.still is None:
-                yield wish, wish.asked(self.sines.jet(free, wish.points, known))
+    def _linearised(self, free: Tensor) -> Iterator[tuple[PenaltyTerm, Linearised]]:
+        for term, known in zip(self.terms, self.known, strict=True):
+            if term.fixed_value is None:
+                yield term, term.linearised(self.sines.jet(free, term.points, known))
             else:
-                yield wish.unmet(self.sines.value(free, wish.points, known))
+                yield term.active_rows(self.sines.value(free, term.points, known))
 
 
-def bent(
-    sines: Sines,
+def minimise_penalised(
+    sines: SineSum,
     factor: Tensor,
     right: Tensor,
-    wishes: Sequence[Wish],
+    terms: Sequence[PenaltyTerm],
     amplitudes: Tensor,
     steps: int,
     *,
     parameters: PenaltyFitParameters = PenaltyFitParameters(),
 ) -> Tensor:
-    """Return amplitudes, of shape (p,), that heed the wishes beside the linear part.
+    """Return amplitudes, of shape (p,), that minimise the linear part and the penalty terms.
 
     Parameters
     ----------
-    sines : Sines
+    sines : SineSum
     factor, right : L and b of the linear part's normal equations L L^T a = b
-    wishes : what is asked of the surface
-    amplitudes : to begin with, of shape (p,)
+    terms : the penalties
+    amplitudes : initial ones, of shape (p,)
     steps : of Gauss-Newton, at most
     """
     target = torch.linalg.solve_triangular(factor, right[:, None], upper=False)[:, 0]
 
-    def posed(number: int, theta: Tensor) -> BendProblem:
+    def posed(number: int, theta: Tensor) -> PenaltyProblem:
         del number
-        return BendProblem.at(sines, factor, target, wishes, theta)
+        return PenaltyProblem.at(sines, factor, target, terms, theta)
 
-    # A step knows nothing of how the surface moves away from its points; what counts is how it is where it has gone.
+    # A step ignores that the surface moves away from its points; the loss that counts is that at the new surface.
     method = GaussNewton(GainRatioDamping(initial_damping=1e-9, metric=identity))
     stop = StopRule(
         steps, parameters.least_decrease_share, patience=steps + 1, held_out_patience=parameters.patience_steps

@@ -1,12 +1,13 @@
-"""Several layers: a spectral start, then Gauss-Newton from coarse to fine.
+"""Fits of one sine network: of one wide layer (`fit_wide`) or of several layers (`fit_deep`).
 
-The start decides. From small weights the network is nearly linear, and Gauss-Newton spends 50 to 90 steps on a plateau
-(the paper's start); from random frequencies and an exact solve of the last layer (`start.spectral_start`) it has none.
+*Several layers.* The start decides the result. From small weights the network is nearly linear, and Gauss-Newton spends
+50 to 90 steps on a plateau (the paper's start); from random frequencies and an exact solve of the last layer
+(`initialisation.spectral_start`) it has none. The stages (`continuation_stages`) then raise the number of rows (a step
+far from the minimum needs only part of the data), the weight of the data against the volume, and the precision of J:
+single precision suffices while the damping is well above its rounding. Of 1,000 points or more, one in twenty is held
+out; the fit ends when the residuals there stop falling, and returns the parameters for which they were least.
 
-The stages raise, one after the other, the number of rows (a step far from the minimum needs to see only a part of the
-data), the weight of the data against the volume, and the precision of J: single precision costs nothing while the
-damping is well above its rounding. Of 1,000 points or more one in twenty is held out; the fit ends when the residuals
-there have stopped falling, and returns the parameters for which they were least.
+*One wide layer.* See the comment on `fit_wide`.
 """
 
 from __future__ import annotations

@@ -25,13 +25,13 @@ from gnrecon.fit.denoising import LocalData, choose_local_data
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import GlobalField, fit_global
-from gnrecon.fit.local_fields import ShapingFor, fit_detail
+from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
 from gnrecon.fit.parameters import FitParameters
-from gnrecon.fit.regularised import Free, Shaping, bend_global
 from gnrecon.fit.shape_priors.ball_fit import BallFit
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
 from gnrecon.fit.shape_priors.sharp_shape import SharpShape
 from gnrecon.fit.summary import FitSummary, describe
+from gnrecon.fit.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
@@ -81,10 +81,10 @@ def fit_two_level(
     ball = steps.detect_ball(samples)
     data, flipped_share = steps.prepare(samples if ball is None else ball.samples)
     data, first, outliers = steps.fit_global(data, subrange(advance, 0.0, share))
-    sdf, shaping = steps.apply_penalties(first, data)
+    sdf, penalties = steps.apply_penalties(first, data)
     try:
         rest = subrange(advance, share, 1.0)
-        detail, averaging_width = steps.fit_local(sdf, data, shaping, outliers > 0, rest, folder, scheduler)
+        detail, averaging_width = steps.fit_local(sdf, data, penalties, outliers > 0, rest, folder, scheduler)
     except KeyboardInterrupt:
         status = "Interrupted before the local fields were solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
@@ -194,22 +194,22 @@ class _Steps:
             data = self._draw(scan, SharpShape.of(scan))
         return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
 
-    def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, ShapingFor | None]:
+    def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, PenaltiesFor | None]:
         """Return the global field after curvature penalties, and what gives those of a local length scale, if any."""
-        penalties = self.options.regularisers
-        if not penalties:
+        regularisers = self.options.regularisers
+        if not regularisers:
             return first.sdf, None
         density = Density(data.samples.points)
-        free = Free.of(first.scene, self.rng)
-        shaping = Shaping.of(penalties, first.sdf, density, free, first.length, self.rng)
-        bent = bend_global(shaping, first.scene, self.options, self.rng)
-        return bent, lambda length: Shaping.of(penalties, bent, density, free, length, self.rng)
+        free = FreeSpace.of(first.scene, self.rng)
+        penalties = SurfacePenalties.of(regularisers, first.sdf, density, free, first.length, self.rng)
+        bent = penalise_global(penalties, first.scene, self.options, self.rng)
+        return bent, lambda length: SurfacePenalties.of(regularisers, bent, density, free, length, self.rng)
 
     def fit_local(
         self,
         sdf: NeuralSDF,
         data: _Data,
-        shaping: ShapingFor | None,
+        penalties: PenaltiesFor | None,
         outliers: bool,
         advance: ProgressCallback,
         folder: str | Path | None,
@@ -226,7 +226,7 @@ class _Steps:
                 sdf, data.samples, data.held_out, options.features, rng, options.device, outliers=outliers
             )
         advance(self.parameters.local_fields.selection_time_share)
-        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, shaping)
+        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties)
         return detail, None if local.averaging is None else local.averaging.width_radii
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:

@@ -6,10 +6,10 @@ zero level the standard deviation
     sigma(x) = c sqrt(J C J^T) / |grad f|
 
 along the normal, to first order. C is the Laplace approximation (`laplace`), and c one factor for all places, from the
-errors where data is left out (`left_out`). Small where the scan is dense, sigma grows with the distance from it, and
-most where the surface turns its back to all points, as in a hole.
-A field with local detail is smoother than the scan in holes, and what it does not know there no cube's data tells. Its
-sigma is that of a stand-in, one layer of rougher features with the same data, whose errors are larger than its own.
+errors at points that are left out (`calibration`). Sigma is small where the scan is dense, grows with the distance from
+it, and is largest where the surface faces away from all points, as in a hole. In holes, the default fit is its smooth
+global field, and no local field has data on the errors there. Its sigma is that of a surrogate: one layer of rougher
+features with the same data, whose errors are larger.
 
 Source: Sellan and Jacobson, Stochastic Poisson Surface Reconstruction (2022), for the idea of a surface with an
 error bar; the formula is the delta method.
@@ -70,7 +70,7 @@ class Uncertainty:
     Parameters
     ----------
     sdf : the fitted field
-    deviation : of the field's values, or of its stand-in's, before it is calibrated
+    deviation : of the field's values, or of its surrogate's, before calibration
     noise : of the points along the normal with which they and their normals fit together, file units
     factor : c, by which errors at left-out points exceed what C alone says
     """
@@ -105,7 +105,7 @@ class Uncertainty:
             When the matrix of the data cannot be factored, because it is not finite.
         """
         if sdf.detail is not None:
-            return replace(cls.of(_stand_in(sdf, samples), samples, seed, parameters=parameters), sdf=sdf)
+            return replace(cls.of(_surrogate(sdf, samples), samples, seed, parameters=parameters), sdf=sdf)
         rng = np.random.default_rng(seed)
         chosen = np.sort(rng.permutation(len(samples))[: parameters.most_points])
         points, normals = (
@@ -131,25 +131,24 @@ class Uncertainty:
 
     def describe(self) -> str:
         """Return the noise and the factor as a phrase."""
-        return f"noise {self.noise:.3g}, calibrated by {self.factor:.3g} where data is left out"
+        return f"noise {self.noise:.3g}, calibrated by a factor {self.factor:.3g} on left-out points"
 
 
-def _stand_in(sdf: NeuralSDF, samples: Samples) -> NeuralSDF:
+def _surrogate(sdf: NeuralSDF, samples: Samples) -> NeuralSDF:
     """Return one layer of features that is fitted to the same samples by a linear solve."""
     options = FitOptions(steps=0, seed=int(sdf.options.get("seed", 0)), device=str(sdf.theta.device))
     return fit(samples, options)[0]
 
 
-# How far off a fit is where data is left out: its own check of its uncertainty, without any truth.
+# Calibration by leave-one-out and leave-patch-out errors, without a reference.
 #
 # For a linear least-squares fit with whitened rows R of some left-out points and residuals e at the mode, the fit
 # without them would have had the residuals (I - H)^-1 e, of covariance (I - H)^-1, with H = R C R^T: nothing is fitted
 # again. Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2. Where the fitted field is
-# not the mode, because it heeds more than the data, its distance from it adds to the error, as an independent error
-# would.
+# not the mode, because it has other terms than the data, its distance from the mode is added as an independent error.
 #
-# Points are left out one by one, and in patches of neighbours, as a hole of the scan would leave them out: errors
-# between points and errors across holes count alike.
+# Points are left out one by one, and in patches of neighbours, like a hole of the scan: errors between
+# points and errors across holes have equal weight.
 
 
 def calibration(
@@ -159,10 +158,10 @@ def calibration(
     *,
     parameters: UncertaintyParameters = UncertaintyParameters(),
 ) -> float:
-    """Return the factor, at least one, by which predicted standard deviations must grow to cover what was left out.
+    """Return the factor, at least one, by which predicted standard deviations must grow to cover the left-out points.
 
     With it, 95.45 % of the left-out positions lie within two standard deviations, or more where it is one; each size of
-    patch has the same say.
+    patch has the same weight.
     """
     rng = np.random.default_rng(seed)
     patches = zip(parameters.patch_sizes, parameters.patch_counts, strict=True)
@@ -191,11 +190,11 @@ def _scores(data: DataRows, posterior: Laplace, patches: Int) -> Float:
     half = torch.linalg.solve_triangular(posterior.factor, rows.T, upper=False).T
     # A point has several rows, of which the interface's comes first.
     half, at_mode = half.reshape(-1, count, size, half.shape[1]), (residuals + steps).reshape(-1, count, size)
-    beside = steps.reshape(-1, count, size)[0]
+    shift = steps.reshape(-1, count, size)[0]
     found = []
     for number in range(count):
         spread = _without(half[:, number].flatten(0, 1))
-        error = torch.hypot((spread @ at_mode[:, number].flatten())[:size], beside[number])
+        error = torch.hypot((spread @ at_mode[:, number].flatten())[:size], shift[number])
         found.append(error / spread.diagonal()[:size].sqrt())
     return torch.cat(found).cpu().numpy()
 

@@ -70,30 +70,17 @@ def prepare(
     advance(0.7)
     oriented, held_out = _hold_out(oriented, holdout, seed)
     # Spacings are those of the whole cloud.
-    apart, width = (
-        None if text is None else parse_reach(str(text), mean_spacing(cleaned.points), units)
-        for text in (spacing, smooth_scan)
-    )
+    lengths = (spacing, smooth_scan)
+    apart, width = (x if x is None else parse_reach(str(x), mean_spacing(cleaned.points), units) for x in lengths)
     oriented, moved = _smooth(oriented, width, parameters)
     kept = thin(oriented, fraction=fraction, max_points=max_points, spacing=apart, method=subsample, seed=seed)
-    least = parameters.least_points
-    if len(kept) < least:
+    if len(kept) < (least := parameters.least_points):
         raise UsageError(f"Subsampling leaves {len(kept)} points, but a surface needs at least {least}.")
     counts = replace(counts, moved=moved, thinned=len(oriented) - len(kept), held_out=len(held_out), kept=len(kept))
     counts = replace(counts, normals=orientation.how, confidence=orientation.confidence, flipped=orientation.flipped)
-    assert kept.normals is not None
-    frame = Frame.of(kept.points)
-    _log.info(
-        "Kept %d of %d points, %d for validation; normals: %s; centre %s, radius %.6g.",
-        len(kept),
-        len(cloud),
-        len(held_out),
-        orientation.how,
-        frame.center.tolist(),
-        frame.scale,
-    )
-    held = _held_samples(held_out, frame)
-    return Samples(frame.to_unit(kept.points), kept.normals, frame, held, orientation.estimated), counts
+    message = "Kept %d of %d points, %d for validation; normals: %s."
+    _log.info(message, len(kept), len(cloud), len(held_out), orientation.how)
+    return _in_unit_ball(kept, held_out, orientation.estimated), counts
 
 
 def _hold_out(cloud: PointCloud, share: float | None, seed: int) -> tuple[PointCloud, PointCloud]:
@@ -116,8 +103,11 @@ def _smooth(cloud: PointCloud, width: float | None, parameters: IngestParameters
     return replace(cloud, points=points + centre, normals=normals), moved
 
 
-def _held_samples(held_out: PointCloud, frame: Frame) -> Samples | None:
-    """Return the validation points in the frame of the fit, or None where there are none."""
-    if not len(held_out) or held_out.normals is None:
-        return None
-    return Samples(frame.to_unit(held_out.points), held_out.normals, frame)
+def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Samples:
+    """Return the samples of a fit, with the validation points in the same frame."""
+    assert kept.normals is not None
+    frame, held = Frame.of(kept.points), None
+    _log.info("The unit ball has the centre %s and the radius %.6g.", frame.center.tolist(), frame.scale)
+    if len(held_out) and held_out.normals is not None:
+        held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
+    return Samples(frame.to_unit(kept.points), kept.normals, frame, held, estimated)

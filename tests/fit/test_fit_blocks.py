@@ -25,8 +25,8 @@ from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.fit_options import QUALITIES
 from gnrecon.fit.local_fields import fit_detail
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Leftover
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -38,11 +38,11 @@ from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 COUNT = 1500
 AXES = np.array([1.0, 0.6, 0.5])
-BELIEF = Belief(0.1, 1e-3, 0.05)
+BELIEF = Hyperparameters(0.1, 1e-3, 0.05)
 FEATURES = 60
 
 
-def fixed_belief(*_: object) -> Belief:
+def fixed_belief(*_: object) -> Hyperparameters:
     """Replace the choice, which is tested elsewhere."""
     return BELIEF
 
@@ -80,7 +80,7 @@ def fitted(
 @pytest.fixture(autouse=True)
 def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fix length and noise; their choice is tested elsewhere."""
-    monkeypatch.setattr(large, "choose", fixed_belief)
+    monkeypatch.setattr(large, "select_hyperparameters", fixed_belief)
     monkeypatch.setitem(QUALITIES, "draft", FEATURES)
 
 
@@ -88,7 +88,7 @@ def _known_belief(monkeypatch: pytest.MonkeyPatch) -> None:
 def whole() -> Detail:
     """The detail of an undisturbed fit in one process."""
     with pytest.MonkeyPatch.context() as patch, threads(1):
-        patch.setattr(large, "choose", fixed_belief)
+        patch.setattr(large, "select_hyperparameters", fixed_belief)
         patch.setitem(QUALITIES, "draft", FEATURES)
         return fitted(block_points=200)[1]
 
@@ -154,7 +154,7 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    found = LocalData(samples, Leftover.of(sdf, samples), fixed_belief())
+    found = LocalData(samples, FieldResiduals.of(sdf, samples), fixed_belief())
     single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
@@ -217,7 +217,8 @@ def test_a_killed_process_leaves_whole_blocks(whole: Detail, tmp_path: Path) -> 
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent), *sys.path]!r}\n"
         "import time, torch; from pathlib import Path\n"
         "from gnrecon.fit.blocks import solve as large; import test_fit_blocks as own\n"
-        "torch.set_num_threads(1); large.choose = own.fixed_belief; own.QUALITIES['draft'] = own.FEATURES\n"
+        "torch.set_num_threads(1); large.select_hyperparameters = own.fixed_belief\n"
+        "own.QUALITIES['draft'] = own.FEATURES\n"
         "save = own.WorkFolder.save\n"
         "own.WorkFolder.save = lambda *arguments: (save(*arguments), time.sleep(0.2))\n"
         f"own.fitted(Path({str(tmp_path)!r}))\n"
@@ -246,7 +247,7 @@ def test_memory_holds_one_cube_and_its_neighbours(tmp_path: Path, monkeypatch: p
         return rows
 
     monkeypatch.setattr(block.BlockSolver, "_nearby_points", counted)
-    monkeypatch.setattr(large, "choose", lambda *_: Belief(0.04, 1e-3, 0.05))
+    monkeypatch.setattr(large, "select_hyperparameters", lambda *_: Hyperparameters(0.04, 1e-3, 0.05))
     with threads(1):
         _, detail = fitted(tmp_path)
     assert isinstance(WorkFolder(tmp_path).array("points").base, np.memmap)
@@ -257,7 +258,7 @@ def test_memory_holds_one_cube_and_its_neighbours(tmp_path: Path, monkeypatch: p
 def test_cubes_see_all_of_their_points(tmp_path: Path) -> None:
     fitted(tmp_path)
     found = block.BlockSolver.of(WorkFolder(tmp_path), "cpu")
-    points, partition = found.leftover.points, found.partition
+    points, partition = found.residuals.points, found.partition
     reach = partition.reach + 2 * found.radius
     for key in found.keys[::7]:
         inside = np.flatnonzero((np.abs(points - partition.center(key)) <= reach).all(axis=1))

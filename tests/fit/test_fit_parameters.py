@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
-from pathlib import Path
 
 import numpy as np
 import pytest
+from parameter_checks import assert_frozen, read_attributes
 
 import gnrecon.fit
 from gnrecon.fit import FitOptions, parameters
 from gnrecon.fit.consistency import find_outliers
 from gnrecon.fit.local_fields import cube_length
-from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.objective import normal_weight
 from gnrecon.fit.parameters import FitParameters, LocalFieldParameters, OutlierParameters, SingleNetworkParameters
 from gnrecon.geometry.arrays import Float
@@ -23,23 +22,13 @@ from gnrecon.geometry.signed_distance import Density
 CLASSES = [found for _, found in inspect.getmembers(parameters, dataclasses.is_dataclass)]
 
 
-def used_names() -> set[str]:
-    """The names of all attributes that the sources of the fit read."""
-    sources = [path for path in Path(gnrecon.fit.__file__).parent.rglob("*.py") if path.name != "parameters.py"]
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sources]
-    return {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-
-
 @pytest.mark.parametrize("group", CLASSES, ids=lambda group: group.__name__)
 def test_groups_are_frozen_and_have_defaults(group: type) -> None:
-    instance = group()
-    for field in dataclasses.fields(group):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(instance, field.name, None)
+    assert_frozen(group())
 
 
 def test_every_constant_is_used() -> None:
-    used = used_names()
+    used = read_attributes(gnrecon.fit, "parameters.py")
     groups = [group for group in CLASSES if group is not FitParameters]
     unused = [(group.__name__, field.name) for group in groups for field in dataclasses.fields(group)]
     assert [both for both in unused if both[1] not in used] == []
@@ -51,9 +40,9 @@ def test_the_whole_holds_every_group() -> None:
 
 
 def test_a_cube_of_sparse_points_is_as_long_as_the_limit_says() -> None:
-    belief, disks = Belief(0.1, 1e-3, 0.05), np.full(5, 10.0)
-    assert cube_length(belief, disks, 1.0) == pytest.approx(0.1 * LocalFieldParameters.most_length_stretch)
-    assert cube_length(belief, disks, 1.0, most_length_stretch=2.0) == pytest.approx(0.2)
+    hyperparameters, disks = Hyperparameters(0.1, 1e-3, 0.05), np.full(5, 10.0)
+    assert cube_length(hyperparameters, disks, 1.0) == pytest.approx(0.1 * LocalFieldParameters.most_length_stretch)
+    assert cube_length(hyperparameters, disks, 1.0, most_length_stretch=2.0) == pytest.approx(0.2)
 
 
 def test_the_default_thresholds_find_the_outliers() -> None:

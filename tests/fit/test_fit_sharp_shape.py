@@ -76,7 +76,7 @@ def test_faces_of_a_cube_are_extended_to_its_edges_and_its_gaps_are_halved() -> 
     nearest = [Density(points).tree.query(places)[0].max() for points in (scan.points, found.samples.points)]
     assert nearest[1] < nearest[0]
     radius = Density(found.samples.points).radius
-    assert found.belief.length == pytest.approx(SharpShapeParameters.exact_length_radii * radius)
+    assert found.hyperparameters.length == pytest.approx(SharpShapeParameters.exact_length_radii * radius)
 
 
 def test_samples_between_points_of_a_cylinder_are_of_fourth_order() -> None:

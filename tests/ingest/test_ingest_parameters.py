@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
-from pathlib import Path
 
 import numpy as np
 import pytest
 from made_shapes import sphere
+from parameter_checks import assert_frozen, read_attributes
 
 import gnrecon.ingest
 from gnrecon.geometry.point_cloud import PointCloud
@@ -29,25 +28,13 @@ from gnrecon.runtime.errors import InputError
 CLASSES = [found for _, found in inspect.getmembers(ingest_parameters, dataclasses.is_dataclass)]
 
 
-def used_names() -> set[str]:
-    """The names of all attributes that the sources of ingest read."""
-    sources = [
-        path for path in Path(gnrecon.ingest.__file__).parent.glob("*.py") if path.name != "ingest_parameters.py"
-    ]
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sources]
-    return {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-
-
 @pytest.mark.parametrize("group", CLASSES, ids=lambda group: group.__name__)
 def test_groups_are_frozen_and_have_defaults(group: type) -> None:
-    instance = group()
-    for field in dataclasses.fields(group):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(instance, field.name, None)
+    assert_frozen(group())
 
 
 def test_every_constant_is_used() -> None:
-    used = used_names()
+    used = read_attributes(gnrecon.ingest, "ingest_parameters.py")
     fields = [(group.__name__, field.name) for group in CLASSES for field in dataclasses.fields(group)]
     # `layers_of` takes the group of double walls itself, because it is called after `prepare`.
     assert [both for both in fields if both[1] not in used] == [("IngestParameters", "double_walls")]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ast
-from dataclasses import FrozenInstanceError, fields, replace
-from pathlib import Path
+from dataclasses import fields, replace
 
 import numpy as np
-import pytest
 import torch
 from implicit_shapes import cube, sphere
+from parameter_checks import assert_frozen, read_attributes
 
 import gnrecon.level_set
 from gnrecon.level_set import GridRegion, project, sample_surface
@@ -19,15 +17,11 @@ DEFAULT = LevelSetParameters()
 
 
 def test_they_are_frozen() -> None:
-    with pytest.raises(FrozenInstanceError):
-        DEFAULT.grid_nodes = 1  # type: ignore[misc]
+    assert_frozen(DEFAULT)
 
 
 def test_each_is_used() -> None:
-    sources = Path(gnrecon.level_set.__file__).parent.glob("*.py")
-    nodes = [node for path in sources for node in ast.walk(ast.parse(path.read_text()))]
-    used = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
-    assert {field.name for field in fields(DEFAULT)} <= used
+    assert {field.name for field in fields(DEFAULT)} <= read_attributes(gnrecon.level_set)
 
 
 def test_the_tolerance_ends_the_projection() -> None:

@@ -21,8 +21,8 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
 from gnrecon.fit.blocks.tree import Codes, DipoleTree, morton_codes
 from gnrecon.fit.local_fields import cube_length
-from gnrecon.fit.local_solve import Belief, PatchSystem
-from gnrecon.fit.model_selection import Leftover, Volume
+from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
+from gnrecon.fit.model_selection import FieldResiduals, Volume
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding
@@ -57,7 +57,7 @@ class BlockSolver:
     partition, features, belief, seed, device : as in `gnrecon.fit.local_fields`
     """
 
-    leftover: Leftover
+    residuals: FieldResiduals
     disks: Float
     radius: float
     cells: Codes
@@ -70,7 +70,7 @@ class BlockSolver:
     box: Box
     partition: Partition
     features: Features
-    belief: Belief
+    hyperparameters: Hyperparameters
     seed: int
     device: str
 
@@ -78,12 +78,12 @@ class BlockSolver:
     def of(cls, work: WorkFolder, device: str) -> BlockSolver:
         """Map the arrays of a work folder."""
         facts, array = work.facts, work.array
-        leftover = Leftover(array("points"), array("normals"), array("value"), array("gradient"))
+        residuals = FieldResiduals(array("points"), array("normals"), array("value"), array("gradient"))
         frequencies, phases, theta = (
             torch.tensor(np.array(array(name)), device=device) for name in ("frequencies", "phases", "theta")
         )
         return cls(
-            leftover=leftover,
+            residuals=residuals,
             disks=array("disks"),
             radius=facts["radius"],
             cells=array("cells"),
@@ -96,7 +96,7 @@ class BlockSolver:
             box=Box(*array("box")),
             partition=Partition(array("origin"), facts["cell"], facts["overlap"]),
             features=Features(frequencies, phases),
-            belief=Belief(facts["length"], facts["position"], facts["angle"]),
+            hyperparameters=Hyperparameters(facts["length"], facts["position"], facts["angle"]),
             seed=facts["seed"],
             device=device,
         )
@@ -121,13 +121,13 @@ class BlockSolver:
         """Return the length and amplitudes of a cube, or None where it holds too few points."""
         center, nearby = self.partition.center(key), self._nearby_points(key)
         reach = self.partition.reach + LocalFieldParameters.data_margin_disk_radii * self.radius
-        rows = nearby[(np.abs(self.leftover.points[nearby] - center) <= reach).all(axis=1)]
+        rows = nearby[(np.abs(self.residuals.points[nearby] - center) <= reach).all(axis=1)]
         if len(rows) < LocalFieldParameters.least_points:
             return None
-        length = cube_length(self.belief, self.disks[rows], self.radius)
-        patch = self.leftover.patch(rows, center, self._free_space(key, center, nearby), self.device)
+        length = cube_length(self.hyperparameters, self.disks[rows], self.radius)
+        patch = self.residuals.patch(rows, center, self._free_space(key, center, nearby), self.device)
         system = PatchSystem(patch, self.features, length, patch.size)
-        amplitudes = system.solve_within(self.belief.position, self.belief.angle)
+        amplitudes = system.solve_with_bounds(self.hyperparameters.position, self.hyperparameters.angle)
         return length, amplitudes.cpu().numpy()
 
     def _nearby_points(self, key: Int) -> Int:
@@ -147,7 +147,7 @@ class BlockSolver:
         rng = np.random.default_rng([self.seed, 3, *(int(number) + 1 for number in key)])
         x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (LocalFieldParameters.volume_samples, 3))
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
-        distance, nearest = cKDTree(self.leftover.points[nearby]).query(x)
+        distance, nearest = cKDTree(self.residuals.points[nearby]).query(x)
         disks = self.disks[nearby][nearest]
         clear = distance > LocalFieldParameters.clearance_disk_radii * disks
         x, distance, disks = x[clear], distance[clear], disks[clear]

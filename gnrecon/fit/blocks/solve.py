@@ -28,8 +28,8 @@ from gnrecon.fit.blocks.tree import DipoleTree, morton_codes, octree_blocks
 from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Leftover, choose
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -69,16 +69,18 @@ def fit_large(
     FitError, MemoryLimitError
         When a block cannot be solved.
     """
-    leftover = Leftover.of(sdf, samples)
-    belief = choose(leftover, held, leftover.density.radius, rng, options.device)
+    residuals = FieldResiduals.of(sdf, samples)
+    hyperparameters = select_hyperparameters(residuals, held, residuals.density.radius, rng, options.device)
     chosen = LocalFieldParameters.selection_time_share
     advance(chosen)
     like = torch.zeros(0, dtype=torch.float64, device=options.device)
     features = Features.draw(options.features, rng, like)
     # Offset by a part of a cell that no regular scan shares, as in `gnrecon.fit.local_fields`.
     edge = LocalFieldParameters.cube_edge_lengths
-    partition = Partition(leftover.points.min(axis=0) - 0.137 * edge * belief.length, edge * belief.length)
-    arrays, facts = _task_data(sdf, leftover, belief, features, partition, block_points)
+    partition = Partition(
+        residuals.points.min(axis=0) - 0.137 * edge * hyperparameters.length, edge * hyperparameters.length
+    )
+    arrays, facts = _task_data(sdf, residuals, hyperparameters, features, partition, block_points)
     with _work_folder(folder) as path:
         work = WorkFolder.open(path, arrays, facts | {"seed": options.seed})
         count = len(arrays["ends"]) - 1
@@ -89,7 +91,7 @@ def fit_large(
         else:
             # As many processes as torch has threads: the option, or by default the cores.
             solve_blocks(work, missing, torch.get_num_threads(), options.device, subrange(advance, chosen, 1.0))
-        return _assembled(work, count, arrays["keys"], partition, features, belief)
+        return _assembled(work, count, arrays["keys"], partition, features, hyperparameters)
 
 
 @contextmanager
@@ -102,23 +104,28 @@ def _work_folder(folder: str | Path | None) -> Iterator[Path]:
 
 
 def _task_data(
-    sdf: NeuralSDF, leftover: Leftover, belief: Belief, features: Features, partition: Partition, block_points: int
+    sdf: NeuralSDF,
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
+    features: Features,
+    partition: Partition,
+    block_points: int,
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the arrays and the plain values from which all blocks are solved, see `BlockSolver`."""
-    density = leftover.density
-    codes = morton_codes(_cells(partition, leftover.points))
+    density = residuals.density
+    codes = morton_codes(_cells(partition, residuals.points))
     # Stable sorting keeps the order of points within a cell, and so the sums over them.
     order = np.argsort(codes, kind="stable")
     cells, first = np.unique(codes[order], return_index=True)
     keys, ends = _divided(
-        _occupied_cubes(partition, leftover.points), cells, np.append(first, len(codes)), block_points
+        _occupied_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points
     )
-    dipoles = DipoleTree.of(leftover.points, leftover.normals, density.disks)
+    dipoles = DipoleTree.of(residuals.points, residuals.normals, density.disks)
     arrays = {
-        "points": leftover.points[order],
-        "normals": leftover.normals[order],
-        "value": leftover.value[order],
-        "gradient": leftover.gradient[order],
+        "points": residuals.points[order],
+        "normals": residuals.normals[order],
+        "value": residuals.value[order],
+        "gradient": residuals.gradient[order],
         "disks": density.disks[order],
         "cells": cells,
         "first": np.append(first, len(codes)),
@@ -137,9 +144,9 @@ def _task_data(
         "cell": partition.cell,
         "overlap": partition.overlap,
         "radius": density.radius,
-        "length": belief.length,
-        "position": belief.position,
-        "angle": belief.angle,
+        "length": hyperparameters.length,
+        "position": hyperparameters.position,
+        "angle": hyperparameters.angle,
     }
     return arrays, facts
 
@@ -172,7 +179,7 @@ def _divided(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) ->
 
 
 def _assembled(
-    work: WorkFolder, count: int, keys: Int, partition: Partition, features: Features, belief: Belief
+    work: WorkFolder, count: int, keys: Int, partition: Partition, features: Features, hyperparameters: Hyperparameters
 ) -> Detail:
     """Return the local fields of all blocks, in the order of their keys."""
     solved = [work.load(number) for number in range(count)]
@@ -183,4 +190,6 @@ def _assembled(
     # The order in which smaller scans have them, whatever the blocks are.
     order = np.lexsort((kept[:, 2], kept[:, 1], kept[:, 0]))
     sums = torch.as_tensor(amplitudes[order], device=features.phases.device)
-    return Detail(partition, kept[order], lengths[order], features, sums, belief.position, belief.angle)
+    return Detail(
+        partition, kept[order], lengths[order], features, sums, hyperparameters.position, hyperparameters.angle
+    )

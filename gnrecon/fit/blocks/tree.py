@@ -133,11 +133,11 @@ class DipoleTree:
         sums = np.column_stack([areas, areas[:, None] * points, areas[:, None] * normals / 4])[order]
         first: Int
         codes, first = codes[order], np.arange(len(points) + 1)
-        codes, sums, first = _joined(codes, sums)
+        codes, sums, first = _connected(codes, sums)
         levels = [_level(sums, first, origin, side)]
         # A code without its last three bits is that of the cube of twice the side.
         while len(codes) > root_cubes:
-            codes, sums, first = _joined(codes >> np.uint64(3), sums)
+            codes, sums, first = _connected(codes >> np.uint64(3), sums)
             side *= 2
             levels.append(_level(sums, first, origin, side))
         return cls(tuple(reversed(levels)))
@@ -180,7 +180,7 @@ class DipoleTree:
         return winding_number(x, *self.dipoles_for(center, reach))
 
 
-def _joined(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:
+def _connected(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:
     """Return each code once, the sums of its rows, which are adjacent, and the first row of each, with the end."""
     start = np.flatnonzero(np.r_[True, codes[1:] != codes[:-1]])
     return codes[start], np.add.reduceat(sums, start, axis=0), np.append(start, len(codes))

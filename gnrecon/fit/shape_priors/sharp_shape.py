@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.fit.local_solve import Belief
+from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.fit.shape_priors.edge_completion import EdgeCompletion
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
@@ -48,14 +48,14 @@ class SharpShape:
     parameters: SharpShapeParameters = SharpShapeParameters()
 
     @property
-    def belief(self) -> Belief:
+    def hyperparameters(self) -> Hyperparameters:
         """Length of the features and noise of the samples."""
         radius, p = Density(self.samples.points).radius, self.parameters
         if self.averaging is None:
             length, angle = p.exact_length_radii, p.exact_angle_radians
         else:
             length, angle = p.averaged_length_radii, p.averaged_angle_radians
-        return Belief(length * radius, p.position_noise_radii * radius, angle)
+        return Hyperparameters(length * radius, p.position_noise_radii * radius, angle)
 
     @classmethod
     def of(cls, samples: Samples, parameters: ShapePriorParameters = ShapePriorParameters()) -> SharpShape | None:

@@ -26,7 +26,7 @@ from benchmarks.engine.paper_loss import PAPER_WEIGHTS, LossWeights, Sample, pos
 from benchmarks.harness.measurement import Clock
 from gnrecon.field import Siren
 from gnrecon.fit.initialisation import solve_last_layer
-from gnrecon.fit.objective import FieldProblem, Scene, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
 from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import SOLVERS, layer_scaled
@@ -141,8 +141,8 @@ def solved_start(
     chosen = torch.as_tensor(rng.permutation(len(points))[:most_points])
     on = scene.points[chosen]
     terms = [
-        Term("data", interface, on),
-        Term("normal", normal_vector, on, scene.normals[chosen], normal_weight),
-        Term("distance", signed_distance, scene.tensor(x), scene.tensor(distance), distance_weight),
+        ObjectiveTerm("data", interface, on),
+        ObjectiveTerm("normal", normal_vector, on, scene.normals[chosen], normal_weight),
+        ObjectiveTerm("distance", signed_distance, scene.tensor(x), scene.tensor(distance), distance_weight),
     ]
     return solve_last_layer(field, terms, sine_features(field, seed), ridge).to(sample.points)

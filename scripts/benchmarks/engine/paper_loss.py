@@ -18,7 +18,7 @@ from torch import Tensor
 
 from benchmarks.accuracy.scans import PAPER_SCANS, draw_vertices, load_shape
 from gnrecon.field import Siren
-from gnrecon.fit.objective import FieldProblem, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.residuals import eikonal, interface, normal_projection
 
 
@@ -64,9 +64,9 @@ def posed(
     The factors of the Jacobian's rows are kept up to `keep_bytes`, and stored in `precision`.
     """
     terms = [
-        Term("data", interface, sample.points, None, weights.data),
-        Term("normal", normal_projection, sample.points, sample.normals, weights.normal),
-        Term("eikonal", eikonal, sample.volume, None, weights.eikonal),
+        ObjectiveTerm("data", interface, sample.points, None, weights.data),
+        ObjectiveTerm("normal", normal_projection, sample.points, sample.normals, weights.normal),
+        ObjectiveTerm("eikonal", eikonal, sample.volume, None, weights.eikonal),
     ]
     return FieldProblem(field, terms, theta, precision=precision, keep_bytes=keep_bytes)
 

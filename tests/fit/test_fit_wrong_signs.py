@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.initialisation import GhostSearch
+from gnrecon.fit.initialisation import WrongSignSearch
 from gnrecon.fit.model_selection import Volume
 from gnrecon.fit.parameters import ModelSelectionParameters
 from gnrecon.geometry.arrays import Float
@@ -38,28 +38,28 @@ def test_all_wrong_signs_are_found_and_few_are_asked_for(
     known, signed = coarse.sample(rng.uniform(-1.6, 1.6, (3000, 3)))
     asked.clear()
     x = rng.uniform(-1.6, 1.6, (20_000, 3))
-    ghosts, distances = GhostSearch(coarse, known, np.sign(signed)).ghosts(x, haunted)
+    wrong_signs, distances = WrongSignSearch(coarse, known, np.sign(signed)).wrong_signs(x, haunted)
     clear, true, *_ = coarse.at(x)
     wrong = haunted(x[clear]) * true < 0
-    assert 20 < len(ghosts) == wrong.sum()
-    np.testing.assert_allclose(ghosts, x[clear][wrong])
+    assert 20 < len(wrong_signs) == wrong.sum()
+    np.testing.assert_allclose(wrong_signs, x[clear][wrong])
     np.testing.assert_allclose(distances, true[wrong])
-    assert len(ghosts) <= asked[0] < 0.15 * len(x)
+    assert len(wrong_signs) <= asked[0] < 0.15 * len(x)
 
 
 @pytest.mark.seed(2068095738)
 def test_signs_that_were_found_are_remembered(coarse: CoarseDistance, rng: np.random.Generator) -> None:
     none = np.zeros(0)
-    search = GhostSearch(coarse, np.zeros((0, 3)), none)
+    search = WrongSignSearch(coarse, np.zeros((0, 3)), none)
     x = rng.uniform(-1.6, 1.6, (2000, 3))
-    ghosts, _ = search.ghosts(x, haunted)
-    assert len(ghosts) > 5
+    wrong_signs, _ = search.wrong_signs(x, haunted)
+    assert len(wrong_signs) > 5
     # Nothing was known, so that everything was asked for.
     assert len(search.points) == len(search.signs) == coarse.size(x)[0].sum()
     np.testing.assert_array_equal(search.signs, np.sign(np.linalg.norm(search.points, axis=1) - 1))
     before = len(search.points)
-    assert len(search.ghosts(x, haunted)[0]) == len(ghosts)
-    assert len(search.points) == before + len(ghosts)
+    assert len(search.wrong_signs(x, haunted)[0]) == len(wrong_signs)
+    assert len(search.points) == before + len(wrong_signs)
 
 
 def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:

@@ -12,9 +12,9 @@ from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import two_level as adaptive
 from gnrecon.fit.parameters import PenaltyFitParameters
-from gnrecon.fit.regularised import Free, Sheet, _joined
 from gnrecon.fit.shape_priors import sharp_shape as sharp
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion
+from gnrecon.fit.surface_penalties import FreeSpace, SurfaceSamples, _connected
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest import prepare
@@ -28,7 +28,7 @@ def fitted(cloud: PointCloud, seed: int = 0, **penalties: str) -> NeuralSDF:
 
 def surface(sdf: NeuralSDF, cloud: PointCloud) -> Float:
     """Points of the surface, in file units."""
-    sheet = Sheet.of(sdf, Density(sdf.frame.to_unit(cloud.points)), 0.05, np.random.default_rng(3))
+    sheet = SurfaceSamples.of(sdf, Density(sdf.frame.to_unit(cloud.points)), 0.05, np.random.default_rng(3))
     return sdf.frame.to_world(sheet.points)
 
 
@@ -109,18 +109,18 @@ def test_the_same_again_is_the_same() -> None:
 
 
 def test_a_cloud_without_known_free_space_is_asked_for_none() -> None:
-    free = Free(np.zeros((0, 3)), np.zeros(0))
-    assert free.wishes(np.zeros(0, dtype=bool), np.zeros(0), 1.0, torch.zeros(0)) == []
+    free = FreeSpace(np.zeros((0, 3)), np.zeros(0))
+    assert free.terms(np.zeros(0, dtype=bool), np.zeros(0), 1.0, torch.zeros(0)) == []
 
 
 def test_the_free_space_counts_as_a_whole() -> None:
-    free = Free(np.eye(3), np.array([0.03, -0.03, 0.01]))
-    (wish,) = free.wishes(np.array([True, False, True]), np.arange(3.0), 2.0, torch.zeros(0, dtype=torch.float64))
-    assert wish.points.tolist() == [[1, 0, 0], [0, 0, 1]]
-    assert wish.still is not None
-    assert wish.still.tolist() == [0, 2]
+    free = FreeSpace(np.eye(3), np.array([0.03, -0.03, 0.01]))
+    (term,) = free.terms(np.array([True, False, True]), np.arange(3.0), 2.0, torch.zeros(0, dtype=torch.float64))
+    assert term.points.tolist() == [[1, 0, 0], [0, 0, 1]]
+    assert term.fixed_value is not None
+    assert term.fixed_value.tolist() == [0, 2]
     # All three points together weigh as much as is asked, whatever part of them a cube holds.
-    assert (wish.scale**2).flatten().tolist() == pytest.approx([4 * PenaltyFitParameters.free_space_weight / 3] * 2)
+    assert (term.scale**2).flatten().tolist() == pytest.approx([4 * PenaltyFitParameters.free_space_weight / 3] * 2)
 
 
 def test_sheets_without_data_are_no_part_of_the_shape() -> None:
@@ -128,17 +128,16 @@ def test_sheets_without_data_are_no_part_of_the_shape() -> None:
     aside, further = near + np.array([0.0, 5, 0]), np.array([[9.5, 0, 0], [10.5, 0, 0]])
     points = np.concatenate([near, aside, further])
     scanned = np.arange(len(points)) < 3
-    assert np.flatnonzero(_joined(points, scanned, 1.6)).tolist() == [*range(9), 18, 19]
+    assert np.flatnonzero(_connected(points, scanned, 1.6)).tolist() == [*range(9), 18, 19]
 
 
 def test_a_sheet_knows_what_is_far() -> None:
     samples = Samples(ball(600).points, ball(600).points, Frame(np.zeros(3), 1.0))
     top = samples.points[:, 2] < 0.6
     density = Density(samples.points[top])
-    sheet = Sheet(samples.points, (samples.points[:, 2] > 0.95).astype(float))
+    sheet = SurfaceSamples(samples.points, (samples.points[:, 2] > 0.95).astype(float))
     x = np.array([[0, 0, 1.2], [0, 0, 0.7], [0, 0, -1.3]])
     told = sheet.volume_distances(x, np.full(3, 9.0), np.array([0.1, -0.1, 0.1]), density)
     assert told == pytest.approx([0.2, -0.3, 9.0], abs=0.02)
-    assert Sheet(samples.points, np.zeros(600)).volume_distances(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(
-        9.0
-    )
+    covered = SurfaceSamples(samples.points, np.zeros(600))
+    assert covered.volume_distances(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(9.0)

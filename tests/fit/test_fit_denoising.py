@@ -11,8 +11,8 @@ import pytest
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import denoising as averaged
 from gnrecon.fit.denoising import LocalData, _best, _candidates, choose_local_data, has_edges
-from gnrecon.fit.local_solve import Belief
-from gnrecon.fit.model_selection import Choice, Leftover
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import DenoisingParameters
 from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -61,17 +61,17 @@ def test_faces_that_meet_are_told_from_bends() -> None:
 def chosen(gains: dict[BilateralFilter, float], edges: bool) -> BilateralFilter | None:
     """Return the averaging whose left-out points are told better, by gains of a scatter of one hundredth."""
     scatter = 0.01 * np.tile([1.0, -1.0], 50)[:, None]
-    belief = Belief(0.1, 0.01, 0.1)
+    hyperparameters = Hyperparameters(0.1, 0.01, 0.1)
 
     class Scores:
         def __init__(self, gain: float) -> None:
             self.gain = gain
 
         def scores(self, length: float) -> np.ndarray:
-            assert length == belief.length
+            assert length == hyperparameters.length
             return np.full((100, 3), 0.5) - self.gain - scatter
 
-    choice = Choice(belief, np.full((100, 3), 0.5))
+    choice = SelectedModel(hyperparameters, np.full((100, 3), 0.5))
     found = _best(choice, lambda one: Scores(gains.get(one, -1.0)), lambda: edges)  # type: ignore[arg-type,return-value]
     return None if found is None else found[0]
 
@@ -88,28 +88,28 @@ def test_edges_decide_what_scatter_hides() -> None:
 
 def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = ball(300, 0.0, np.random.default_rng(4))
-    leftover = Leftover(samples.points, samples.normals, np.zeros(300), samples.normals)
+    residuals = FieldResiduals(samples.points, samples.normals, np.zeros(300), samples.normals)
 
     def result(position: float, estimated: bool) -> LocalData | None:
         """What is told of a noise, in radii of a point's disk; None where averaging was tried."""
-        choice = Choice(Belief(0.1, position * leftover.density.radius, 0.1), np.zeros((2, 2)))
+        choice = SelectedModel(Hyperparameters(0.1, position * residuals.density.radius, 0.1), np.zeros((2, 2)))
 
         class Canned:
             def clean(self) -> None:
                 return None
 
-            def choice(self) -> Choice:
+            def select(self) -> SelectedModel:
                 return choice
 
-        monkeypatch.setattr(averaged.Trials, "draw", lambda *_: Canned())
-        monkeypatch.setattr(averaged.Leftover, "of", lambda *_: leftover)
+        monkeypatch.setattr(averaged.CrossValidation, "draw", lambda *_: Canned())
+        monkeypatch.setattr(averaged.FieldResiduals, "of", lambda *_: residuals)
         monkeypatch.setattr(averaged, "_best", lambda *_: tried.append(True))
         tried: list[bool] = []
         field: NeuralSDF = None  # type: ignore[assignment]
         given = replace(samples, estimated=estimated)
         found = choose_local_data(field, given, np.zeros(300, dtype=bool), 300, np.random.default_rng(0), "cpu")
         assert found.samples is given
-        assert found.belief is choice.belief
+        assert found.hyperparameters is choice.hyperparameters
         assert found.averaging is None
         return None if tried else found
 

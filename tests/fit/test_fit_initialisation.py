@@ -11,27 +11,27 @@ from torch import Tensor
 from gnrecon.field import Siren
 from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.fit.initialisation import Spectrum, random_features, solve_last_layer
-from gnrecon.fit.objective import FieldProblem, Term
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
 
 each_field = pytest.mark.parametrize("widths", [(20,), (12, 15)], ids=str)
 
 
-def draw(widths: tuple[int, ...]) -> tuple[Siren, list[Term], Tensor]:
+def draw(widths: tuple[int, ...]) -> tuple[Siren, list[ObjectiveTerm], Tensor]:
     generator = torch.Generator().manual_seed(4)
     field = Siren(widths)
     x, volume = (torch.randn(count, 3, generator=generator, dtype=torch.float64) for count in (60, 80))
     normals = x / x.norm(dim=1, keepdim=True)
     terms = [
-        Term("interface", interface, normals),
-        Term("normal", normal_vector, normals, normals, 0.3),
-        Term("distance", signed_distance, volume, volume.norm(dim=1) - 1, 0.1),
+        ObjectiveTerm("interface", interface, normals),
+        ObjectiveTerm("normal", normal_vector, normals, normals, 0.3),
+        ObjectiveTerm("distance", signed_distance, volume, volume.norm(dim=1) - 1, 0.1),
     ]
     return field, terms, torch.randn(field.layout.count, generator=generator, dtype=torch.float64)
 
 
-def loss_gradient(field: Siren, terms: list[Term], theta: Tensor) -> tuple[float, Tensor]:
+def loss_gradient(field: Siren, terms: list[ObjectiveTerm], theta: Tensor) -> tuple[float, Tensor]:
     """The loss and its gradient by the last layer's parameters."""
     problem = FieldProblem(field, terms, theta)
     jacobian, residual = problem.linearise(theta)
@@ -61,7 +61,7 @@ def test_solve_finds_a_field_that_the_features_can_express(widths: tuple[int, ..
     field, _, theta = draw(widths)
     x = torch.randn(200, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     value, gradient = field.value_and_gradient(theta, x)
-    terms = [Term("distance", signed_distance, x, value), Term("normal", normal_vector, x, gradient)]
+    terms = [ObjectiveTerm("distance", signed_distance, x, value), ObjectiveTerm("normal", normal_vector, x, gradient)]
     blank = theta.clone()
     blank[field.layout.offsets[-1] :] = 0.0
     torch.testing.assert_close(solve_last_layer(field, terms, blank), theta, rtol=0, atol=1e-4)
@@ -69,7 +69,7 @@ def test_solve_finds_a_field_that_the_features_can_express(widths: tuple[int, ..
 
 def test_values_that_are_not_finite_end_with_a_sentence() -> None:
     field, terms, theta = draw((20,))
-    broken = [*terms, Term("distance", signed_distance, terms[0].points, terms[0].points[:, 0] * torch.nan)]
+    broken = [*terms, ObjectiveTerm("distance", signed_distance, terms[0].points, terms[0].points[:, 0] * torch.nan)]
     with pytest.raises(FitError, match="not finite"):
         solve_last_layer(field, broken, theta)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
-from gnrecon.fit.objective import FieldProblem, Term, groups
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, groups
 from gnrecon.residuals import (
     eikonal,
     interface,
@@ -35,7 +35,7 @@ def value_at(field: Siren, theta: Tensor, x: Tensor) -> Tensor:
     return (weights @ activation + bias)[0]
 
 
-def plain_residuals(field: Siren, terms: Sequence[Term], theta: Tensor) -> list[Tensor]:
+def plain_residuals(field: Siren, terms: Sequence[ObjectiveTerm], theta: Tensor) -> list[Tensor]:
     """Unweighted residuals of each term, of shape (N, m)."""
     results = []
     for term in terms:
@@ -45,7 +45,7 @@ def plain_residuals(field: Siren, terms: Sequence[Term], theta: Tensor) -> list[
     return results
 
 
-def weighted(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tensor:
+def weighted(field: Siren, terms: Sequence[ObjectiveTerm], theta: Tensor) -> Tensor:
     rows = []
     for term, residual in zip(terms, plain_residuals(field, terms, theta), strict=True):
         weight = torch.as_tensor(term.weight, dtype=theta.dtype).expand(len(term))
@@ -53,7 +53,7 @@ def weighted(field: Siren, terms: Sequence[Term], theta: Tensor) -> Tensor:
     return torch.cat(rows)
 
 
-def draw(seed: int, widths: tuple[int, ...]) -> tuple[Siren, list[Term], Tensor, torch.Generator]:
+def draw(seed: int, widths: tuple[int, ...]) -> tuple[Siren, list[ObjectiveTerm], Tensor, torch.Generator]:
     """All kinds of terms: on shared and on own points, with and without targets, weighted as one and by point."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -65,12 +65,12 @@ def draw(seed: int, widths: tuple[int, ...]) -> tuple[Siren, list[Term], Tensor,
     side = around / around.norm(dim=1, keepdim=True)
     by_point = 0.1 + torch.rand(150, generator=generator, dtype=torch.float64)
     terms = [
-        Term("interface", interface, on),
-        Term("distance", signed_distance, volume, normal(90), 0.3),
-        Term("normal", normal_vector, on, normals, by_point),
-        Term("eikonal", eikonal, around, None, 0.01),
-        Term("cosine", normal_cosine, on, normals, 2.0 * by_point),
-        Term("projection", normal_projection, around, side, 0.7),
+        ObjectiveTerm("interface", interface, on),
+        ObjectiveTerm("distance", signed_distance, volume, normal(90), 0.3),
+        ObjectiveTerm("normal", normal_vector, on, normals, by_point),
+        ObjectiveTerm("eikonal", eikonal, around, None, 0.01),
+        ObjectiveTerm("cosine", normal_cosine, on, normals, 2.0 * by_point),
+        ObjectiveTerm("projection", normal_projection, around, side, 0.7),
     ]
     field = Siren(widths)
     return field, terms, normal(field.layout.count), generator
@@ -169,9 +169,9 @@ def test_long_lists_of_points_are_evaluated_in_parts() -> None:
     field, _, theta, generator = draw(3, (4,))
     x = torch.randn(9001, 3, generator=generator, dtype=torch.float64)
     value, gradient = field.value_and_gradient(theta, x)
-    values_only = FieldProblem(field, [Term("interface", interface, x)], theta)
+    values_only = FieldProblem(field, [ObjectiveTerm("interface", interface, x)], theta)
     torch.testing.assert_close(values_only.residual(theta), value / 9001**0.5)
-    with_gradient = FieldProblem(field, [Term("eikonal", eikonal, x)], theta)
+    with_gradient = FieldProblem(field, [ObjectiveTerm("eikonal", eikonal, x)], theta)
     torch.testing.assert_close(with_gradient.residual(theta), (gradient.norm(dim=1) - 1) / 9001**0.5)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
 from gnrecon.fit import two_level as adaptive
-from gnrecon.fit.model_selection import Leftover, _smoothest, choose
+from gnrecon.fit.model_selection import FieldResiduals, _smoothest, select_hyperparameters
 from gnrecon.fit.parameters import ModelSelectionParameters
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.runtime.errors import InputError
@@ -162,9 +162,9 @@ def test_the_score_does_not_reward_a_flat_field() -> None:
     noisy = torus(2500, rng, noise=0.02)
     zero = np.zeros(len(noisy))
     held = rng.random(len(noisy)) < 0.15
-    leftover = Leftover(noisy.points, noisy.normals, zero + distance(noisy), noisy.normals)
-    belief = choose(leftover, held, 0.02, rng)
-    assert belief.position >= 0.005
+    residuals = FieldResiduals(noisy.points, noisy.normals, zero + distance(noisy), noisy.normals)
+    hyperparameters = select_hyperparameters(residuals, held, 0.02, rng)
+    assert hyperparameters.position >= 0.005
 
 
 def test_estimated_normals_do_not_smooth_ripples_away() -> None:
@@ -178,7 +178,9 @@ def test_estimated_normals_do_not_smooth_ripples_away() -> None:
     smooth = radius - 0.8, samples.points / radius[:, None]
     held = rng.random(len(samples)) < 0.15
     heeding, free = (
-        choose(Leftover(samples.points, normals, *smooth, estimated), held, 0.03, np.random.default_rng(1))
+        select_hyperparameters(
+            FieldResiduals(samples.points, normals, *smooth, estimated), held, 0.03, np.random.default_rng(1)
+        )
         for estimated in (False, True)
     )
     assert free.angle > heeding.angle or free.position < heeding.position
@@ -196,8 +198,8 @@ def test_scans_that_do_not_match_are_not_wound_through() -> None:
     normals = x + 0.1 * rng.standard_normal(x.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     held = rng.random(2500) < 0.15
-    leftover = Leftover((0.8 + apart)[:, None] * x, normals, apart, x, estimated=True)
-    assert choose(leftover, held, 0.03, rng).position > 0.002
+    residuals = FieldResiduals((0.8 + apart)[:, None] * x, normals, apart, x, estimated=True)
+    assert select_hyperparameters(residuals, held, 0.03, rng).position > 0.002
 
 
 def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
@@ -212,8 +214,8 @@ def test_of_beliefs_that_predict_alike_the_noisier_wins() -> None:
 
 def test_left_over_is_in_unit_coordinates(clean: tuple[Samples, NeuralSDF]) -> None:
     samples, sdf = clean
-    leftover = Leftover.of(sdf.coarse(), samples)
-    np.testing.assert_allclose(leftover.value * FRAME.scale, sdf.coarse().sdf(FRAME.to_world(samples.points)))
+    residuals = FieldResiduals.of(sdf.coarse(), samples)
+    np.testing.assert_allclose(residuals.value * FRAME.scale, sdf.coarse().sdf(FRAME.to_world(samples.points)))
 
 
 def test_what_one_network_must_do_is_left_to_one() -> None:

@@ -13,8 +13,8 @@ from torch.distributions import MultivariateNormal
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.local_solve import Patch, data_kernel
-from gnrecon.fit.marginal_likelihood import Evidence, log_density
-from gnrecon.fit.model_selection import Leftover, Trials
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, log_density
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals
 from gnrecon.fit.parameters import LocalSolveParameters, MarginalLikelihoodParameters
 
 LENGTH, RADIUS = 0.4, 0.05
@@ -57,7 +57,7 @@ def test_log_density_is_that_of_a_normal_distribution(rng: np.random.Generator) 
 def test_noise_is_found_again(position: float, angle: float, rng: np.random.Generator) -> None:
     exact, features = patches(6, 60, rng)
     drawn = [noisy(patch, position * RADIUS, angle, rng) for patch in exact]
-    found = Evidence(drawn, features, RADIUS, "cpu").noise(LENGTH)
+    found = MarginalLikelihood(drawn, features, RADIUS, "cpu").noise(LENGTH)
     # What the prior's size, which is not the functions' own, makes of it moves it by a place in the tables at most.
     tables = MarginalLikelihoodParameters
     for value, wanted, table in (
@@ -77,27 +77,29 @@ def test_exact_points_with_tilted_normals_are_believed(rng: np.random.Generator)
     # Left over are waves a tenth of the radius long, of which the normals tell nothing.
     value = 0.01 * np.sin(20.0 * x[:, 0])
     gradient = x + 0.2 * np.cos(20.0 * x[:, :1]) * np.array([1.0, 0.0, 0.0])
-    leftover = Leftover(x, tilted, value, gradient)
-    radius = leftover.density.radius
+    residuals = FieldResiduals(x, tilted, value, gradient)
+    radius = residuals.density.radius
     held = rng.random(1500) < 1 / 6
-    trials = Trials.draw(leftover, held, radius, rng, "cpu")
-    belief = trials.choice().best
-    assert belief.position <= 0.05 * radius
-    assert 0.17 <= belief.angle <= 0.4
+    validation = CrossValidation.draw(residuals, held, radius, rng, "cpu")
+    hyperparameters = validation.select().best
+    assert hyperparameters.position <= 0.05 * radius
+    assert 0.17 <= hyperparameters.angle <= 0.4
 
 
 def test_few_points_and_estimated_normals_have_a_belief_too(rng: np.random.Generator) -> None:
     x = rng.standard_normal((40, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    leftover = Leftover(x, x, 0.01 * x[:, 0], x)
+    residuals = FieldResiduals(x, x, 0.01 * x[:, 0], x)
     assert len(x) < MarginalLikelihoodParameters.patch_points
     held = np.arange(40) % 6 == 0
-    found = Trials.draw(leftover, held, leftover.density.radius, rng, "cpu").choice()
-    assert found.evident is not None
-    assert found.best == found.evident
-    of_estimated = Trials.draw(replace(leftover, estimated=True), held, leftover.density.radius, rng, "cpu").choice()
-    assert of_estimated.evident is None
-    assert of_estimated.best == of_estimated.belief
+    found = CrossValidation.draw(residuals, held, residuals.density.radius, rng, "cpu").select()
+    assert found.most_likely is not None
+    assert found.best == found.most_likely
+    of_estimated = CrossValidation.draw(
+        replace(residuals, estimated=True), held, residuals.density.radius, rng, "cpu"
+    ).select()
+    assert of_estimated.most_likely is None
+    assert of_estimated.best == of_estimated.hyperparameters
 
 
 def test_size_of_a_kernel(rng: np.random.Generator) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.local_solve import Patch, PatchSystem, RowSystem, patch_system
+from gnrecon.fit.local_solve import LocalRowSystem, Patch, PatchSystem, patch_system
 from gnrecon.fit.parameters import LocalSolveParameters
 
 LENGTH, POSITION, ANGLE = 0.4, 0.01, 0.2
@@ -52,10 +52,10 @@ def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor]:
     return J, r
 
 
-@pytest.mark.parametrize("system", [PatchSystem, RowSystem])
+@pytest.mark.parametrize("system", [PatchSystem, LocalRowSystem])
 @pytest.mark.seed(1503570714)
 def test_amplitudes_are_the_mode_of_bayesian_regression(
-    system: type[PatchSystem | RowSystem], patch: Patch, features: Features
+    system: type[PatchSystem | LocalRowSystem], patch: Patch, features: Features
 ) -> None:
     prior = (
         LocalSolveParameters.correction_rms_factor
@@ -79,7 +79,7 @@ def test_a_correction_is_brought_within_its_bounds(patch: Patch, features: Featu
 
     before = beyond(system.solve(*loose))
     assert before > 0.1
-    assert beyond(system.solve_within(*loose)) < 0.1 * before
+    assert beyond(system.solve_with_bounds(*loose)) < 0.1 * before
     # What was asked for stays in the equations that others add to.
     factor, right = system.equations(*loose) or pytest.fail("indefinite")
     assert beyond(torch.cholesky_solve(right[:, None], factor)[:, 0]) < 0.1 * before
@@ -88,7 +88,7 @@ def test_a_correction_is_brought_within_its_bounds(patch: Patch, features: Featu
 def test_a_correction_within_its_bounds_is_left_alone(patch: Patch, features: Features) -> None:
     free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
     system = PatchSystem(free, features, LENGTH, free.size)
-    torch.testing.assert_close(system.solve_within(POSITION, ANGLE), system.solve(POSITION, ANGLE), rtol=0, atol=0)
+    torch.testing.assert_close(system.solve_with_bounds(POSITION, ANGLE), system.solve(POSITION, ANGLE), rtol=0, atol=0)
 
 
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:
@@ -104,11 +104,11 @@ def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Feature
 def test_the_smaller_system_is_solved(patch: Patch, features: Features, rng: np.random.Generator) -> None:
     many = Features.draw(89, rng, torch.zeros(0, dtype=torch.float64))
     # The patch has 20 values, 60 derivatives and 8 samples of the volume.
-    assert isinstance(patch_system(patch, many, LENGTH, patch.size), RowSystem)
+    assert isinstance(patch_system(patch, many, LENGTH, patch.size), LocalRowSystem)
     assert isinstance(patch_system(patch, features, LENGTH, patch.size), PatchSystem)
 
 
 def test_what_rounding_makes_indefinite_is_damped_more(patch: Patch, features: Features) -> None:
-    for system in (PatchSystem, RowSystem):
+    for system in (PatchSystem, LocalRowSystem):
         amplitudes = system(patch, features, LENGTH, 1e12).solve(1e-9, 1e-9)
         assert bool(torch.isfinite(amplitudes).all())

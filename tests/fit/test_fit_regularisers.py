@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.parameters import PenaltyFitParameters
-from gnrecon.fit.regularisers import BendProblem, Sines, Wish, bent, regularisers
+from gnrecon.fit.regularisers import PenaltyProblem, PenaltyTerm, SineSum, minimise_penalised, regularisers
 from gnrecon.residuals import SecondOrder, free_space, gauss_curvature, interface, mean_curvature, surface_strain
 from gnrecon.runtime.errors import UsageError
 
@@ -21,9 +21,9 @@ def sphere(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return (x.square().sum(1) - 1) / 2, x, torch.eye(3).to(x).expand(len(x), 3, 3)
 
 
-def sines(rng: np.random.Generator, count: int = 80) -> Sines:
+def sines(rng: np.random.Generator, count: int = 80) -> SineSum:
     like = torch.zeros(0, dtype=torch.float64)
-    return Sines(Features.draw(count, rng, like), torch.tensor([0.1, 0.0, 0.9]).double(), 0.5, 0.2, sphere)
+    return SineSum(Features.draw(count, rng, like), torch.tensor([0.1, 0.0, 0.9]).double(), 0.5, 0.2, sphere)
 
 
 def cap(rng: np.random.Generator, count: int = 150) -> Tensor:
@@ -69,8 +69,8 @@ def curvature_left(residual: SecondOrder, weight: float, rng: np.random.Generato
     rim = torch.nn.functional.normalize(rim, dim=1)
     rows = field.rows(rim, interface(*sphere(rim)[:2], None), torch.full((len(rim), 1), len(rim) ** -0.5).double())
     factor = torch.linalg.cholesky(rows.T @ rows + 1e-4 * torch.eye(80).double())
-    wish = Wish(residual, points, torch.full((150, 1), (weight / 150) ** 0.5, dtype=torch.float64))
-    found = bent(field, factor, none, [wish], none, 8)
+    term = PenaltyTerm(residual, points, torch.full((150, 1), (weight / 150) ** 0.5, dtype=torch.float64))
+    found = minimise_penalised(field, factor, none, [term], none, 8)
 
     def left(a: Tensor) -> float:
         there = field.on_surface(a, points)
@@ -95,15 +95,15 @@ def test_points_that_stay_keep_what_is_asked_of_their_values(rng: np.random.Gene
     """A cap that is bent flat would leave the points below it on its other side."""
     field, points = sines(rng), cap(rng)
     none = torch.zeros(80, dtype=torch.float64)
-    flat = Wish(mean_curvature, points, torch.full((150, 1), 0.1).double())
+    flat = PenaltyTerm(mean_curvature, points, torch.full((150, 1), 0.1).double())
     below = 0.85 * torch.nn.functional.normalize(points, dim=1)
     least = torch.full((150,), -0.1).double()
     keeps = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
-    held = Wish(keeps, below, torch.full((150, 1), 1.0).double(), target=least, still=sphere(below)[0])
+    held = PenaltyTerm(keeps, below, torch.full((150, 1), 1.0).double(), target=least, fixed_value=sphere(below)[0])
     factor = 1e-2 * torch.eye(80).double()
 
-    def highest(*wishes: Wish) -> float:
-        found = bent(field, factor, none, wishes, none, 8)
+    def highest(*terms: PenaltyTerm) -> float:
+        found = minimise_penalised(field, factor, none, terms, none, 8)
         return float((sphere(below)[0] + field.features.sums(found, below, field.center, field.length, 0)[0]).max())
 
     assert highest(flat) > -0.05
@@ -114,8 +114,8 @@ def test_creases_hardly_count(rng: np.random.Generator) -> None:
     """The tangent of r^2 / (1 + r^2) at r = 10 is a multiple of r^2 that weighs 1 / 101^2."""
     field, points = sines(rng), cap(rng, 5)
     none = torch.zeros(80, dtype=torch.float64)
-    wish = Wish(mean_curvature, points, torch.ones(5, 1).double(), robust=0.2)
-    problem = BendProblem.at(field, torch.eye(80).double(), none, [wish], none)
+    term = PenaltyTerm(mean_curvature, points, torch.ones(5, 1).double(), robust=0.2)
+    problem = PenaltyProblem.at(field, torch.eye(80).double(), none, [term], none)
     # On the unit sphere k1 + k2 is 2, which is ten times 0.2.
     torch.testing.assert_close(problem.residual(none)[80:], torch.full((5,), 2 / 101).double(), rtol=1e-4, atol=0)
 

@@ -1,12 +1,12 @@
-"""A global field and the cubes of its detail, bent to what the regularisers ask for (`regulariser`, `bend`).
+"""Curvature penalties on the global field (`penalise_global`) and on local fields (`SurfacePenalties.penalise_cube`).
 
-Where a hole is to be filled by a film of its own, the coarse distances there say something else: their sign is that of
-the winding number, another film's, and their size the distance to the hole's rim. So samples of the volume that are
-nearer to the film than to any scanned point are told the distance to the film instead, as it is then: that keeps the
-field's sign and slope beside it, and hardly holds it, because these rows weigh little.
+Holes that are to be filled by a minimal surface need other distances in the volume: the coarse ones have the sign of
+the winding number, which closes the hole elsewhere, and the distance to the hole's rim. Volume samples that are nearer
+to the current surface in the hole than to any scanned point get the distance to that surface instead. This keeps the
+field's sign and slope near it, and hardly fixes its place, because these rows have small weights.
 
-So little that features which are bent to a surface's curvature may run off in the free space beside it, and leave
-sheets there. Where the sign is beyond doubt the field is asked to keep it, by a residual that is zero where it does.
+With such small weights, features that follow the curvature penalty may make sheets in free space. Where the sign is
+certain, a one-sided residual (`FreeSpace`) keeps it.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_solve import Belief, PatchSystem
-from gnrecon.fit.objective import FieldProblem, Scene, Term, data_terms, distance_term
+from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
-from gnrecon.fit.regularisers import Jet, Regulariser, Sines, Wish, bent
+from gnrecon.fit.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.signed_distance import Density, free_space_bounds
 from gnrecon.least_squares.direct import damped_factor
@@ -38,8 +38,8 @@ from gnrecon.runtime.errors import FitError
 
 
 @dataclass(frozen=True)
-class Free:
-    """Points of the volume at which the sign is beyond doubt, and what f should be there at least.
+class FreeSpace:
+    """Points of the volume at which the sign is certain, and bounds of f there.
 
     Parameters
     ----------
@@ -53,14 +53,14 @@ class Free:
     @classmethod
     def of(
         cls, scene: Scene, rng: np.random.Generator, *, parameters: PenaltyFitParameters = PenaltyFitParameters()
-    ) -> Free:
+    ) -> FreeSpace:
         """Draw points of a scan's box."""
         x = scene.places(parameters.free_space_factor * scene.volume_count, rng)
         known, distance, _, certain = scene.coarse.at(x)
         kept = certain & (np.abs(distance) > parameters.free_space_clearance_radii)
         return cls(x[known][kept], free_space_bounds(distance[kept], parameters.most_free_space_distance_radii))
 
-    def wishes(
+    def terms(
         self,
         rows: Mask,
         known: Float,
@@ -68,164 +68,173 @@ class Free:
         like: Tensor,
         *,
         weight: float = PenaltyFitParameters.free_space_weight,
-    ) -> list[Wish]:
-        """Return what is asked at some of the points.
+    ) -> list[PenaltyTerm]:
+        """Return the one-sided terms at some of the points.
 
         Parameters
         ----------
         rows : mask of them
-        known : value at all points, of shape (Q,), of what the features are added to
+        known : value at all points, of shape (Q,), of the field that the features are added to
         scale : of the root mean square residual of all points, for a weight of one
         like : tensor whose device is used
         """
         if not rows.any():
             return []
-        points, least, still = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
+        points, least, fixed_value = (torch.as_tensor(part[rows]).to(like) for part in (self.points, self.least, known))
         scales = torch.full_like(least, scale * (weight / len(rows)) ** 0.5)[:, None]
         residual = SecondOrder("free space", lambda f, g, _, target: free_space(f, g, target))
-        return [Wish(residual, points, scales, target=least, still=still)]
+        return [PenaltyTerm(residual, points, scales, target=least, fixed_value=fixed_value)]
 
 
 @dataclass(frozen=True)
-class Shaping:
-    """What is asked of a field's surface, and where.
+class SurfacePenalties:
+    """Curvature penalties of a field and the points at which they apply.
 
     Parameters
     ----------
-    wanted : the regularisers
-    sheet : points of the surface, at which they are asked for
+    regularisers : the penalties
+    surface : points of the surface at which they apply
     sdf : the global field
     density : of the scanned points
     free : where the field is to keep its sign
     """
 
-    wanted: Sequence[Regulariser]
-    sheet: Sheet
+    regularisers: Sequence[Regulariser]
+    surface: SurfaceSamples
     sdf: NeuralSDF
     density: Density
-    free: Free
+    free: FreeSpace
 
     @classmethod
     def of(
         cls,
-        wanted: Sequence[Regulariser],
+        regularisers: Sequence[Regulariser],
         sdf: NeuralSDF,
         density: Density,
-        free: Free,
+        free: FreeSpace,
         length: float,
         rng: np.random.Generator,
-    ) -> Shaping:
+    ) -> SurfacePenalties:
         """Draw points of the surface for features of a length, in radii."""
         return cls(
-            wanted, Sheet.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng), sdf, density, free
+            regularisers,
+            SurfaceSamples.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng),
+            sdf,
+            density,
+            free,
         )
 
     @cached_property
-    def in_free(self) -> Float:
+    def free_space_values(self) -> Float:
         """Values of the global field at the points of the free space, of shape (Q,)."""
         return self.sdf.sdf(self.sdf.frame.to_world(self.free.points)) / self.sdf.frame.scale
 
     def volume_distances(self, x: Float, signed: Float) -> Float:
         """Return signed distances at points of the volume, of shape (Q, 3), from coarse ones, of shape (Q,)."""
-        if not any(one.holes for one in self.wanted):
+        if not any(one.holes for one in self.regularisers):
             return signed
-        return self.sheet.volume_distances(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
+        return self.surface.volume_distances(x, signed, self.sdf.sdf(self.sdf.frame.to_world(x)), self.density)
 
-    def wishes(self, rows: Mask, scale: float, like: Tensor) -> list[Wish]:
-        """Return what is asked of the surface at some of its points.
+    def terms(self, rows: Mask, scale: float, like: Tensor) -> list[PenaltyTerm]:
+        """Return the penalty terms at some points of the surface.
 
         Parameters
         ----------
-        rows : mask of the sheet's points
+        rows : mask of the surface points
         scale : of each point's residuals, for a weight of one
         like : tensor whose device is used
         """
         found = []
-        for one in self.wanted:
-            share = self.sheet.far * rows if one.holes else 1.0 * rows
-            asked = np.flatnonzero(share)
-            if len(asked):
-                points, weights = (torch.as_tensor(part[asked]).to(like) for part in (self.sheet.points, share))
+        for one in self.regularisers:
+            share = self.surface.far * rows if one.holes else 1.0 * rows
+            active = np.flatnonzero(share)
+            if len(active):
+                points, weights = (torch.as_tensor(part[active]).to(like) for part in (self.surface.points, share))
                 scales = scale * (one.weight * weights[:, None]).sqrt()
-                found.append(Wish(one.residual, points, scales, one.crease))
+                found.append(PenaltyTerm(one.residual, points, scales, one.crease))
         return found
 
-    def bend_cube(
+    def penalise_cube(
         self,
         features: Features,
         length: float,
         center: Float,
         reach: float,
-        belief: Belief,
+        hyperparameters: Hyperparameters,
         system: PatchSystem,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
     ) -> Tensor:
         """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
-        amplitudes = system.solve_within(belief.position, belief.angle)
-        equations = system.equations(belief.position, belief.angle)
-        rows = np.asarray((np.abs(self.sheet.points - center) < reach).all(axis=1))
-        scale = (len(self.density.points) / len(self.sheet)) ** 0.5 / belief.position
-        wishes = self.wishes(rows, scale, amplitudes)
-        if equations is None or not wishes:
+        amplitudes = system.solve_with_bounds(hyperparameters.position, hyperparameters.angle)
+        equations = system.equations(hyperparameters.position, hyperparameters.angle)
+        rows = np.asarray((np.abs(self.surface.points - center) < reach).all(axis=1))
+        scale = (len(self.density.points) / len(self.surface)) ** 0.5 / hyperparameters.position
+        terms = self.terms(rows, scale, amplitudes)
+        if equations is None or not terms:
             return amplitudes
         near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
-        wishes += self.free.wishes(near, self.in_free, len(self.density.points) ** 0.5 / belief.position, amplitudes)
+        terms += self.free.terms(
+            near, self.free_space_values, len(self.density.points) ** 0.5 / hyperparameters.position, amplitudes
+        )
         whole, known = as_sines(self.sdf)
 
         def base(x: Tensor) -> Jet:
             return whole.jet(known, x, whole.known(x))
 
-        sines = Sines(
+        sines = SineSum(
             features, torch.as_tensor(center).to(amplitudes), length, parameters.cube_step_lengths * length, base
         )
-        return bent(sines, *equations, wishes, amplitudes, parameters.cube_steps)
+        return minimise_penalised(sines, *equations, terms, amplitudes, parameters.cube_steps)
 
 
-def bend_global(
-    shaping: Shaping,
+def penalise_global(
+    penalties: SurfacePenalties,
     scene: Scene,
     options: FitOptions,
     rng: np.random.Generator,
     *,
     parameters: PenaltyFitParameters = PenaltyFitParameters(),
 ) -> NeuralSDF:
-    """Return the global field with output weights that heed the regularisers.
+    """Return the global field with output weights that also minimise the penalties.
 
     Raises
     ------
     FitError
         When the data's system cannot be factored.
     """
-    sdf, like = shaping.sdf, scene.points
-    everywhere, free = (np.ones(len(one), dtype=bool) for one in (shaping.sheet.points, shaping.free.points))
-    wishes = shaping.wishes(everywhere, max(len(everywhere), 1) ** -0.5, like)
+    sdf, like = penalties.sdf, scene.points
+    everywhere, free = (np.ones(len(one), dtype=bool) for one in (penalties.surface.points, penalties.free.points))
+    terms = penalties.terms(everywhere, max(len(everywhere), 1) ** -0.5, like)
     # The global field is all of f.
-    wishes += shaping.free.wishes(free, np.zeros(len(free)), 1.0, like)
-    x, wanted = _volume(shaping, scene, scene.volume_count, rng)
+    terms += penalties.free.terms(free, np.zeros(len(free)), 1.0, like)
+    x, wanted = _volume(penalties, scene, scene.volume_count, rng)
     for left in reversed(range(parameters.rounds)):
         volume = scene.tensor(x), scene.tensor(wanted)
-        terms = [*data_terms(scene, options, rng, InitialisationParameters.final_points), distance_term(scene, *volume)]
+        data = [*data_terms(scene, options, rng, InitialisationParameters.final_points), distance_term(scene, *volume)]
         sines, amplitudes = as_sines(sdf)
-        problem, factor, right = _linear_part(sdf, terms, amplitudes)
-        sdf = replace(sdf, theta=problem.whole(bent(sines, factor, right, wishes, amplitudes, parameters.global_steps)))
+        problem, factor, right = _linear_part(sdf, data, amplitudes)
+        sdf = replace(
+            sdf,
+            theta=problem.whole(minimise_penalised(sines, factor, right, terms, amplitudes, parameters.global_steps)),
+        )
         if left:
             # Where the sign has become wrong, more samples bring it back, as at the fit's start.
-            trial, expected = _volume(shaping, scene, 3 * scene.volume_count, rng)
+            trial, expected = _volume(penalties, scene, 3 * scene.volume_count, rng)
             wrong = np.flatnonzero(sdf.sdf(sdf.frame.to_world(trial)) * expected <= 0)[: scene.volume_count // 2]
             x, wanted = np.concatenate([x, trial[wrong]]), np.concatenate([wanted, expected[wrong]])
     return sdf
 
 
-def _volume(shaping: Shaping, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
+def _volume(penalties: SurfacePenalties, scene: Scene, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
     """Return points of the volume, of shape (Q, 3), and what their signed distances should be, of shape (Q,)."""
     x, distance = scene.volume(count, rng)
-    return x, shaping.volume_distances(x, distance)
+    return x, penalties.volume_distances(x, distance)
 
 
 def _linear_part(
     sdf: NeuralSDF,
-    terms: Sequence[Term],
+    terms: Sequence[ObjectiveTerm],
     amplitudes: Tensor,
     *,
     ridge: float = InitialisationParameters.ridge,
@@ -243,27 +252,27 @@ def _linear_part(
             # The ridge holds the amplitudes where they are, as damping does.
             return problem, factor, right + ridge * amplitudes
         ridge *= 10
-    raise FitError("The surface could not be shaped: the data's system holds values that are not finite.")
+    raise FitError("The curvature penalties could not be applied: the linear system holds values that are not finite.")
 
 
-def as_sines(sdf: NeuralSDF) -> tuple[Sines, Tensor]:
-    """Return a network of one layer as sine features, of which one more is its bias, and their amplitudes."""
+def as_sines(sdf: NeuralSDF) -> tuple[SineSum, Tensor]:
+    """Return a network of one layer as sine features, with one more for its bias, and their amplitudes."""
     (weights, bias), (out, constant) = sdf.field.layout.layers(sdf.theta)
     frequencies = torch.cat([weights, weights.new_zeros(1, 3)])
     phases = torch.cat([bias, bias.new_full((1,), torch.pi / 2)])
-    sines = Sines(Features(frequencies, phases), weights.new_zeros(3), 1.0, PenaltyFitParameters.global_step_radii)
+    sines = SineSum(Features(frequencies, phases), weights.new_zeros(3), 1.0, PenaltyFitParameters.global_step_radii)
     return sines, torch.cat([out[0], constant])
 
 
 # Points of a fitted field's surface, and how far each is from the scan, as in its holes.
 #
-# Distances count in radii of the disk that the nearest scanned point stands for. On points thrown evenly at random onto
-# a surface, one in fifty of its places is 2 radii from all of them, and five in a million are 3.5 radii away. What lies
-# between counts in part, so that nothing is left without a say at a hole's rim.
+# Distances are in radii of the disk that the nearest scanned point stands for. If points are uniformly distributed on a
+# surface, one in fifty of its places is 2 radii from all of them, and five in a million are 3.5 radii away. Weights
+# between these are interpolated, so that the penalty begins smoothly at a hole's rim.
 
 
 @dataclass(frozen=True)
-class Sheet:
+class SurfaceSamples:
     """Points of a surface, about uniform by area, unit coordinates.
 
     Parameters
@@ -287,10 +296,10 @@ class Sheet:
         rng: np.random.Generator,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
-    ) -> Sheet:
+    ) -> SurfaceSamples:
         """Draw points of a field's zero level about `spacing` apart, in radii; none where there is no surface.
 
-        Sheets on which no point is near the scan are no part of the shape, and are left out.
+        Connected parts without a point near the scan are not part of the shape, and are dropped.
         """
         scanned = float(np.pi * np.square(density.disks).sum())
         count = int(np.clip(scanned / spacing**2, parameters.least_surface_samples, parameters.most_surface_samples))
@@ -298,7 +307,7 @@ class Sheet:
         distance, nearest = density.tree.query(points)
         low, high = parameters.near_disk_radii, parameters.far_disk_radii
         far = np.clip((distance / density.disks[nearest] - low) / (high - low), 0.0, 1.0)
-        kept = _joined(points, far == 0.0, parameters.joined_spacings * np.sqrt(scanned / count))
+        kept = _connected(points, far == 0.0, parameters.joined_spacings * np.sqrt(scanned / count))
         return cls(points[kept], far[kept])
 
     def volume_distances(self, x: Float, signed: Float, value: Float, density: Density) -> Float:
@@ -308,7 +317,7 @@ class Sheet:
         ----------
         x : points of the volume, of shape (Q, 3)
         signed : what their coarse distances are, of shape (Q,)
-        value : of the field there, whose sign tells the far part's sides, of shape (Q,)
+        value : of the field there, whose sign gives the side of the far part, of shape (Q,)
         density : of the scanned points
         """
         film = self.points[self.far == 1.0]
@@ -319,8 +328,8 @@ class Sheet:
         return signed_distance
 
 
-def _joined(points: Float, near: Mask, reach: float) -> Mask:
-    """Return which points, of shape (N, 3), lead to a near one in leaps of at most `reach`."""
+def _connected(points: Float, near: Mask, reach: float) -> Mask:
+    """Return which points, of shape (N, 3), are connected to a near one by steps of at most `reach`."""
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
     labels = connected_components(graph, directed=False)[1]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.marginal_likelihood import clean_noise, heights
-from gnrecon.fit.model_selection import Choice, Leftover, Trials
+from gnrecon.fit.marginal_likelihood import clean_noise, median_pair_height
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import CleanScanParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -38,10 +38,10 @@ def bumpy(count: int, noise: float = 0.0, tilt: float = 0.0, seed: int = 0) -> S
     return Samples(x + noise * normals * rng.standard_normal((count, 1)), normals, FRAME)
 
 
-def leftover(samples: Samples, over: float = 0.1) -> Leftover:
+def residuals(samples: Samples, over: float = 0.1) -> FieldResiduals:
     """Return what a field leaves over that is off by a part of the radius of a disk."""
     off = np.full(len(samples.points), over * Density(samples.points).radius)
-    return Leftover(samples.points, samples.normals, off, samples.normals)
+    return FieldResiduals(samples.points, samples.normals, off, samples.normals)
 
 
 def told(samples: Samples) -> tuple[Float, Float, Density]:
@@ -59,11 +59,11 @@ def off_truth(samples: Samples) -> float:
 
 def test_neighbours_tell_the_noise_of_positions() -> None:
     radius = Density(bumpy(1500).points).radius
-    assert heights(*told(bumpy(1500))) < 0.01
+    assert median_pair_height(*told(bumpy(1500))) < 0.01
     for share in (0.1, 0.2):
         # Half of the sum of two heights, each of both points' noise: its median is 0.95 of that noise, and less of
         # pairs that are more than a radius apart.
-        assert heights(*told(bumpy(1500, share * radius))) == pytest.approx(0.75 * share, rel=0.2)
+        assert median_pair_height(*told(bumpy(1500, share * radius))) == pytest.approx(0.75 * share, rel=0.2)
 
 
 def test_a_clean_scan_has_the_noise_that_its_neighbours_tell() -> None:
@@ -94,12 +94,12 @@ def test_of_other_scans_the_noise_is_chosen(scan: Samples, over: float) -> None:
 def test_points_that_were_scanned_twice_are_no_pairs() -> None:
     scan = bumpy(600)
     twice = replace(scan, points=np.repeat(scan.points, 2, axis=0), normals=np.repeat(scan.normals, 2, axis=0))
-    assert heights(*told(twice)) == pytest.approx(heights(*told(scan)), rel=0.6)
+    assert median_pair_height(*told(twice)) == pytest.approx(median_pair_height(*told(scan)), rel=0.6)
 
 
 def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    scan = leftover(bumpy(200))
-    trials = Trials.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
+    scan = residuals(bumpy(200))
+    validation = CrossValidation.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
     even = np.linspace(-1.0, 1.0, 10)[:, None]
     lengths = ModelSelectionParameters.lengths_disk_radii
     scores = {
@@ -108,17 +108,17 @@ def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: p
         lengths[2]: 1.99 - even,
         lengths[3]: 0.0 * even,
     }
-    monkeypatch.setattr(Trials, "scores", lambda _, length: scores[length])
-    belief = trials.clean()
-    assert belief is not None
-    assert belief.length == lengths[1]
+    monkeypatch.setattr(CrossValidation, "scores", lambda _, length: scores[length])
+    hyperparameters = validation.clean()
+    assert hyperparameters is not None
+    assert hyperparameters.length == lengths[1]
 
 
 def test_clean_scans_are_fitted_nearer_than_by_choice(monkeypatch: pytest.MonkeyPatch) -> None:
     scan = bumpy(800)
     by_neighbours = off_truth(scan)
-    monkeypatch.setattr(Trials, "clean", lambda _: None)
+    monkeypatch.setattr(CrossValidation, "clean", lambda _: None)
     by_evidence = off_truth(scan)
-    monkeypatch.setattr(Choice, "best", property(lambda choice: choice.belief))
+    monkeypatch.setattr(SelectedModel, "best", property(lambda choice: choice.hyperparameters))
     by_choice = off_truth(scan)
     assert by_neighbours < min(0.7 * by_choice, 0.9 * by_evidence, 0.05), (by_neighbours, by_choice, by_evidence)

@@ -1,0 +1,28 @@
+"""Checks of the dataclasses of parameters: that they are frozen, and that their fields are used."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import FrozenInstanceError, fields
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+
+def assert_frozen(parameters: Any) -> None:
+    """Check that no field can be set."""
+    for field in fields(parameters):
+        with pytest.raises(FrozenInstanceError):
+            setattr(parameters, field.name, None)
+
+
+@cache
+def read_attributes(package: ModuleType, leave_out: str = "") -> frozenset[str]:
+    """Return the names of all attributes in the sources of a package, without those of one file."""
+    assert package.__file__ is not None
+    sources = [path for path in Path(package.__file__).parent.rglob("*.py") if path.name != leave_out]
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sources]
+    return frozenset(node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute))
