@@ -27,12 +27,7 @@ class Options(OptionTable):
     """Options of `gnrecon.reconstruct` and of the command line, checked.
 
     docs/options.md explains them with examples. Lengths are in file units; as text they may have another unit, as in
-    ``"2mm"``, or be in spacings of the points, as in ``"2s"``.
-
-    Raises
-    ------
-    UsageError
-        When a name is unknown or a value out of its range.
+    ``"2mm"``, or be in spacings of the points, as in ``"2s"``. A value out of its range raises `UsageError`.
     """
 
     def __post_init__(self) -> None:

@@ -10,9 +10,7 @@ from typing import Any
 from gnrecon.fit import bounds_of
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare, survey
-from gnrecon.io import (
-    Reading,
-)
+from gnrecon.io import Reading
 from gnrecon.options import Options
 from gnrecon.pipeline import read_source
 from gnrecon.report.estimate import estimate

@@ -121,7 +121,7 @@ def test_a_sharp_shape_passes_its_parameters_on() -> None:
     assert len(plain.samples) < len(default.samples)
     long = SharpShape.of(samples, ShapePriorParameters(sharp=SharpShapeParameters(exact_length_radii=5.2)))
     assert long is not None
-    assert long.belief.length == pytest.approx(2 * default.belief.length)
+    assert long.hyperparameters.length == pytest.approx(2 * default.hyperparameters.length)
 
 
 def test_the_search_for_faces_allows_fewer_points_beside_these() -> None:
