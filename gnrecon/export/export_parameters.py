@@ -71,7 +71,7 @@ class HandleParameters:
     axis_cosine: float = 0.7
     # Least cosine between the normals of a vertex and of a point that supports it: 60 degrees.
     normal_cosine: float = 0.5
-    # Points that a vertex is compared with, and that a point's plane is fitted to beside the point itself.
+    # Points that a vertex is compared with, and that a point's plane is fitted to in addition to the point itself.
     ring_points: int = 8
     # Loop lengths from a cap within which unsupported surface, and any surface, is faired.
     stub_lengths: float = 3.0

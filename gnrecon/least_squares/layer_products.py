@@ -1,6 +1,6 @@
 """One layer's columns of Jacobian rows as sums of outer products, and products with them that never form the rows.
 
-Row n is  l_n (i_n, 1)^T + r_n (t_n, 0)^T,  an (out, in + 1) matrix laid out as the weights row by row and then the
+Row n is  l_n (i_n, 1)^T + r_n (t_n, 0)^T,  an (out, in + 1) matrix arranged as the weights row by row and then the
 biases; rows of second derivatives have further pairs r, t. With V and b the same layout of a vector v:
 
     J v    row n:   l_n . (V i_n + b) + r_n . (V t_n)                   two GEMMs

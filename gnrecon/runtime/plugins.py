@@ -2,7 +2,7 @@
 
 A package names an object in its metadata, in the group ``gnrecon.readers``, ``gnrecon.writers`` or
 ``gnrecon.residuals``. Listing plugins reads metadata only; a package's code is imported when one of its plugins is
-loaded. Every look-up reads the installed packages anew: nothing is registered or cached.
+loaded. Every look-up reads the installed packages each time: nothing is registered or cached.
 """
 
 from __future__ import annotations
