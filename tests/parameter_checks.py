@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import FrozenInstanceError, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +17,17 @@ def assert_frozen(parameters: Any) -> None:
     for field in fields(parameters):
         with pytest.raises(FrozenInstanceError):
             setattr(parameters, field.name, None)
+
+
+def field_names(parameters: Any) -> list[str]:
+    """Return the names of all fields of a class, those of nested parameters included."""
+    found = []
+    for field in fields(parameters):
+        found.append(field.name)
+        value = getattr(parameters(), field.name)
+        if is_dataclass(value):
+            found += field_names(type(value))
+    return found
 
 
 @cache

@@ -97,7 +97,11 @@ def test_the_mesh_scales_and_moves_with_the_scan(
 ) -> None:
     moved = reconstruct(scan[0] * scale + offset, scan[1], **FAST)
     assert np.array_equal(moved.mesh.faces, result.mesh.faces)
-    assert np.abs((moved.mesh.vertices - offset) / scale - result.mesh.vertices).max() < 1e-6 * RADIUS
+    apart = np.abs((moved.mesh.vertices - offset) / scale - result.mesh.vertices).max(axis=1)
+    # The fields agree to rounding, below. Where a vertex lies along the surface is found in float32, so that a few that
+    # are nearly undetermined differ more, and by how much depends on the processor.
+    assert np.quantile(apart, 0.999) < 1e-6 * RADIUS
+    assert apart.max() < 1e-5 * RADIUS
     near = scan[0] + 0.1 * scan[1]
     assert np.abs(moved.sdf.sdf(near * scale + offset) / scale - result.sdf.sdf(near)).max() < 1e-6 * RADIUS
 

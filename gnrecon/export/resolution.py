@@ -43,8 +43,8 @@ class Fineness:
     def describe(self) -> str:
         """One sentence for the user."""
         return (
-            f"{self.resolution} cells along the box: the mean edge is {self.edge_length:.3g} units, and 99.9 % of the "
-            f"mesh lies within {self.chord_error:.3g} of the fitted surface."
+            f"{self.resolution} cells along the box: the mean edge is {self.edge_length:.3g} units, and 99.9 % of "
+            f"face centres and edge midpoints lie within {self.chord_error:.3g} of the fitted surface."
         )
 
     def as_dict(self) -> dict[str, int | float]:

@@ -17,7 +17,7 @@ from benchmarks.accuracy.problem import save_mesh, save_scan
 from benchmarks.accuracy.scans import PAPER_SCANS, ROCKER_ARM, draw_vertices, load_shape
 from benchmarks.accuracy.trial import Job, run_trial
 from PIL import Image
-from rich.console import Console
+from printed_tables import printed
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
@@ -59,10 +59,7 @@ def record(method: str, depth: int, seed: int, chamfer: float, **more: Any) -> d
 
 
 def text_of(summaries: list[dict[str, Any]], seeds: int) -> str:
-    console = Console(width=100, highlight=False)
-    with console.capture() as capture:
-        console.print(comparison_table(summaries, seeds))
-    return capture.get()
+    return printed(comparison_table(summaries, seeds), width=100)
 
 
 def test_without_a_name_the_benchmarks_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ from benchmarks.engine.step_time import Frozen, dense_steps, freeze, measure_sol
 from benchmarks.engine.time_to_loss import Goal, History, compare, measure_quality, run_baseline, run_ours
 from benchmarks.harness.measurement import Clock, run_isolated
 from PIL import Image
-from rich.console import Console
+from printed_tables import printed
 from torch import Tensor
 
 from gnrecon.field import Siren
@@ -57,10 +57,7 @@ def random_theta(seed: int) -> Tensor:
 
 
 def text_of(report: dict[str, Any]) -> str:
-    console = Console(width=200, highlight=False)
-    with console.capture() as capture:
-        console.print(*tables(report))
-    return capture.get()
+    return printed(*tables(report))
 
 
 @pytest.mark.parametrize("chunk", [None, 7])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from analytic_fields import Field, sphere, torus
-from parameter_checks import assert_frozen, read_attributes
+from parameter_checks import assert_frozen, field_names, read_attributes
 
 import gnrecon.export
 from gnrecon.export import Neighbourhood, extract, remesh, remove_handles, trim
@@ -23,23 +23,12 @@ from gnrecon.export.mesh_field import MeshOptions, mesh_field
 from gnrecon.export.sparse_grid import narrow_band
 
 
-def names(parameters: type) -> list[str]:
-    """All fields, those of nested parameters included."""
-    found = []
-    for field in fields(parameters):
-        found.append(field.name)
-        value = getattr(parameters(), field.name)
-        if is_dataclass(value):
-            found += names(type(value))
-    return found
-
-
 def test_they_are_frozen() -> None:
     for parameters in (ExportParameters(), *(getattr(ExportParameters(), f.name) for f in fields(ExportParameters))):
         assert_frozen(parameters)
 
 
-@pytest.mark.parametrize("name", names(ExportParameters))
+@pytest.mark.parametrize("name", field_names(ExportParameters))
 def test_each_is_used(name: str) -> None:
     assert name in read_attributes(gnrecon.export, "export_parameters.py")
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from parameter_checks import assert_frozen, read_attributes
+from parameter_checks import assert_frozen, field_names, read_attributes
 
 import gnrecon.rendering
 from gnrecon.geometry.mesh import Mesh
@@ -15,23 +15,12 @@ from gnrecon.rendering.rays import Camera, shade, sphere_directions
 from gnrecon.rendering.rendering_parameters import LightParameters, RenderingParameters, SheetParameters
 
 
-def names(parameters: type) -> list[str]:
-    """All fields, those of nested parameters included."""
-    found = []
-    for field in fields(parameters):
-        found.append(field.name)
-        value = getattr(parameters(), field.name)
-        if is_dataclass(value):
-            found += names(type(value))
-    return found
-
-
 @pytest.mark.parametrize("parameters", [RenderingParameters(), LightParameters(), SheetParameters()])
 def test_they_are_frozen(parameters: object) -> None:
     assert_frozen(parameters)
 
 
-@pytest.mark.parametrize("name", names(RenderingParameters))
+@pytest.mark.parametrize("name", field_names(RenderingParameters))
 def test_each_is_used(name: str) -> None:
     assert name in read_attributes(gnrecon.rendering, "rendering_parameters.py")
 

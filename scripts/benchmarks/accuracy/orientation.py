@@ -28,16 +28,9 @@ from gnrecon.runtime.errors import ExitCode
 
 
 def main(arguments: Sequence[str], protocol: Protocol | None = None) -> int:
-    """Run the benchmark with arguments; return the exit code, that of a batch where gnrecon made no mesh.
+    """Run the benchmark with arguments; return the exit code, that of a batch with failures if gnrecon made no mesh.
 
-    Raises
-    ------
-    InputError
-        When a case's file is missing or cannot be read.
-    OutputError
-        When a result cannot be written.
-    UsageError
-        When a case or the quality is unknown.
+    It raises the errors of `many_scans.main`.
     """
     chosen = _parser().parse_args(arguments)
     protocol = (protocol or Protocol(limit=3600.0)).at_quality(chosen.quality)
