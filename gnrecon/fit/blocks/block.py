@@ -46,7 +46,7 @@ class BlockSolver:
 
     Parameters
     ----------
-    leftover : residuals of the global field at all points, ordered by the Morton codes of their cells
+    residuals : of the global field at all points, ordered by the Morton codes of their cells
     disks : array of shape (N,), radius of the disk that each point represents
     radius : their median
     cells, first : arrays of shapes (C,) and (C + 1,), codes of the occupied cells, and first point of each
@@ -54,7 +54,7 @@ class BlockSolver:
     ends : array of shape (K + 1,), first cube of each block
     dipoles : of all points
     network, theta, box : the global field in unit coordinates
-    partition, features, belief, seed, device : as in `gnrecon.fit.local_fields`
+    partition, features, hyperparameters, seed, device : as in `gnrecon.fit.local_fields`
     """
 
     residuals: FieldResiduals
