@@ -49,7 +49,7 @@ def fit(
     advance : called with the share that is done
     folder : work folder of the default fit, which is then solved by blocks and resumes from what the folder holds
     scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks
-    parameters : tuning constants
+    parameters : tuning constants of the default fit
 
     Raises
     ------
@@ -65,7 +65,7 @@ def fit(
     elif folder is not None:
         raise UsageError("A work folder is for the default fit only; leave out --widths and --steps.")
     else:
-        sdf, fitted = _fit_network(samples, options, rng, callback, advance, parameters.single_network)
+        sdf, fitted = _fit_network(samples, options, rng, callback, advance)
     if not sdf.finite:
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
     return replace(sdf, support=_support(samples)), fitted
@@ -77,7 +77,8 @@ def _fit_network(
     rng: np.random.Generator,
     callback: Callback | None,
     advance: ProgressCallback,
-    parameters: SingleNetworkParameters,
+    *,
+    parameters: SingleNetworkParameters = SingleNetworkParameters(),
 ) -> tuple[NeuralSDF, Solution]:
     """Fit the network that the options describe."""
     scene = Scene.of(samples, options.device, rng)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gnrecon.fit.parameters import SingleNetworkParameters
-from gnrecon.fit.regularisers import Regulariser, regularisers
+from gnrecon.fit.penalties.regularisers import Regulariser, regularisers
 from gnrecon.least_squares import SOLVERS
 from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, normal_projection, normal_vector
 from gnrecon.residuals.named_residuals import named
@@ -57,7 +57,7 @@ class FitOptions:
         A torch device, ``"cpu"`` or ``"cuda"``.
     smooth, fill, prior : str, optional
         Curvature penalties of the default fit, such as ``"strain=1e-4"``, ``"minimal"`` and ``"developable"``; see
-        `gnrecon.fit.regularisers`.
+        `gnrecon.fit.penalties.regularisers`.
 
     Raises
     ------

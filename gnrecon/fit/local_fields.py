@@ -23,7 +23,7 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
 from gnrecon.fit.model_selection import FieldResiduals, Volume
 from gnrecon.fit.parameters import LocalFieldParameters
-from gnrecon.fit.surface_penalties import SurfacePenalties
+from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.runtime.parallel import map_in_threads

@@ -1,4 +1,4 @@
-"""Tuning constants of the fit, one frozen dataclass for each method, gathered in `FitParameters`.
+"""Tuning constants of the fit, one frozen dataclass for each method; `FitParameters` holds those of the default fit.
 
 A radius is that of the scan, which lies in the unit ball. A spacing is the median distance between neighbouring points,
 and a disk radius that of the disk that one point stands for. Values without a source were chosen on the benchmark
@@ -8,6 +8,8 @@ shapes of docs/benchmarks.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+from gnrecon.fit.shape_priors.prior_parameters import BallFitParameters, ShapePriorParameters
 
 
 @dataclass(frozen=True)
@@ -270,20 +272,15 @@ class UncertaintyParameters:
 
 @dataclass(frozen=True)
 class FitParameters:
-    """All tuning constants of the fit."""
+    """The tuning constants that `gnrecon.fit.fit` passes on to the default fit.
+
+    The other groups of this module are the defaults of the functions that their docstrings name. The local fields of a
+    fit by blocks take their defaults.
+    """
 
     two_level: TwoLevelParameters = TwoLevelParameters()
+    ball: BallFitParameters = BallFitParameters()
+    shape_priors: ShapePriorParameters = ShapePriorParameters()
     global_field: GlobalFieldParameters = GlobalFieldParameters()
     outliers: OutlierParameters = OutlierParameters()
-    denoising: DenoisingParameters = DenoisingParameters()
-    clean_scan: CleanScanParameters = CleanScanParameters()
-    marginal_likelihood: MarginalLikelihoodParameters = MarginalLikelihoodParameters()
-    model_selection: ModelSelectionParameters = ModelSelectionParameters()
-    local_solve: LocalSolveParameters = LocalSolveParameters()
     local_fields: LocalFieldParameters = LocalFieldParameters()
-    initialisation: InitialisationParameters = InitialisationParameters()
-    objective: ObjectiveParameters = ObjectiveParameters()
-    single_network: SingleNetworkParameters = SingleNetworkParameters()
-    penalties: PenaltyFitParameters = PenaltyFitParameters()
-    laplace: LaplaceParameters = LaplaceParameters()
-    uncertainty: UncertaintyParameters = UncertaintyParameters()

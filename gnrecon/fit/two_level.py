@@ -5,7 +5,7 @@ exact because the field is linear in the weights (variable projection). The step
 
 1. Prepare the data: snap a ball, turn contradicted normals around, extend faces to sharp edges and across holes.
 2. Fit the global field (`global_field`), without validation points; leave out outliers and fit it again.
-3. Apply the curvature penalties, if any, to the global field (`regularised`).
+3. Apply the curvature penalties, if any, to the global field (`penalties`).
 4. Choose length scale and noise on the validation points (`denoising`, `model_selection`), then fit the local fields
    (`local_fields`), or those of a large scan by blocks (`blocks.solve`).
 """
@@ -24,14 +24,15 @@ from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
 from gnrecon.fit.denoising import LocalData, choose_local_data
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.fit_summary import FitSummary, describe
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
 from gnrecon.fit.parameters import FitParameters
+from gnrecon.fit.penalties.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.fit.shape_priors.ball_fit import BallFit
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
+from gnrecon.fit.shape_priors.prior_parameters import HoleCompletionParameters
 from gnrecon.fit.shape_priors.sharp_shape import SharpShape
-from gnrecon.fit.summary import FitSummary, describe
-from gnrecon.fit.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
@@ -122,11 +123,12 @@ class _Data:
     sharp: SharpShape | None
     across: HoleCompletion
 
-    def across_holes(self, rng: np.random.Generator) -> _Data:
+    def across_holes(self, rng: np.random.Generator, parameters: HoleCompletionParameters) -> _Data:
         """Return the data with samples across the holes; a shape with sharp edges has them already."""
         if self.sharp is not None:
             return self
-        across = complete_holes(self.samples.points, self.samples.normals, not self.samples.estimated)
+        exact = not self.samples.estimated
+        across = complete_holes(self.samples.points, self.samples.normals, exact, parameters)
         if not len(across):
             return self
         points, normals = across.appended_to(self.samples.points, self.samples.normals)
@@ -162,16 +164,17 @@ class _Steps:
 
     def detect_ball(self, samples: Samples) -> BallFit | None:
         """Return the samples snapped to a ball, or None of any other shape."""
-        return BallFit.of(samples) if self._finds_edges else None
+        return BallFit.of(samples, self.parameters.ball) if self._finds_edges else None
 
     def prepare(self, scan: Samples) -> tuple[_Data, float]:
         """Return the data with faces extended to sharp edges, and the share of normals that were turned around."""
-        sharp = SharpShape.of(scan) if self._finds_edges and not scan.estimated else None
+        priors = self.parameters.shape_priors
+        sharp = SharpShape.of(scan, priors) if self._finds_edges and not scan.estimated else None
         data = self._draw(scan, sharp)
         if not scan.estimated:
             return data, 0.0
         scan, flipped_share = flip_contradicted_normals(scan, data.seen, self.options)
-        sharp = SharpShape.of(scan) if self._finds_edges else None
+        sharp = SharpShape.of(scan, priors) if self._finds_edges else None
         data = replace(data, scan=scan, samples=scan) if sharp is None else self._draw(scan, sharp)
         return data, flipped_share
 
@@ -191,7 +194,7 @@ class _Steps:
             data = data.without(outliers)
         else:
             scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
-            data = self._draw(scan, SharpShape.of(scan))
+            data = self._draw(scan, SharpShape.of(scan, self.parameters.shape_priors))
         return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
 
     def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, PenaltiesFor | None]:
@@ -225,14 +228,17 @@ class _Steps:
             local = choose_local_data(
                 sdf, data.samples, data.held_out, options.features, rng, options.device, outliers=outliers
             )
-        advance(self.parameters.local_fields.selection_time_share)
-        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties)
+        limits = self.parameters.local_fields
+        advance(limits.selection_time_share)
+        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=limits)
         return detail, None if local.averaging is None else local.averaging.width_radii
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
         """Return the data with samples across holes, and the global field that is fitted to them."""
         # A fit with curvature penalties closes holes by them.
-        completed = data if self.options.regularisers else data.across_holes(self.rng)
+        completed = (
+            data if self.options.regularisers else data.across_holes(self.rng, self.parameters.shape_priors.holes)
+        )
         seen = completed.samples, completed.held_out, completed.seen
         return completed, fit_global(*seen, self.options, self.rng, advance, parameters=self.parameters.global_field)
 

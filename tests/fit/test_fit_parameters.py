@@ -7,19 +7,32 @@ import inspect
 
 import numpy as np
 import pytest
+import torch
 from parameter_checks import assert_frozen, read_attributes
 
 import gnrecon.fit
-from gnrecon.fit import FitOptions, parameters
+from gnrecon.fit import FitOptions, fit, parameters, two_level
 from gnrecon.fit.consistency import find_outliers
 from gnrecon.fit.local_fields import cube_length
 from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.objective import normal_weight
-from gnrecon.fit.parameters import FitParameters, LocalFieldParameters, OutlierParameters, SingleNetworkParameters
+from gnrecon.fit.parameters import (
+    FitParameters,
+    LocalFieldParameters,
+    OutlierParameters,
+    SingleNetworkParameters,
+    TwoLevelParameters,
+)
+from gnrecon.fit.shape_priors.prior_parameters import BallFitParameters
 from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
 
-CLASSES = [found for _, found in inspect.getmembers(parameters, dataclasses.is_dataclass)]
+CLASSES = [
+    found
+    for _, found in inspect.getmembers(parameters, dataclasses.is_dataclass)
+    if found.__module__ == parameters.__name__
+]
 
 
 @pytest.mark.parametrize("group", CLASSES, ids=lambda group: group.__name__)
@@ -34,9 +47,24 @@ def test_every_constant_is_used() -> None:
     assert [both for both in unused if both[1] not in used] == []
 
 
-def test_the_whole_holds_every_group() -> None:
-    held = {type(getattr(FitParameters(), field.name)) for field in dataclasses.fields(FitParameters)}
-    assert held == {group for group in CLASSES if group is not FitParameters}
+def test_the_default_fit_takes_every_group_of_the_whole() -> None:
+    source = inspect.getsource(two_level)
+    assert [f.name for f in dataclasses.fields(FitParameters) if f"parameters.{f.name}" not in source] == []
+
+
+def test_the_parameters_of_a_fit_take_effect() -> None:
+    z = 1 - (2 * np.arange(300) + 1) / 300
+    angle, ring = np.pi * (1 + 5**0.5) * np.arange(300), np.sqrt(1 - z**2)
+    points = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    samples = Samples(points, points, Frame(np.zeros(3), 1.0))
+    options = FitOptions(quality="draft")
+    default, same = (fit(samples, options, parameters=one)[0].theta for one in (FitParameters(), FitParameters()))
+    assert torch.equal(default, same)
+    no_ball = FitParameters(ball=BallFitParameters(min_points=1000))
+    few = FitParameters(two_level=TwoLevelParameters(global_field_points=100))
+    assert "ball" in fit(samples, options)[1].status
+    assert "ball" not in fit(samples, options, parameters=no_ball)[1].status
+    assert not torch.equal(fit(samples, options, parameters=few)[0].theta, default)
 
 
 def test_a_cube_of_sparse_points_is_as_long_as_the_limit_says() -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.parameters import PenaltyFitParameters
-from gnrecon.fit.regularisers import PenaltyProblem, PenaltyTerm, SineSum, minimise_penalised, regularisers
+from gnrecon.fit.penalties.regularisers import PenaltyProblem, PenaltyTerm, SineSum, minimise_penalised, regularisers
 from gnrecon.residuals import SecondOrder, free_space, gauss_curvature, interface, mean_curvature, surface_strain
 from gnrecon.runtime.errors import UsageError
 

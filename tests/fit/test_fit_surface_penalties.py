@@ -12,9 +12,9 @@ from gnrecon.export import curvatures
 from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import two_level as adaptive
 from gnrecon.fit.parameters import PenaltyFitParameters
+from gnrecon.fit.penalties.surface_penalties import FreeSpace, PenaltySamples, _connected
 from gnrecon.fit.shape_priors import sharp_shape as sharp
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion
-from gnrecon.fit.surface_penalties import FreeSpace, SurfaceSamples, _connected
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.ingest import prepare
@@ -28,7 +28,7 @@ def fitted(cloud: PointCloud, seed: int = 0, **penalties: str) -> NeuralSDF:
 
 def surface(sdf: NeuralSDF, cloud: PointCloud) -> Float:
     """Points of the surface, in file units."""
-    sheet = SurfaceSamples.of(sdf, Density(sdf.frame.to_unit(cloud.points)), 0.05, np.random.default_rng(3))
+    sheet = PenaltySamples.of(sdf, Density(sdf.frame.to_unit(cloud.points)), 0.05, np.random.default_rng(3))
     return sdf.frame.to_world(sheet.points)
 
 
@@ -135,9 +135,9 @@ def test_a_sheet_knows_what_is_far() -> None:
     samples = Samples(ball(600).points, ball(600).points, Frame(np.zeros(3), 1.0))
     top = samples.points[:, 2] < 0.6
     density = Density(samples.points[top])
-    sheet = SurfaceSamples(samples.points, (samples.points[:, 2] > 0.95).astype(float))
+    sheet = PenaltySamples(samples.points, (samples.points[:, 2] > 0.95).astype(float))
     x = np.array([[0, 0, 1.2], [0, 0, 0.7], [0, 0, -1.3]])
     told = sheet.volume_distances(x, np.full(3, 9.0), np.array([0.1, -0.1, 0.1]), density)
     assert told == pytest.approx([0.2, -0.3, 9.0], abs=0.02)
-    covered = SurfaceSamples(samples.points, np.zeros(600))
+    covered = PenaltySamples(samples.points, np.zeros(600))
     assert covered.volume_distances(x, np.full(3, 9.0), x[:, 2], density) == pytest.approx(9.0)

@@ -15,9 +15,9 @@ from torch.func import grad, jacrev, vmap
 from gnrecon.field import Siren
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
 from gnrecon.fit.initialisation import random_features
-from gnrecon.fit.laplace_approximation import DataRows, Laplace, free_units, laplace
 from gnrecon.fit.parameters import LaplaceParameters, UncertaintyParameters
-from gnrecon.fit.uncertainty import calibration, left_out_scores
+from gnrecon.fit.posterior.laplace_approximation import DataRows, Laplace, free_units, laplace
+from gnrecon.fit.posterior.uncertainty import calibration, left_out_scores
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.residuals import normal_projection, normal_vector

@@ -28,9 +28,9 @@ from torch import Tensor
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_field import fit
 from gnrecon.fit.fit_options import FitOptions, normal_residual
-from gnrecon.fit.laplace_approximation import DataRows, Laplace, laplace
 from gnrecon.fit.objective import normal_weight
 from gnrecon.fit.parameters import UncertaintyParameters
+from gnrecon.fit.posterior.laplace_approximation import DataRows, Laplace, laplace
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from gnrecon.fit.regularisers import Regulariser
+from gnrecon.fit.penalties.regularisers import Regulariser
 
 
 @dataclass(frozen=True)

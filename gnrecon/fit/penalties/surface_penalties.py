@@ -28,7 +28,7 @@ from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
-from gnrecon.fit.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised
+from gnrecon.fit.penalties.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.signed_distance import Density, free_space_bounds
 from gnrecon.least_squares.direct import damped_factor
@@ -100,7 +100,7 @@ class SurfacePenalties:
     """
 
     regularisers: Sequence[Regulariser]
-    surface: SurfaceSamples
+    surface: PenaltySamples
     sdf: NeuralSDF
     density: Density
     free: FreeSpace
@@ -118,7 +118,7 @@ class SurfacePenalties:
         """Draw points of the surface for features of a length, in radii."""
         return cls(
             regularisers,
-            SurfaceSamples.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng),
+            PenaltySamples.of(sdf, density, length / PenaltyFitParameters.samples_per_length, rng),
             sdf,
             density,
             free,
@@ -272,7 +272,7 @@ def as_sines(sdf: NeuralSDF) -> tuple[SineSum, Tensor]:
 
 
 @dataclass(frozen=True)
-class SurfaceSamples:
+class PenaltySamples:
     """Points of a surface, about uniform by area, unit coordinates.
 
     Parameters
@@ -296,7 +296,7 @@ class SurfaceSamples:
         rng: np.random.Generator,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
-    ) -> SurfaceSamples:
+    ) -> PenaltySamples:
         """Draw points of a field's zero level about `spacing` apart, in radii; none where there is no surface.
 
         Connected parts without a point near the scan are not part of the shape, and are dropped.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gnrecon.fit.regularisers import regularisers
-from gnrecon.fit.summary import FitSummary, describe
+from gnrecon.fit.fit_summary import FitSummary, describe
+from gnrecon.fit.penalties.regularisers import regularisers
 
 
 def test_a_plain_fit_says_what_was_solved_and_chosen() -> None:

@@ -1,0 +1,1 @@
+"""The posterior of a fit: standard deviations of the surface by the Laplace approximation."""
