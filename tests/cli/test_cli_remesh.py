@@ -79,7 +79,7 @@ def test_edges_and_errors_may_be_asked_for_with_units(model: Path, tmp_path: Pat
     assert np.linalg.norm(sides, axis=2).mean() == pytest.approx(0.1, rel=0.1)
     fine = command(*words, tmp_path / "fine.ply", "--edge-length", "1mm", "--max-error", "0.02mm")
     assert fine.returncode == 0, fine.stderr
-    assert "99.9 % of the mesh lies within 0.0" in fine.stderr
+    assert "99.9 % of face centres and edge midpoints lie within 0.0" in fine.stderr
     assert len(read_mesh(tmp_path / "fine.ply").faces) > 2 * len(mesh.faces)
     both = command(*words, tmp_path / "none.ply", "--edge-length", "1mm", "--resolution", 64)
     assert both.returncode == ExitCode.USAGE

@@ -225,8 +225,8 @@ def test_what_one_network_must_do_is_left_to_one() -> None:
 
 
 def test_an_interrupt_leaves_the_global_field(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*args: object) -> None:
-        del args
+    def interrupted(*args: object, **options: object) -> None:
+        del args, options
         raise KeyboardInterrupt
 
     monkeypatch.setattr(adaptive, "fit_detail", interrupted)
