@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from pathlib import Path
+from types import FrameType, ModuleType
 from typing import Any
 
 MOVED = {
@@ -45,17 +46,28 @@ class MovedModules(MetaPathFinder, Loader):
     def exec_module(self, module: ModuleType) -> None:
         """Fill an old module: each of its names is looked up in the new one."""
         new = import_module(MOVED[module.__name__])
-        # The import system's own frames are not counted, so that the warning shows the line that imports.
         warnings.warn(
             f"{module.__name__} is {new.__name__} since gnrecon 0.2, and the old path ends with 0.3.",
             DeprecationWarning,
-            stacklevel=2,
+            stacklevel=_frames_to_caller(),
         )
 
         def look_up(name: str) -> Any:
             return getattr(new, name)
 
         module.__dict__.update(__doc__=new.__doc__, __getattr__=look_up, __all__=list(public_names(new)))
+
+
+def _frames_to_caller() -> int:
+    """Return how far up the caller's frame is whose line imports an old path: beyond importlib's and gnrecon's own."""
+    own = (str(Path(__file__).parent / "__init__.py"), __file__)
+    frame: FrameType | None = sys._getframe(1)
+    level = 1
+    while frame is not None and (frame.f_code.co_filename in own or "importlib" in frame.f_code.co_filename):
+        # `warnings.warn` itself does not count the frames of importlib's frozen core.
+        level += "importlib._bootstrap" not in frame.f_code.co_filename
+        frame = frame.f_back
+    return level
 
 
 def public_names(module: ModuleType) -> Sequence[str]:

@@ -26,11 +26,12 @@ def test_an_old_path_gives_the_objects_of_the_new_one(old: str) -> None:
     sys.modules.pop(old)
 
 
-def test_the_warning_shows_the_line_that_imports(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "line", ["from gnrecon.errors import UsageError", "from gnrecon import errors", "gnrecon.errors"]
+)
+def test_the_warning_shows_the_line_that_imports(tmp_path: Path, line: str) -> None:
     script = tmp_path / "script.py"
-    script.write_text(
-        "import gnrecon\n\nfrom gnrecon.errors import UsageError\n\nassert UsageError is gnrecon.UsageError\n"
-    )
+    script.write_text(f"import gnrecon\n\n{line}\n")
     done = subprocess.run([sys.executable, "-W", "default", script], capture_output=True, text=True, check=True)
     assert f"{script}:3: DeprecationWarning: gnrecon.errors is" in done.stderr
 
