@@ -29,6 +29,7 @@ def measure(
     seed: int = 0,
     scale: float | None = None,
     advance: ProgressCallback = ignore_progress,
+    lid: Mesh | None = None,
 ) -> Metrics:
     """Measure a mesh against a reference surface or cloud.
 
@@ -46,13 +47,18 @@ def measure(
         distance of its vertices from their mean.
     advance : callable
         Receives the share that is done.
+    lid : Mesh, optional
+        Faces that close an open reference mesh, in its frame and units. A closed mesh has to cross the opening
+        somewhere: its samples are measured to the nearer of reference and lid. No samples are drawn on the lid, so
+        that a mesh may be open there.
 
     Raises
     ------
     InputError
         When either has nothing to measure or coordinates that are not finite.
     UsageError
-        When `samples` or `scale` is not positive, or the reference's points all coincide.
+        When `samples` or `scale` is not positive, the reference's points all coincide, or the reference of a lid has
+        no faces.
     """
     if samples < 1:
         raise UsageError(f"The number of samples is {samples}, but must be at least 1.")
@@ -61,7 +67,10 @@ def measure(
     anchor = reference.vertices if isinstance(reference, Mesh) else reference.points
     if not len(anchor) or (isinstance(reference, Mesh) and not len(reference.faces)):
         raise InputError("The reference has neither faces nor points, so there is nothing to measure against.")
-    for name, positions in (("mesh", mesh.vertices), ("reference", anchor)):
+    if lid is not None and not isinstance(reference, Mesh):
+        raise UsageError("A lid was given for a reference without faces, but only a mesh can be closed.")
+    covers = {} if lid is None else {"lid": lid.vertices}
+    for name, positions in ({"mesh": mesh.vertices, "reference": anchor} | covers).items():
         if broken := int((~np.isfinite(positions)).any(axis=1).sum()):
             raise InputError(f"The {name} has {broken} points that are not finite, so distances cannot be measured.")
     radius = float(np.linalg.norm(anchor - anchor.mean(axis=0), axis=1).max()) if scale is None else scale
@@ -72,7 +81,7 @@ def measure(
     on_mesh = sample_surface(mesh, samples, rng)
     if isinstance(reference, Mesh):
         on_reference = sample_surface(reference, samples, rng)
-        back = _to_surface(on_mesh, reference)
+        back = _to_surface(on_mesh, reference if lid is None else _together(reference, lid))
     else:
         on_reference = _samples_of_cloud(reference)
         back = _to_points(on_mesh, on_reference)
@@ -110,6 +119,13 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> SurfaceS
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
     points = np.einsum("ij,ijk->ik", weights, mesh.corners[faces])
     return SurfaceSamples(points, vectors[faces] / areas[faces, None])
+
+
+def _together(mesh: Mesh, other: Mesh) -> Mesh:
+    return Mesh(
+        np.concatenate([mesh.vertices, other.vertices]),
+        np.concatenate([mesh.faces, other.faces + len(mesh.vertices)]),
+    )
 
 
 def _samples_of_cloud(cloud: PointCloud) -> SurfaceSamples:

@@ -120,6 +120,29 @@ def test_a_cloud_as_reference() -> None:
     assert measure(mesh, PointCloud(normals), samples=100).normal_consistency is None
 
 
+def square(height: float) -> Mesh:
+    """A square of side 2 about the z axis, at a height."""
+    corners = np.array([[-1.0, -1, height], [1, -1, height], [1, 1, height], [-1, 1, height]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_a_lid_is_where_a_mesh_may_be_and_need_not_be() -> None:
+    reference, lid = square(0), square(1)
+    both = Mesh(np.concatenate([reference.vertices, lid.vertices]), np.concatenate([reference.faces, lid.faces + 4]))
+    without, on_lid = measure(both, reference), measure(both, reference, lid=lid)
+    off = measure(lid, reference, lid=reference)
+    assert (without.mesh_to_reference_mean, without.hausdorff) == pytest.approx((0.5, 1.0), abs=0.01)
+    assert (on_lid.chamfer_mean, on_lid.hausdorff, on_lid.f_score) == pytest.approx((0, 0, 1), abs=1e-6)
+    # A lid does not move what the reference's own samples are measured to.
+    assert (off.reference_to_mesh_mean, off.mesh_to_reference_mean) == pytest.approx((1, 1), abs=1e-6)
+    open_mesh = measure(reference, reference, lid=lid)
+    assert (open_mesh.chamfer_mean, open_mesh.hausdorff) == pytest.approx((0, 0), abs=1e-6)
+    with pytest.raises(UsageError, match="without faces"):
+        measure(lid, PointCloud(lid.vertices), lid=lid)
+    with pytest.raises(InputError, match="The lid has 4 points that are not finite"):
+        measure(lid, reference, lid=lid.with_vertices(np.full((4, 3), np.nan)))
+
+
 def test_numbers_are_named_with_their_definitions() -> None:
     metrics = measure(ball(1.0, resolution=24), ball(1.02, resolution=24), samples=1000)
     numbers = json.loads(json.dumps(metrics.as_dict()))
