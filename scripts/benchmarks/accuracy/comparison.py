@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks.accuracy.methods import OURS, PEERS
-from benchmarks.accuracy.problem import Case, Problem, save_scan, save_truth
+from benchmarks.accuracy.problem import Case, Problem, save_mesh, save_scan, save_truth
 from benchmarks.accuracy.trial import Job, run_trial
 from gnrecon.options import Options
 
@@ -95,16 +95,19 @@ def run_case(
         When the case's files are missing or cannot be read.
     """
     folder.mkdir()
-    truth, records = folder / "truth.npz", []
+    truth, lid, records = folder / "truth.npz", folder / "lid.npz", []
     for seed in seeds:
         problem, scan = problem_of(seed), folder / f"scan-{seed}.npz"
         save_truth(problem.truth, truth)
         save_scan(problem.scan.points, problem.scan.normals, scan)
+        if problem.lid is not None:
+            save_mesh(problem.lid, lid)
         for number, (method, settings) in enumerate(protocol.contestants(methods)):
             print(f"bench: {name}, seed {seed}, {method} {settings or ''}", file=sys.stderr)
             given = settings | ({"outliers": True} if problem.outliers and method in PEERS else {})
             files = str(scan), str(truth)
             job = Job(method, *files, protocol.threads, protocol.samples, given, problem.surface_samples)
+            job = job if problem.lid is None else replace(job, lid=str(lid))
             trial = folder / f"{seed}-{number}"
             record = {"case": name, "method": method, "settings": given, "seed": seed, "points": len(problem.scan)}
             records.append(record | {"folder": str(trial)} | run_trial(job, trial, protocol.limit))

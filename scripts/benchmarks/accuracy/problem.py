@@ -33,6 +33,8 @@ class Problem:
         Whether the scan is known to hold points far off the surface, so that every method may remove them.
     surface_samples : int
         Samples on each surface for distances between samples, as published for the SRB; 0 for none.
+    lid : Mesh, optional
+        Faces that close the openings of the truth: a mesh may lie on them, but need not; see `gnrecon.export.measure`.
     up, view : str, (azimuth, elevation) in degrees
         View of pictures.
     """
@@ -43,6 +45,7 @@ class Problem:
     radius: float | None = 1.0
     outliers: bool = False
     surface_samples: int = 0
+    lid: Mesh | None = None
     up: str = "z"
     view: tuple[float, float] = (35.0, 25.0)
 

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.accuracy.methods import METHODS
-from benchmarks.accuracy.problem import load_scan, load_truth, save_mesh
-from benchmarks.harness.measurement import run_isolated, timed
+from benchmarks.accuracy.problem import load_mesh, load_scan, load_truth, save_mesh
+from benchmarks.harness.measurement import Stopwatch, run_isolated
 from gnrecon.export import measure, verify
 from gnrecon.export.metrics import sample_surface
 from gnrecon.geometry.mesh import Mesh
@@ -38,6 +38,7 @@ class Job:
     samples : samples on each surface for measuring
     settings : keyword arguments of the method
     surface_samples : samples on each surface for distances between samples; 0 for none
+    lid : file of the faces that close the truth, which `save_mesh` wrote; None where the truth has no lid
     """
 
     method: str
@@ -47,6 +48,7 @@ class Job:
     samples: int
     settings: dict[str, Any] = field(default_factory=dict)
     surface_samples: int = 0
+    lid: str | None = None
 
 
 def run_trial(job: Job, folder: Path, limit_seconds: float | None = None) -> dict[str, Any]:
@@ -75,8 +77,10 @@ def measure_trial(folder: str, **arguments: Any) -> dict[str, Any]:
     points, normals = load_scan(Path(job.scan))
     method = METHODS[job.method]()
     libraries_mb = process_peak_mb()
-    seconds, (mesh, details) = timed(lambda: method(points, normals, **job.settings))
-    figures = {"seconds": seconds, "peak_memory_mb": process_peak_mb(), "libraries_memory_mb": libraries_mb}
+    with Stopwatch() as watch:
+        mesh, details = method(points, normals, **job.settings)
+    figures = {"seconds": watch.seconds, "cpu_seconds": watch.cpu_seconds}
+    figures |= {"peak_memory_mb": process_peak_mb(), "libraries_memory_mb": libraries_mb}
     if not len(mesh.faces):
         raise MeshError("The mesh is empty.")
     save_mesh(mesh, Path(folder) / "mesh.npz")
@@ -84,7 +88,8 @@ def measure_trial(folder: str, **arguments: Any) -> dict[str, Any]:
 
 
 def _distances(mesh: Mesh, truth: Mesh | PointCloud, job: Job) -> dict[str, Any]:
-    figures = measure(mesh, truth, samples=job.samples).as_dict()
+    lid = None if job.lid is None else load_mesh(Path(job.lid))
+    figures = measure(mesh, truth, samples=job.samples, lid=lid).as_dict()
     if job.surface_samples and isinstance(truth, Mesh):
         figures |= between_samples(mesh, truth, job.surface_samples)
     return figures
