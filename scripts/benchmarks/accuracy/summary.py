@@ -28,6 +28,7 @@ COLUMNS = (
     Figure("genus", "genus", "{:g}"),
     Figure("closed", "closed", "{}"),
     Figure("seconds", "s", "{:,.1f}"),
+    Figure("cpu_seconds", "CPU s", "{:,.1f}"),
     Figure("peak_memory_mb", "MB"),
 )
 SAMPLE_COLUMNS = (
@@ -36,10 +37,13 @@ SAMPLE_COLUMNS = (
 )
 
 
-def summarise(records: Sequence[dict[str, Any]], problem: Problem) -> dict[str, Any]:
+def summarise(
+    records: Sequence[dict[str, Any]], problem: Problem, stored: Sequence[dict[str, Any]] = ()
+) -> dict[str, Any]:
     """Return the facts of a case, and for each of its methods the medians over seeds at the best setting.
 
-    Distances are in the truth's own unit; `factor` converts them to the reported `unit`.
+    Distances are in the truth's own unit; `factor` converts them to the reported `unit`. `stored` are the figures of
+    peers that were measured before, see `stored_peers.best_stored`.
     """
     found = [record | _derived(record) for record in records]
     names = dict.fromkeys(record["method"] for record in found)
@@ -49,9 +53,11 @@ def summarise(records: Sequence[dict[str, Any]], problem: Problem) -> dict[str, 
         "points": records[0]["points"],
         "genus": problem.genus,
         "against_scan": isinstance(problem.truth, PointCloud),
+        "lid": problem.lid is not None,
         "unit": problem.unit,
         "factor": problem.factor,
         "methods": {name: best_setting([r for r in found if r["method"] == name], keys) for name in names},
+        "stored": list(stored),
     }
 
 
@@ -115,7 +121,10 @@ def _derived(record: dict[str, Any]) -> dict[str, Any]:
 def accuracy_table(summaries: Sequence[dict[str, Any]], seeds: int) -> Table:
     """Return a table of the summaries of `summary.summarise`; the best peer of each case is marked with a star."""
     caption = "Mean: half the sum of both ways. F-score at 0.5 % of the radius. *: the best peer by the mean."
-    table = Table(caption=caption + (f" Medians over {seeds} seeds." if seeds > 1 else ""))
+    caption += f" Medians over {seeds} seeds." if seeds > 1 else ""
+    if any(summary["stored"] for summary in summaries):
+        caption += " Stored: the peer with the least mean, and that with the least Hausdorff distance; seed 0."
+    table = Table(caption=caption)
     has_samples = any(done["samples_chamfer"] is not None for summary in summaries for done in _measured(summary))
     columns = [*COLUMNS, *(SAMPLE_COLUMNS if has_samples else ())]
     table.add_column("case and method", no_wrap=True)
@@ -128,8 +137,15 @@ def accuracy_table(summaries: Sequence[dict[str, Any]], seeds: int) -> Table:
         for method, figures in summary["methods"].items():
             name = f"{method_title(method, figures)}{' *' if method == star else ''}"
             table.add_row(name, *(_cell(figures, column, summary["factor"]) for column in columns))
+        for figures in summary["stored"]:
+            table.add_row(_stored_title(figures), *(_cell(figures, column, summary["factor"]) for column in columns))
         table.add_section()
     return table
+
+
+def _stored_title(figures: dict[str, Any]) -> str:
+    others = "" if figures["same_points"] else " (other points)"
+    return f"stored {figures['method']}, {figures['setting']}{others}"
 
 
 def method_title(method: str, figures: dict[str, Any]) -> str:
@@ -152,7 +168,8 @@ def failures(summaries: Sequence[dict[str, Any]]) -> list[str]:
 def _described(summary: dict[str, Any]) -> str:
     genus = "" if summary["genus"] is None else f", genus {summary['genus']}"
     against = "; measured against the scan" if summary["against_scan"] else ""
-    return f"{summary['points']:,} points{genus}; {summary['unit']}{against}"
+    lid = "; open, with a flat lid" if summary["lid"] else ""
+    return f"{summary['points']:,} points{genus}; {summary['unit']}{against}{lid}"
 
 
 def _measured(summary: dict[str, Any]) -> list[dict[str, Any]]:
@@ -162,7 +179,8 @@ def _measured(summary: dict[str, Any]) -> list[dict[str, Any]]:
 def _cell(figures: dict[str, Any], column: Figure, factor: float) -> str:
     if "error" in figures:
         return "failed" if column.key == "chamfer_mean" else ""
-    value = figures[column.key]
+    # Stored figures have fewer keys than those of a trial.
+    value = figures.get(column.key)
     if value is not None and column.key == "closed":
         return "yes" if value == 1 else "no"
     in_unit = factor * value if value is not None and column.is_length else value
