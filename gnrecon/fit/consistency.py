@@ -19,10 +19,10 @@ import torch
 from gnrecon.field.networks import Siren
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.global_field import smooth_spectrum
 from gnrecon.fit.initialisation import wide_start
+from gnrecon.fit.linear_field import smooth_spectrum
 from gnrecon.fit.objective import ObjectiveTerm, Scene, distance_term
-from gnrecon.fit.parameters import GlobalFieldParameters, OutlierParameters
+from gnrecon.fit.parameters import LinearFieldParameters, OutlierParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
@@ -69,7 +69,7 @@ def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Gen
             distance_term(scene, x, distance),
         ]
 
-    theta = wide_start(field, scene, terms, rng, smooth_spectrum(min(GlobalFieldParameters.length_scales_radii), scene))
+    theta = wide_start(field, scene, terms, rng, smooth_spectrum(min(LinearFieldParameters.length_scales_radii), scene))
     sdf = NeuralSDF(field, theta, samples.frame, scene.box)
     slopes: Float = np.einsum("ij,ij->i", sdf.gradient(samples.frame.to_world(samples.points)), samples.normals)
     return slopes

@@ -61,7 +61,7 @@ def fit(
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
     if options.adaptive:
-        sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler, parameters=parameters)
+        sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler, callback, parameters=parameters)
     elif folder is not None:
         raise UsageError("A work folder is for the default fit only; leave out --widths and --steps.")
     else:

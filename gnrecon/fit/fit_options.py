@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gnrecon.fit.parameters import SingleNetworkParameters
+from gnrecon.fit.parameters import NetworkLadderParameters, SingleNetworkParameters
 from gnrecon.fit.penalties.regularisers import Regulariser, regularisers
 from gnrecon.least_squares import SOLVERS
 from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, normal_projection, normal_vector
@@ -120,7 +120,7 @@ class FitOptions:
         docs/research/2026-11-21-one-wide-layer.md), so that by default the exact linear solve is left as it is.
         """
         if self.adaptive:
-            return 0
+            return 0 if self.regularisers else NetworkLadderParameters().most_steps
         if self.steps is not None:
             return self.steps
         if self.optimiser == "adam":

@@ -195,7 +195,7 @@ class ObjectiveTerm:
         What the history and the report call it.
     residual : function of (value, gradient, target)
     points : of shape (N, 3), unit coordinates
-    target : of shape (N,) or (N, 3), or None
+    target : of shape (N,), (N, 2) or (N, 3), or None
     weight : float, or a tensor of shape (N,) for weights that differ from point to point
     """
 

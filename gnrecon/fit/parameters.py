@@ -49,8 +49,8 @@ class OutlierParameters:
 
 
 @dataclass(frozen=True)
-class GlobalFieldParameters:
-    """The smooth global field (`fit.global_field`)."""
+class LinearFieldParameters:
+    """The linear start of the global field (`fit.linear_field`)."""
 
     units: int = 1000
     wrong_sign_share: float = 4e-3  # of free space, that heavier normals may give the wrong sign
@@ -65,6 +65,56 @@ class GlobalFieldParameters:
     position_noise_spacings: float = 0.1  # assumed in the selection; that of normals is this over the reach, in radians
     least_validation_points: int = 5  # with fewer, nothing is selected
     field_deviation_radii: float = 1.0  # prior standard deviation of the field
+
+
+@dataclass(frozen=True)
+class NetworkTermParameters:
+    """The rows of the global network's Gauss-Newton steps (`fit.network_terms`)."""
+
+    data_rows: int = 2500  # most points of a step; free space has as many samples, and the eikonal residual half
+    pool_samples: int = 20_000  # of free space, of which each step draws a part
+    trial_samples: int = 60_000  # places that are searched for wrong signs before the network is widened
+    # One-sided bounds of f in free space, as shares of the coarse distance: the medial axis of a smooth field is round.
+    least_share: float = 0.5
+    most_share: float = 1.5
+    free_space_deviation_share: float = 0.15  # standard deviation of these bounds, as a share of the distance
+    near_spacings: float = 2.0  # standard deviation of the places near the surface
+    near_eikonal_deviation: float = 0.1  # of |grad f| there
+    far_eikonal_deviation: float = 0.3  # of |grad f| in the box, where a distance has kinks
+    robust_degrees_of_freedom: float = 4.0  # of Student's t distribution of the data (Lange, Little and Taylor 1989)
+    least_deviation: float = 1e-3  # in disk radii and radians; below, rounding would decide
+    least_slope: float = 0.3  # of the field along a normal, in a distance |f| / slope
+    least_validation_points: int = 10  # with fewer, the seen points are scored
+    wrong_sign_score: float = 100.0  # disk radii for a field that is wrong in all of free space: sheets cost most
+    eikonal_measured: int = 2000  # places at which the history's eikonal residual is measured
+
+
+@dataclass(frozen=True)
+class NetworkLadderParameters:
+    """The widths of the global network, and its steps (`fit.network_ladder`)."""
+
+    depth: int = 3  # hidden layers
+    widths: tuple[int, ...] = (16, 24, 32)
+    first_steps: int = 30  # most Gauss-Newton steps of the first width
+    steps: int = 15  # of each further width
+    patience_steps: int = 8  # without a better score
+    least_gain: float = 0.01  # share of the score that a wider network must gain
+    damping: float = 1e-2  # of the first step of each width
+
+    @property
+    def most_steps(self) -> int:
+        """Steps of the whole ladder."""
+        return self.first_steps + (len(self.widths) - 1) * self.steps
+
+
+@dataclass(frozen=True)
+class GlobalFieldParameters:
+    """The smooth global field (`fit.global_field`)."""
+
+    linear: LinearFieldParameters = LinearFieldParameters()
+    terms: NetworkTermParameters = NetworkTermParameters()
+    ladder: NetworkLadderParameters = NetworkLadderParameters()
+    linear_time_share: float = 0.3  # of the global fit, measured, for the progress bar
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ exact because the field is linear in the weights (variable projection). The step
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,9 +38,11 @@ from gnrecon.fit.shape_priors.sharp_shape import SharpShape
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.optim import Solution
+from gnrecon.optim import Callback, Solution
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
+
+_log = logging.getLogger(__name__)
 
 
 def fit_two_level(
@@ -48,12 +52,14 @@ def fit_two_level(
     advance: ProgressCallback = ignore_progress,
     folder: str | Path | None = None,
     scheduler: str | None = None,
+    callback: Callback | None = None,
     *,
     parameters: FitParameters = FitParameters(),
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a global field and local fields.
 
-    An interrupt (Ctrl-C) while the local fields are solved leaves the global field.
+    An interrupt (Ctrl-C) during the steps of Gauss-Newton, or while the local fields are solved, leaves the global
+    field.
 
     Parameters
     ----------
@@ -63,6 +69,7 @@ def fit_two_level(
     advance : called with the share that is done
     folder : where the work is kept; the local fields are then solved by blocks, as those of a large scan always are
     scheduler : address of a Dask scheduler that solves the blocks
+    callback : called with the record of each step of Gauss-Newton
 
     Raises
     ------
@@ -77,15 +84,19 @@ def fit_two_level(
             f"smooth, fill and prior are for fits of fewer than {BlockParameters.large_scan_points} points without a "
             "work folder; thin the scan with --max-points."
         )
-    steps = _Steps(options, by_blocks, rng, parameters)
+    steps = _Steps(options, by_blocks, rng, parameters, callback)
     share = parameters.two_level.global_time_share
     ball = steps.detect_ball(samples)
     data, flipped_share = steps.prepare(samples if ball is None else ball.samples)
     data, first, outliers = steps.fit_global(data, subrange(advance, 0.0, share))
+    if first.solution.interrupted:
+        status = f"{first.solution.status} This is the smooth global field alone."
+        return first.sdf, replace(first.solution, status=status)
     sdf, penalties = steps.apply_penalties(first, data)
     try:
         rest = subrange(advance, share, 1.0)
-        detail, averaging_width = steps.fit_local(sdf, data, penalties, outliers > 0, rest, folder, scheduler)
+        fields = [sdf] if first.other is None else [sdf, first.other]
+        sdf, detail, averaging_width = steps.fit_local(fields, data, penalties, outliers > 0, rest, folder, scheduler)
     except KeyboardInterrupt:
         status = "Interrupted before the local fields were solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
@@ -98,7 +109,7 @@ def fit_two_level(
         ball_points=len(samples),
         ball_samples=0 if ball is None else len(ball.samples) - len(samples),
     )
-    solution = replace(first.solution, status=describe(summary), method="Exact linear least squares.")
+    solution = replace(first.solution, status=describe(summary))
     return replace(sdf, detail=detail), solution
 
 
@@ -156,6 +167,7 @@ class _Steps:
     by_blocks: bool
     rng: np.random.Generator
     parameters: FitParameters
+    callback: Callback | None = None
 
     @property
     def _finds_edges(self) -> bool:
@@ -188,7 +200,7 @@ class _Steps:
         outliers = find_outliers(
             first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points), parameters=self.parameters.outliers
         )
-        if not outliers.any():
+        if first.solution.interrupted or not outliers.any():
             return completed, first, 0
         if data.sharp is None:
             data = data.without(outliers)
@@ -210,28 +222,45 @@ class _Steps:
 
     def fit_local(
         self,
-        sdf: NeuralSDF,
+        fields: Sequence[NeuralSDF],
         data: _Data,
         penalties: PenaltiesFor | None,
         outliers: bool,
         advance: ProgressCallback,
         folder: str | Path | None,
         scheduler: str | None,
-    ) -> tuple[Detail, float | None]:
-        """Return the local fields, and the width over which points were averaged for them, in disk radii, or None."""
-        options, rng = self.options, self.rng
+    ) -> tuple[NeuralSDF, Detail, float | None]:
+        """Return the global field, the local ones, and the width of averaging for them, in disk radii, or None.
+
+        Of the global fields, that is used with which a local fit predicts the validation points best. A network that
+        follows sparse points may leave the local fields nothing to learn from.
+        """
+        options, rng, sdf = self.options, self.rng, fields[0]
         if self.by_blocks:
-            return fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler), None
+            return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler), None
         if data.sharp is not None:
             local = LocalData.of_faces(sdf, data.sharp)
         else:
-            local = choose_local_data(
-                sdf, data.samples, data.held_out, options.features, rng, options.device, outliers=outliers
-            )
+            seed = int(rng.integers(2**32))
+            tried = [
+                choose_local_data(
+                    field,
+                    data.samples,
+                    data.held_out,
+                    options.features,
+                    np.random.default_rng(seed),  # the same patches for each field
+                    options.device,
+                    outliers=outliers,
+                )
+                for field in fields
+            ]
+            best = min(range(len(fields)), key=lambda number: tried[number].score)
+            _log.info("Scores with local fields, in disk radii: %s.", ", ".join(f"{one.score:.3g}" for one in tried))
+            sdf, local = fields[best], tried[best]
         limits = self.parameters.local_fields
         advance(limits.selection_time_share)
         detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=limits)
-        return detail, None if local.averaging is None else local.averaging.width_radii
+        return sdf, detail, None if local.averaging is None else local.averaging.width_radii
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
         """Return the data with samples across holes, and the global field that is fitted to them."""
@@ -240,7 +269,9 @@ class _Steps:
             data if self.options.regularisers else data.across_holes(self.rng, self.parameters.shape_priors.holes)
         )
         seen = completed.samples, completed.held_out, completed.seen
-        return completed, fit_global(*seen, self.options, self.rng, advance, parameters=self.parameters.global_field)
+        return completed, fit_global(
+            *seen, self.options, self.rng, advance, self.callback, parameters=self.parameters.global_field
+        )
 
     def _draw(self, scan: Samples, sharp: SharpShape | None) -> _Data:
         """Draw the validation points and those that the global field sees."""

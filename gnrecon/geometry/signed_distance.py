@@ -150,6 +150,11 @@ class CoarseDistance:
         self._radii = Density(self._sources).disks
         self._dipoles = normals[chosen] * (self._radii**2 / 4)[:, None]
 
+    @property
+    def radius(self) -> float:
+        """Median radius of the disks that points represent."""
+        return self._density.radius
+
     def sample(self, x: Float) -> tuple[Float, Float]:
         """Return the points among x, of shape (Q, 3), where the distance is known, and the distances there."""
         known, signed, *_ = self.at(x)

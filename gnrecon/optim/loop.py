@@ -221,6 +221,7 @@ class Record:
     held_out : value of the held-out residuals after the step, if there are any
     iterations : of an iterative linear solver
     seconds : since the start of the run
+    eikonal : root mean square of |grad f| - 1 near the surface after the step, where the fit measures it
     """
 
     step: int
@@ -232,6 +233,7 @@ class Record:
     held_out: float | None = None
     iterations: int = 0
     seconds: float = 0.0
+    eikonal: float | None = None
 
 
 Callback = Callable[[Record], None]

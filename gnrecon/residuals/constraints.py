@@ -79,6 +79,17 @@ def signed_distance(value: Tensor, gradient: Tensor, target: Tensor | None) -> L
     return Linearised((value - target)[:, None], torch.ones_like(value)[:, None], None)
 
 
+def value_range(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
+    """The value is known to lie in a range: r = f - clip(f, least, most), zero within it.
+
+    Targets are of shape (N, 2): the least and the most value.
+    """
+    del gradient
+    assert target is not None, "the ends of the range are the targets of this residual"
+    excess = value - value.clamp(target[:, 0], target[:, 1])
+    return Linearised(excess[:, None], (excess != 0).to(value.dtype)[:, None], None)
+
+
 def normal_vector(value: Tensor, gradient: Tensor, target: Tensor | None) -> Linearised:
     """The gradient is the unit normal n: r = grad f - n, three residuals a point, linear in f."""
     del value

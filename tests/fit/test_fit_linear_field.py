@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.global_field import Smoothness, global_smoothness
+from gnrecon.fit.linear_field import Smoothness, field_smoothness
 from gnrecon.fit.objective import Scene
-from gnrecon.fit.parameters import GlobalFieldParameters
+from gnrecon.fit.parameters import LinearFieldParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 
@@ -42,17 +42,17 @@ def chosen(samples: Samples) -> Smoothness:
     held[::6] = True
     seen = Samples(samples.points[~held], samples.normals[~held], FRAME)
     scene = Scene.of(seen, "cpu", np.random.default_rng(1))
-    return global_smoothness(samples, held, scene, np.random.default_rng(2))
+    return field_smoothness(samples, held, scene, np.random.default_rng(2))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_ball_needs_long_features(noise: float) -> None:
-    assert chosen(rippled(1.0, 0.0, noise)).length > GlobalFieldParameters.length_scales_radii[0]
+    assert chosen(rippled(1.0, 0.0, noise)).length > LinearFieldParameters.length_scales_radii[0]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
 def test_ripples_need_short_features(noise: float) -> None:
-    assert chosen(rippled(9.0, 0.05, noise)).length == GlobalFieldParameters.length_scales_radii[0]
+    assert chosen(rippled(9.0, 0.05, noise)).length == LinearFieldParameters.length_scales_radii[0]
 
 
 def test_equal_seeds_choose_alike() -> None:
@@ -64,5 +64,5 @@ def test_exact_normals_of_a_smooth_shape_reach_farther_than_scattered_ones() -> 
     exact = rippled(1.0, 0.0, 0.01)
     turned = exact.normals + 0.5 * np.random.default_rng(3).standard_normal(exact.normals.shape)
     scattered = Samples(exact.points, turned / np.linalg.norm(turned, axis=1, keepdims=True), FRAME)
-    assert chosen(exact).reach == GlobalFieldParameters.normal_reaches_spacings[-1]
-    assert chosen(scattered).reach < GlobalFieldParameters.normal_reaches_spacings[-1]
+    assert chosen(exact).reach == LinearFieldParameters.normal_reaches_spacings[-1]
+    assert chosen(scattered).reach < LinearFieldParameters.normal_reaches_spacings[-1]

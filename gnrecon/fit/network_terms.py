@@ -1,0 +1,185 @@
+"""The terms of the global network: what a step of Gauss-Newton minimises, and how validation points score it.
+
+    values       f = 0                       at the points
+    normals      grad f = n                  at the points
+    free space   f between two shares of d   where the winding number is certain; d is the coarse signed distance
+    eikonal      |grad f| = 1                near the surface, and in the whole box
+
+Each row is over its standard deviation, so that the sum of squares is a log likelihood, and no weight is left to set.
+The deviations of values and normals are those of the validation points from the field that the step starts at
+(`NetworkTerms.noise`): a coarse field fits coarsely, a better one weighs the data more, and what the network cannot
+predict it does not chase. Rows of data have the robust weights of Student's t distribution at that deviation, so that
+outliers and contradicting normals lose their weight. Those of free space are one-sided; besides a random part of all
+samples, each step has the samples at which the field is wrong.
+Source: Lange, Little and Taylor, *Robust Statistical Modeling Using the t Distribution* (1989), for the weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gnrecon.field.networks import Siren
+from gnrecon.fit.initialisation import WrongSignSearch
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
+from gnrecon.fit.parameters import NetworkTermParameters
+from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.signed_distance import sample_near_surface
+from gnrecon.residuals.constraints import eikonal, interface, normal_vector, value_range
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Standard deviations of values, in radii, and of normals, in radians."""
+
+    values: float
+    normals: float
+
+
+@dataclass(frozen=True)
+class NetworkTerms:
+    """The data of a global network.
+
+    Parameters
+    ----------
+    scene : the points that it sees
+    points, normals : of shape (V, 3), the validation points
+    volume, distances : samples of free space, of shape (Q, 3), and their coarse signed distances, of shape (Q,)
+    near : places near the surface at which the eikonal residual is measured, of shape (E, 3)
+    """
+
+    scene: Scene
+    points: Tensor
+    normals: Tensor
+    volume: Tensor
+    distances: Tensor
+    near: Tensor
+    parameters: NetworkTermParameters
+
+    @classmethod
+    def draw(
+        cls,
+        scene: Scene,
+        points: Float,
+        normals: Float,
+        rng: np.random.Generator,
+        *,
+        parameters: NetworkTermParameters = NetworkTermParameters(),
+    ) -> NetworkTerms:
+        """Draw the samples of free space; without validation points, the points that are seen take their place."""
+        if len(points) < parameters.least_validation_points:
+            points, normals = scene.samples.points, scene.samples.normals
+        x, distance = _certain(scene, scene.places(parameters.pool_samples, rng))
+        count = parameters.eikonal_measured
+        near = sample_near_surface(scene.samples.points, parameters.near_spacings * scene.coarse.spacing, count, rng)
+        validation = scene.tensor(points), scene.tensor(normals)
+        return cls(scene, *validation, scene.tensor(x), scene.tensor(distance), scene.tensor(near), parameters)
+
+    def with_wrong_signs(self, field: Siren, theta: Tensor, rng: np.random.Generator) -> NetworkTerms:
+        """Return the terms with more samples of free space where the field has the wrong sign."""
+        scene = self.scene
+        known = WrongSignSearch(scene.coarse, self.volume.cpu().numpy(), self.distances.sign().cpu().numpy())
+        trial = scene.places(self.parameters.trial_samples, rng)
+        wrong, _ = known.wrong_signs(trial, lambda x: field.value(theta, scene.tensor(x)).cpu().numpy())
+        x, distance = _certain(scene, wrong)
+        volume, distances = (
+            torch.cat([self.volume, scene.tensor(x)]),
+            torch.cat([self.distances, scene.tensor(distance)]),
+        )
+        return replace(self, volume=volume, distances=distances)
+
+    def noise(self, field: Siren, theta: Tensor) -> Deviations:
+        """Return robust deviations of the validation points from the field."""
+        distance, angle = self._misfits(field, theta)
+        least, radius = self.parameters.least_deviation, self.radius
+        # Medians of the absolute value of a normal variable, and of the length of a normal vector in space.
+        values, normals = float(distance.median()) / 0.6745, float(angle.median()) / 1.538
+        return Deviations(max(values, least * radius), max(normals, least))
+
+    def score(self, field: Siren, theta: Tensor) -> float:
+        """Return how badly the field predicts the validation points and the sign of free space, in disk radii."""
+        distance, angle = self._misfits(field, theta)
+        wrong = float(self._is_wrong(field, theta).double().mean())
+        return float(distance.mean()) / self.radius + float(angle.mean()) + self.parameters.wrong_sign_score * wrong
+
+    def eikonal_rms(self, field: Siren, theta: Tensor) -> float:
+        """Return the root mean square of |grad f| - 1 near the surface."""
+        gradient = field.value_and_gradient(theta, self.near)[1]
+        return float((gradient.norm(dim=1) - 1.0).square().mean().sqrt())
+
+    def problem(self, field: Siren, theta: Tensor, noise: Deviations, rng: np.random.Generator) -> FieldProblem:
+        """Draw the rows of one step."""
+        terms = [*self._data(field, theta, noise, rng), self._free_space(field, theta, rng), *self._eikonal(rng)]
+        return FieldProblem(field, terms, theta, precision=torch.float32)
+
+    @property
+    def radius(self) -> float:
+        """Median radius of the disks that points stand for."""
+        return self.scene.coarse.radius
+
+    def _misfits(self, field: Siren, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distances of the validation points from the surface, and |grad f - n|, both of shape (V,)."""
+        value, gradient = field.value_and_gradient(theta, self.points)
+        slope = (gradient * self.normals).sum(1).clamp_min(self.parameters.least_slope)
+        return value.abs() / slope, (gradient - self.normals).norm(dim=1)
+
+    def _is_wrong(self, field: Siren, theta: Tensor) -> Tensor:
+        """Return the samples of free space at which f is beyond half of the one-sided bound, a mask of shape (Q,)."""
+        value = self.distances.sign() * field.value(theta, self.volume)
+        return value < self.parameters.least_share / 2 * self.distances.abs()
+
+    def _data(
+        self, field: Siren, theta: Tensor, noise: Deviations, rng: np.random.Generator
+    ) -> tuple[ObjectiveTerm, ObjectiveTerm]:
+        """Return values and normals at a random part of the points, with robust weights."""
+        scene, freedom = self.scene, self.parameters.robust_degrees_of_freedom
+        rows = self._part(len(scene.points), self.parameters.data_rows, rng)
+        points, normals = scene.points[rows], scene.normals[rows]
+        value, gradient = field.value_and_gradient(theta, points)
+        off = (value / noise.values).square()
+        turned = ((gradient - normals) / noise.normals).square().sum(1)
+        of_values = (freedom + 1) / (freedom + off) / noise.values**2
+        of_normals = (freedom + 3) / (freedom + turned) / noise.normals**2
+        # A term's weight is divided by its number of rows.
+        return (
+            ObjectiveTerm("interface", interface, points, None, len(rows) * of_values),
+            ObjectiveTerm("normal", normal_vector, points, normals, len(rows) * of_normals),
+        )
+
+    def _free_space(self, field: Siren, theta: Tensor, rng: np.random.Generator) -> ObjectiveTerm:
+        """Return a random part of free space, and of the samples at which the field is wrong."""
+        count = min(len(self.scene.points), self.parameters.data_rows)
+        some = self._part(len(self.volume), count, rng)
+        wrong = self._is_wrong(field, theta).nonzero()[:, 0]
+        rows = torch.cat([some, wrong[self._part(len(wrong), count // 2, rng)]])
+        distance = self.distances[rows]
+        near, far = self.parameters.least_share * distance, self.parameters.most_share * distance
+        ends = torch.stack([torch.minimum(near, far), torch.maximum(near, far)], 1)
+        weight = len(rows) / (self.parameters.free_space_deviation_share * distance).square()
+        return ObjectiveTerm("free space", value_range, self.volume[rows], ends, weight)
+
+    def _eikonal(self, rng: np.random.Generator) -> tuple[ObjectiveTerm, ObjectiveTerm]:
+        """Return eikonal rows near the surface and in the box."""
+        scene, limits = self.scene, self.parameters
+        count = max(min(len(scene.points), limits.data_rows) // 2, 1)
+        near = sample_near_surface(scene.samples.points, limits.near_spacings * scene.coarse.spacing, count, rng)
+        box = scene.box.sample(max(count // 2, 1), rng)
+        deviations = limits.near_eikonal_deviation, limits.far_eikonal_deviation
+        near_term, far_term = (
+            ObjectiveTerm(name, eikonal, scene.tensor(x), None, len(x) / deviation**2)
+            for name, x, deviation in zip(("eikonal near the surface", "eikonal"), (near, box), deviations, strict=True)
+        )
+        return near_term, far_term
+
+    def _part(self, count: int, most: int, rng: np.random.Generator) -> Tensor:
+        """Return at most `most` of so many rows, in order."""
+        return torch.as_tensor(np.sort(rng.permutation(count)[:most])).to(self.points.device)
+
+
+def _certain(scene: Scene, x: Float) -> tuple[Float, Float]:
+    """Return the places among x, of shape (Q, 3), where distance and sign are known, and the signed distances."""
+    known, distance, _, certain = scene.coarse.at(x)
+    return x[known][certain], distance[certain]
