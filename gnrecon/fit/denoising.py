@@ -37,14 +37,12 @@ class LocalData:
     residuals : of the global field at the samples
     hyperparameters : length scale and noise
     averaging : the filter, or None
-    score : how badly the validation points are predicted with a local fit, in disk radii; see `model_selection`
     """
 
     samples: Samples
     residuals: FieldResiduals
     hyperparameters: Hyperparameters
     averaging: BilateralFilter | None = None
-    score: float = np.inf
 
     @classmethod
     def of_faces(cls, sdf: NeuralSDF, sharp: SharpShape) -> LocalData:
@@ -83,14 +81,13 @@ def choose_local_data(
     validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
     clean = None if outliers else validation.clean()
     if clean is not None:
-        return LocalData(samples, residuals, clean.best, score=float(clean.scores_of_best_noise.mean()))
+        return LocalData(samples, residuals, clean)
     selected = validation.select()
-    score = float(selected.scores_of_best_noise.mean())
     # The marginal likelihood is not robust to outliers that remain.
     plain = selected.hyperparameters if outliers else selected.best
     # Estimated normals are means over edges already. The factor keeps noise that equals the limit but for rounding.
     if samples.estimated or selected.hyperparameters.position <= 1.001 * parameters.least_noise_disk_radii * radius:
-        return LocalData(samples, residuals, plain, score=score)
+        return LocalData(samples, residuals, plain)
 
     def with_kept(averaging: BilateralFilter) -> CrossValidation:
         points, normals = samples.points.copy(), samples.normals.copy()
@@ -102,14 +99,12 @@ def choose_local_data(
     first = _candidates(parameters)[0]
     found = _best(selected, with_kept, lambda: has_edges(*first.apply(samples.points, samples.normals)), parameters)
     if found is None:
-        return LocalData(samples, residuals, plain, score=score)
+        return LocalData(samples, residuals, plain)
     averaging, better = found
-    averaged = better.select()
     points, normals = averaging.apply(samples.points, samples.normals)
     samples = replace(samples, points=points, normals=normals)
     _log.info("Points are averaged over %.2g radii of their disks where normals agree.", averaging.width_radii)
-    score = float(averaged.scores_of_best_noise.mean())
-    return LocalData(samples, FieldResiduals.of(sdf, samples), averaged.hyperparameters, averaging, score)
+    return LocalData(samples, FieldResiduals.of(sdf, samples), better.select().hyperparameters, averaging)
 
 
 def _best(
@@ -123,7 +118,7 @@ def _best(
     Edges are looked for only if the patches do not decide. All filters are compared at the length scale of the scanned
     points; a better one is selected afterwards.
     """
-    plain = selected.scores_of_best_noise
+    plain = _of_best_noise(selected.scores)
     first, *others = _candidates(parameters)
 
     def tried(averaging: BilateralFilter) -> tuple[Float, CrossValidation]:

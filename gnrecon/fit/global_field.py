@@ -38,14 +38,22 @@ class GlobalField:
     solution : with the steps of Gauss-Newton as its history
     scene : what it saw
     length : of the linear field's features, in radii
-    other : the linear field where the network is the global field, on which local fields may be better
+    ladder : the network's, or None of a linear field
     """
 
     sdf: NeuralSDF
     solution: Solution
     scene: Scene
     length: float
-    other: NeuralSDF | None = None
+    ladder: NetworkLadder | None = None
+
+    def refitted(self, samples: Samples) -> NeuralSDF:
+        """Return the field after some steps on all samples, which the validation points are a part of."""
+        if self.ladder is None:
+            return self.sdf
+        points, normals = self.scene.tensor(samples.points), self.scene.tensor(samples.normals)
+        field, theta = self.ladder.refit(replace(self.scene, points=points, normals=normals, samples=samples))
+        return replace(self.sdf, field=field, theta=theta)
 
 
 def fit_global(
@@ -90,13 +98,13 @@ def fit_global(
     terms = NetworkTerms.draw(scene, points, normals, rng, parameters=parameters.terms)
     step = _counted(callback, subrange(advance, share, 1.0), parameters)
     ladder = NetworkLadder(terms, options, rng, step, parameters.ladder)
-    field, solution, score = ladder.climb()
+    field, solution, score = ladder.fit()
     linear_score = terms.score(linear.sdf.field, linear.sdf.theta)
     _log.info("Score of the validation points: linear field %.3g, network %.3g disk radii.", linear_score, score)
     if linear_score < score and not solution.interrupted:
         return replace(first, solution=replace(linear.solution, history=solution.history))
     sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
-    return GlobalField(sdf, solution, scene, linear.length, linear.sdf)
+    return GlobalField(sdf, solution, scene, linear.length, ladder)
 
 
 def _counted(callback: Callback | None, advance: ProgressCallback, parameters: GlobalFieldParameters) -> Callback:

@@ -154,12 +154,6 @@ class SelectedModel:
         """Return the hyperparameters for points as they were scanned."""
         return self.most_likely or self.hyperparameters
 
-    @property
-    def scores_of_best_noise(self) -> Float:
-        """Return the patches' scores, of shape (patches,), with the noise that is best on their mean, in radii."""
-        best: Float = self.scores[:, int(self.scores.mean(axis=0).argmin())]
-        return best
-
 
 def select_hyperparameters(
     residuals: FieldResiduals, held_out: Mask, radius: float, rng: np.random.Generator, device: str = "cpu"
@@ -177,7 +171,7 @@ def select_hyperparameters(
     device : a torch device
     """
     validation = CrossValidation.draw(residuals, held_out, radius, rng, device)
-    return (validation.clean() or validation.select()).best
+    return validation.clean() or validation.select().best
 
 
 def _marginal_likelihood(
@@ -292,7 +286,7 @@ class CrossValidation:
             residuals, residuals, radius, features, centers, found, held_out, device, None, likelihood, parameters
         )
 
-    def clean(self) -> SelectedModel | None:
+    def clean(self) -> Hyperparameters | None:
         """Return the hyperparameters of a clean scan, whose noise follows from its points, or None of any other.
 
         The length scale is the shortest that no longer one beats by more than the standard error. Clean points justify
@@ -306,8 +300,7 @@ class CrossValidation:
         number, count = 0, len(self.parameters.lengths_disk_radii)
         while number + 1 < count and known._clearly_better(number + 1, number):
             number += 1
-        chosen = Hyperparameters(self._length(number), *noise)
-        return SelectedModel(chosen, known.scores(chosen.length))
+        return Hyperparameters(self._length(number), *noise)
 
     def select(self) -> SelectedModel:
         """Return the hyperparameters that predict best."""

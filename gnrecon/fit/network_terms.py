@@ -97,7 +97,10 @@ class NetworkTerms:
         least, radius = self.parameters.least_deviation, self.radius
         # Medians of the absolute value of a normal variable, and of the length of a normal vector in space.
         values, normals = float(distance.median()) / 0.6745, float(angle.median()) / 1.538
-        return Deviations(max(values, least * radius), max(normals, least))
+        # The errors of estimated normals are alike among neighbours, so that validation points do not show them.
+        estimated = self.scene.samples.estimated
+        least_angle = self.parameters.least_estimated_deviation if estimated else least
+        return Deviations(max(values, least * radius), max(normals, least_angle))
 
     def score(self, field: Siren, theta: Tensor) -> float:
         """Return how badly the field predicts the validation points and the sign of free space, in disk radii."""

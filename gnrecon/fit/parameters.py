@@ -19,7 +19,8 @@ class TwoLevelParameters:
     global_field_points: int = 5000  # most points that the global field is fitted to; its 1,000 units resolve no more
     validation_one_in: int = 6  # one point in so many is a validation point
     most_validation_points: int = 2000  # where the local fields are not solved by blocks; more change no choice
-    global_time_share: float = 0.25  # of the whole fit, measured, for the progress bar
+    most_refitted_points: int = 6000  # up to which the network takes its last steps on all points, see `global_field`
+    global_time_share: float = 0.4  # of the whole fit, measured, for the progress bar
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ class NetworkTermParameters:
     far_eikonal_deviation: float = 0.3  # of |grad f| in the box, where a distance has kinks
     robust_degrees_of_freedom: float = 4.0  # of Student's t distribution of the data (Lange, Little and Taylor 1989)
     least_deviation: float = 1e-3  # in disk radii and radians; below, rounding would decide
+    least_estimated_deviation: float = 0.3  # radians, of estimated normals; on the benchmark's scans 0.13 to 0.37
     least_slope: float = 0.3  # of the field along a normal, in a distance |f| / slope
     least_validation_points: int = 10  # with fewer, the seen points are scored
     wrong_sign_score: float = 100.0  # disk radii for a field that is wrong in all of free space: sheets cost most
@@ -100,6 +102,10 @@ class NetworkLadderParameters:
     patience_steps: int = 8  # without a better score
     least_gain: float = 0.01  # share of the score that a wider network must gain
     damping: float = 1e-2  # of the first step of each width
+    refit_steps: int = 12  # with the validation points, once they have chosen everything
+    refit_length: float = 0.5  # of these steps: points are drawn for each, so that shorter ones average over more
+    points_per_member: int = 2000  # a scan of a half or a third of so many seen points gets two or three networks
+    most_members: int = 4
 
     @property
     def most_steps(self) -> int:

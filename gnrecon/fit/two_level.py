@@ -12,8 +12,6 @@ exact because the field is linear in the weights (variable projection). The step
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +27,7 @@ from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.fit_summary import FitSummary, describe
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
+from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import FitParameters
 from gnrecon.fit.penalties.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.fit.shape_priors.ball_fit import BallFit
@@ -41,8 +40,6 @@ from gnrecon.geometry.signed_distance import Density
 from gnrecon.optim import Callback, Solution
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
-
-_log = logging.getLogger(__name__)
 
 
 def fit_two_level(
@@ -95,8 +92,9 @@ def fit_two_level(
     sdf, penalties = steps.apply_penalties(first, data)
     try:
         rest = subrange(advance, share, 1.0)
-        fields = [sdf] if first.other is None else [sdf, first.other]
-        sdf, detail, averaging_width = steps.fit_local(fields, data, penalties, outliers > 0, rest, folder, scheduler)
+        sdf, detail, averaging_width = steps.fit_local(
+            first, sdf, data, penalties, outliers > 0, rest, folder, scheduler
+        )
     except KeyboardInterrupt:
         status = "Interrupted before the local fields were solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
@@ -202,11 +200,13 @@ class _Steps:
         )
         if first.solution.interrupted or not outliers.any():
             return completed, first, 0
+        if data.sharp is None and not self.options.regularisers:
+            # Robust weights have kept the network from them already, so that it need not be fitted again.
+            return self._completed(data.without(outliers)), first, int(outliers.sum())
         if data.sharp is None:
-            data = data.without(outliers)
-        else:
-            scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
-            data = self._draw(scan, SharpShape.of(scan, self.parameters.shape_priors))
+            return *self._fit_global(data.without(outliers), subrange(advance, 0.5, 1.0)), int(outliers.sum())
+        scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
+        data = self._draw(scan, SharpShape.of(scan, self.parameters.shape_priors))
         return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
 
     def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, PenaltiesFor | None]:
@@ -222,7 +222,8 @@ class _Steps:
 
     def fit_local(
         self,
-        fields: Sequence[NeuralSDF],
+        first: GlobalField,
+        sdf: NeuralSDF,
         data: _Data,
         penalties: PenaltiesFor | None,
         outliers: bool,
@@ -230,33 +231,19 @@ class _Steps:
         folder: str | Path | None,
         scheduler: str | None,
     ) -> tuple[NeuralSDF, Detail, float | None]:
-        """Return the global field, the local ones, and the width of averaging for them, in disk radii, or None.
-
-        Of the global fields, that is used with which a local fit predicts the validation points best. A network that
-        follows sparse points may leave the local fields nothing to learn from.
-        """
-        options, rng, sdf = self.options, self.rng, fields[0]
+        """Return the global field, the local ones, and the width of averaging for them, in disk radii, or None."""
+        options, rng = self.options, self.rng
         if self.by_blocks:
             return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler), None
         if data.sharp is not None:
             local = LocalData.of_faces(sdf, data.sharp)
         else:
-            seed = int(rng.integers(2**32))
-            tried = [
-                choose_local_data(
-                    field,
-                    data.samples,
-                    data.held_out,
-                    options.features,
-                    np.random.default_rng(seed),  # the same patches for each field
-                    options.device,
-                    outliers=outliers,
-                )
-                for field in fields
-            ]
-            best = min(range(len(fields)), key=lambda number: tried[number].score)
-            _log.info("Scores with local fields, in disk radii: %s.", ", ".join(f"{one.score:.3g}" for one in tried))
-            sdf, local = fields[best], tried[best]
+            samples, held_out, device = data.samples, data.held_out, options.device
+            local = choose_local_data(sdf, samples, held_out, options.features, rng, device, outliers=outliers)
+            # The validation points have chosen everything, and may be fitted, too.
+            if len(samples) <= self.parameters.two_level.most_refitted_points:
+                sdf = first.refitted(data.samples)
+                local = replace(local, residuals=FieldResiduals.of(sdf, local.samples))
         limits = self.parameters.local_fields
         advance(limits.selection_time_share)
         detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=limits)
@@ -264,14 +251,17 @@ class _Steps:
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
         """Return the data with samples across holes, and the global field that is fitted to them."""
-        # A fit with curvature penalties closes holes by them.
-        completed = (
-            data if self.options.regularisers else data.across_holes(self.rng, self.parameters.shape_priors.holes)
-        )
+        completed = self._completed(data)
         seen = completed.samples, completed.held_out, completed.seen
         return completed, fit_global(
             *seen, self.options, self.rng, advance, self.callback, parameters=self.parameters.global_field
         )
+
+    def _completed(self, data: _Data) -> _Data:
+        """Return the data with samples across holes; a fit with curvature penalties closes holes by them."""
+        if self.options.regularisers:
+            return data
+        return data.across_holes(self.rng, self.parameters.shape_priors.holes)
 
     def _draw(self, scan: Samples, sharp: SharpShape | None) -> _Data:
         """Draw the validation points and those that the global field sees."""

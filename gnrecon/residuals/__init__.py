@@ -18,6 +18,7 @@ from gnrecon.residuals.constraints import (
     signed_distance,
     surface_strain,
     tangents,
+    value_range,
 )
 from gnrecon.residuals.named_residuals import named
 
@@ -40,4 +41,5 @@ __all__ = [
     "signed_distance",
     "surface_strain",
     "tangents",
+    "value_range",
 ]

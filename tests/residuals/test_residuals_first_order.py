@@ -22,6 +22,7 @@ FORMULAS: dict[str, Formula] = {
     "design_region": lambda f, _g, _t: torch.minimum(f, torch.zeros_like(f))[None],
     "free_space": lambda f, _g, t: torch.minimum(torch.sign(t) * (f - t), torch.zeros_like(f))[None],
     "signed_distance": lambda f, _g, t: (f - t)[None],
+    "value_range": lambda f, _g, t: (f - f.clamp(t[0], t[1]))[None],
     "normal_vector": lambda _f, g, t: g - t,
     "normal_projection": lambda _f, g, t: (g @ t)[None] - 1,
     "normal_cosine": lambda _f, g, t: (g @ t)[None] / g.norm() - 1,
@@ -43,6 +44,8 @@ def targets(name: str, generator: torch.Generator, count: int) -> Tensor | None:
         return None
     if name in ("signed_distance", "free_space"):
         return torch.randn(count, generator=generator, dtype=torch.float64)
+    if name == "value_range":
+        return torch.randn(count, 2, generator=generator, dtype=torch.float64).sort(dim=1).values
     normals = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     return normals / normals.norm(dim=1, keepdim=True)
 
@@ -54,6 +57,16 @@ def test_a_design_region_may_ask_for_more_than_zero() -> None:
     torch.testing.assert_close(linear.residual[:, 0], torch.tensor([-0.2, -0.2, 0.0], dtype=torch.float64))
     assert linear.by_value is not None
     assert linear.by_value[:, 0].tolist() == [1.0, 1.0, 0.0]
+
+
+def test_a_range_has_two_ends() -> None:
+    value = torch.tensor([-0.3, -0.1, 0.2, 0.5], dtype=torch.float64)
+    ends = torch.tensor([[-0.2, 0.3]], dtype=torch.float64).expand(4, 2)
+    linear = residuals.value_range(value, torch.zeros(4, 3, dtype=torch.float64), ends)
+    torch.testing.assert_close(linear.residual[:, 0], torch.tensor([-0.1, 0.0, 0.0, 0.2], dtype=torch.float64))
+    assert linear.by_value is not None
+    assert linear.by_value[:, 0].tolist() == [1.0, 0.0, 0.0, 1.0]
+    assert linear.by_gradient is None
 
 
 def test_free_space_has_two_sides() -> None:
@@ -101,7 +114,7 @@ def test_an_exact_distance_has_no_residual(name: str, seed: int) -> None:
     normals = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     normals = normals / normals.norm(dim=1, keepdim=True)
     distance = torch.zeros(20, dtype=torch.float64)
-    if name in ("signed_distance", "free_space", "eikonal"):
+    if name in ("signed_distance", "free_space", "value_range", "eikonal"):
         distance = torch.rand(20, generator=generator, dtype=torch.float64) - 0.2
     x = (center + (radius + distance)[:, None] * normals).requires_grad_()
     value = (x - center).norm(dim=1) - radius
@@ -109,6 +122,7 @@ def test_an_exact_distance_has_no_residual(name: str, seed: int) -> None:
     known = dict.fromkeys(("interface", "design_region", "eikonal"), None) | dict.fromkeys(
         ("signed_distance", "free_space"), distance
     )
+    known["value_range"] = torch.stack([distance - 0.05, distance + 0.05], dim=1)
     target = known.get(name, normals)
     residual = by_name(name)(value.detach(), gradient, target).residual
     torch.testing.assert_close(residual, torch.zeros_like(residual), rtol=0, atol=1e-12)

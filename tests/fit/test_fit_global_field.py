@@ -1,0 +1,188 @@
+"""The global network by Gauss-Newton: what its steps lower, what outliers and wrong signs do to it, and its size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gnrecon.field.networks import Siren
+from gnrecon.fit import FitOptions, fit
+from gnrecon.fit import network_ladder as ladders
+from gnrecon.fit.global_field import GlobalField, fit_global
+from gnrecon.fit.initialisation import random_network
+from gnrecon.fit.network_ladder import NetworkLadder
+from gnrecon.fit.network_terms import Deviations, NetworkTerms
+from gnrecon.fit.objective import Scene
+from gnrecon.fit.parameters import GlobalFieldParameters, NetworkLadderParameters, NetworkTermParameters
+from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.optim import Record
+
+FRAME = Frame(np.array([1.0, 2.0, 3.0]), 2.0)
+TWO_WIDTHS = GlobalFieldParameters(ladder=NetworkLadderParameters(widths=(12, 16), most_members=1))
+
+
+def capsule(count: int, seed: int) -> Samples:
+    """Points of a capsule: all within 0.3 of the axis from -0.5 to 0.5."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((count, 3))
+    x *= 0.3 / np.linalg.norm(x, axis=1, keepdims=True)
+    normals = x / 0.3
+    # The round ends have as much area as a cylinder of length 0.6, to which one of length 1 is added.
+    along = rng.random(count) < 1 / 1.6
+    ring = normals[along, :2] / np.linalg.norm(normals[along, :2], axis=1, keepdims=True)
+    normals[along] = np.column_stack([ring, np.zeros(len(ring))])
+    x[along] = 0.3 * normals[along] + np.column_stack([np.zeros((len(ring), 2)), rng.uniform(-0.5, 0.5, len(ring))])
+    x[~along, 2] += 0.5 * np.sign(x[~along, 2])
+    return Samples(x, normals, FRAME)
+
+
+def distance(x: Float) -> Float:
+    axis = np.zeros_like(x)
+    axis[:, 2] = x[:, 2].clip(-0.5, 0.5)
+    return np.asarray(np.linalg.norm(x - axis, axis=1) - 0.3)
+
+
+def held_out(samples: Samples) -> Mask:
+    mask = np.zeros(len(samples), dtype=bool)
+    mask[::6] = True
+    return mask
+
+
+def fitted(samples: Samples, parameters: GlobalFieldParameters, records: list[Record] | None = None) -> GlobalField:
+    out = held_out(samples)
+    rows = np.flatnonzero(~out)
+    callback = None if records is None else records.append
+    rng = np.random.default_rng(3)
+    return fit_global(samples, out, rows, FitOptions(), rng, lambda share: None, callback, parameters=parameters)
+
+
+@pytest.fixture(scope="module")
+def network() -> tuple[GlobalField, list[Record]]:
+    records: list[Record] = []
+    return fitted(capsule(900, 0), TWO_WIDTHS, records), records
+
+
+def test_steps_are_recorded_with_the_eikonal_residual(network: tuple[GlobalField, list[Record]]) -> None:
+    found, records = network
+    assert found.ladder is not None, "the network is better than the linear field"
+    assert tuple(records) == found.solution.history
+    assert [record.step for record in records] == list(range(1, len(records) + 1))
+    assert all(0 < a.seconds < b.seconds for a, b in zip(records, records[1:], strict=False))
+    first, last = records[0].eikonal, records[-1].eikonal
+    assert first is not None
+    assert last is not None
+    assert last < 0.1
+    assert last < 0.3 * first
+
+
+def test_the_field_is_a_distance_whose_sign_is_right_in_all_of_the_box(
+    network: tuple[GlobalField, list[Record]],
+) -> None:
+    sdf = network[0].sdf
+    x = sdf.box.sample(20_000, np.random.default_rng(1))
+    value = sdf.sdf(FRAME.to_world(x)) / FRAME.scale
+    clear = np.abs(distance(x)) > 0.03
+    assert (value * distance(x) > 0)[clear].all()
+    truth = capsule(2000, 5)
+    value, gradient = sdf.sdf_and_gradient(FRAME.to_world(truth.points))
+    assert np.abs(value).mean() / FRAME.scale < 3e-3
+    assert np.linalg.norm(gradient - truth.normals, axis=1).mean() < 0.1
+
+
+def test_steps_on_all_points_come_nearer_to_those_left_out(network: tuple[GlobalField, list[Record]]) -> None:
+    samples = capsule(900, 0)
+    left = samples.points[held_out(samples)]
+
+    def missed(sdf: object) -> float:
+        return float(np.abs(sdf.sdf(FRAME.to_world(left))).mean())  # type: ignore[attr-defined]
+
+    assert missed(network[0].refitted(samples)) < missed(network[0].sdf)
+
+
+def test_outliers_and_contradicting_normals_lose_their_weight() -> None:
+    clean, rng = capsule(900, 0), np.random.default_rng(2)
+    wrong = rng.permutation(900)[:45]
+    points, normals = clean.points.copy(), clean.normals.copy()
+    points[wrong] += 0.1 * normals[wrong]
+    normals[wrong] *= -1
+    truth = capsule(2000, 5).points
+
+    def off(parameters: GlobalFieldParameters) -> float:
+        sdf = fitted(replace(clean, points=points, normals=normals), parameters).sdf
+        return float(np.abs(sdf.sdf(FRAME.to_world(truth))).mean()) / FRAME.scale
+
+    least_squares = replace(TWO_WIDTHS, terms=NetworkTermParameters(robust_degrees_of_freedom=1e6))
+    assert off(TWO_WIDTHS) < 0.7 * off(least_squares)
+
+
+def terms_of(samples: Samples, rng: np.random.Generator) -> NetworkTerms:
+    out = held_out(samples)
+    seen = replace(samples, points=samples.points[~out], normals=samples.normals[~out])
+    return NetworkTerms.draw(Scene.of(seen, "cpu", rng), samples.points[out], samples.normals[out], rng)
+
+
+def test_free_space_is_drawn_where_the_field_is_wrong(rng: np.random.Generator) -> None:
+    terms = terms_of(capsule(600, 0), rng)
+    field = Siren((8, 8))
+    theta = random_network(field, rng, terms.scene.points)
+    flat = theta.clone()
+    flat[-1] = 0.5  # positive everywhere: wrong inside alone
+    problem = terms.problem(field, flat, Deviations(0.01, 0.1), rng)
+    (free,) = (term for term in problem.terms if term.name == "free space")
+    x = free.points.numpy()
+    inside = distance(x) < 0
+    wrong = len(x) - min(len(terms.scene.points), len(terms.volume))
+    assert 0 < wrong <= inside.sum()
+    assert inside.mean() > 1.3 * (terms.distances < 0).double().mean().item()
+    least, most = free.target.T.numpy()  # type: ignore[union-attr]
+    assert (least < most).all()
+    assert (np.sign(least) == np.sign(distance(x))).all()
+    again = terms.with_wrong_signs(field, flat, rng)
+    assert len(again.volume) > len(terms.volume)
+    assert (distance(again.volume[len(terms.volume) :].numpy()) < 0).all()
+
+
+def test_the_noise_of_the_data_is_that_of_the_validation_points(rng: np.random.Generator) -> None:
+    exact = capsule(3000, 0)
+    noisy = replace(exact, points=exact.points + 0.02 * rng.standard_normal((3000, 1)) * exact.normals)
+    terms = replace(terms_of(noisy, rng), points=torch.as_tensor(noisy.points), normals=torch.as_tensor(noisy.normals))
+    terms = replace(terms, parameters=NetworkTermParameters(least_deviation=1e-9))
+    field = fitted(exact, TWO_WIDTHS).sdf
+    assert terms.noise(field.field, field.theta).values == pytest.approx(0.02, rel=0.1)
+
+
+def test_sparse_points_get_several_small_networks_and_dense_ones_one(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    made: list[tuple[int, ...]] = []
+
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> ladders.Solution:
+        del self, steps
+        made.append(field.widths)
+        return ladders.Solution(theta, "", ())
+
+    monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
+    monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0 / (1 + len(made)))
+    parameters = NetworkLadderParameters(widths=(4, 24, 32), points_per_member=600, most_members=4)
+    NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, None, parameters).fit()
+    assert made == [(4,) * 3] * 2, "1,321 parameters are more than the 1,200 rows of 300 points"
+    made.clear()
+    NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, None, parameters).fit()
+    assert made == [(4,) * 3, (24,) * 3, (32,) * 3]
+
+
+def test_an_interrupt_during_the_steps_keeps_the_network_so_far() -> None:
+    def interrupting(record: Record) -> None:
+        if record.step == 3:
+            raise KeyboardInterrupt
+
+    sdf, solution = fit(capsule(900, 0), FitOptions(), interrupting)
+    assert solution.interrupted
+    assert sdf.detail is None
+    assert len(solution.history) == 3
+    assert "Interrupted" in solution.status
+    assert "global field alone" in solution.status
