@@ -1,8 +1,8 @@
 """Larger sine networks of known functions: a network with more units, and the mean of several networks.
 
-*Widening* (`widened`) adds units to every hidden layer, and the function stays the same. New units have random incoming weights, and outgoing weights of zero to all units that were there before. The function
-is therefore unchanged, but its derivatives by the new outgoing weights are not zero, so that Gauss-Newton uses the new
-units from its first step on.
+*Widening* (`widened`) adds units to every hidden layer, and the function stays the same. New units have random incoming
+weights, and outgoing weights of zero to all units that were there before. The function is therefore unchanged, but its
+derivatives by the new outgoing weights are not zero, so that Gauss-Newton uses the new units from its first step on.
 Source: Chen, Goodfellow and Shlens, *Net2Net: Accelerating Learning via Knowledge Transfer* (2016), with new units in
 place of copies, which a second-order method would leave equal.
 

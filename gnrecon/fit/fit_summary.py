@@ -27,6 +27,7 @@ class FitSummary:
     edge_samples : samples that extend faces to their sharp edges, or None of a shape without sharp edges
     hole_samples, holes : samples that extend planes and cylinders across holes, and the number of holes
     regularisers : curvature penalties that were applied
+    steps : of Gauss-Newton that made the global field, or none of a linear one
     """
 
     cubes: int
@@ -45,6 +46,7 @@ class FitSummary:
     hole_samples: int = 0
     holes: int = 0
     regularisers: tuple[Regulariser, ...] = ()
+    steps: int = 0
 
 
 def describe(summary: FitSummary) -> str:
@@ -53,7 +55,8 @@ def describe(summary: FitSummary) -> str:
 
 
 def _solved(summary: FitSummary) -> Iterator[str]:
-    yield f"Fitted a global field and {_counted(summary.cubes, 'local field')} by linear least squares."
+    by_steps = f" by {_counted(summary.steps, 'Gauss-Newton step')}," if summary.steps else ""
+    yield f"Fitted a global field{by_steps} and {_counted(summary.cubes, 'local field')} by linear least squares."
     if summary.edge_samples is None:
         yield (
             f"Chosen from the data: length scale {summary.length:.3g}, noise {summary.position_noise:.2g} in position "

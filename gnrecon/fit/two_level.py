@@ -1,13 +1,14 @@
 """The default fit: a smooth global field, and local fields that correct it near the data.
 
-Both are sums of sine features whose output weights solve linear least-squares problems: one Gauss-Newton step, which is
-exact because the field is linear in the weights (variable projection). The steps, in the order of `fit_two_level`:
+The global field is a sine network that Gauss-Newton fits with an eikonal term. The local fields are sums of sine
+features whose output weights solve linear least-squares problems. The steps, in the order of `fit_two_level`:
 
 1. Prepare the data: snap a ball, turn contradicted normals around, extend faces to sharp edges and across holes.
-2. Fit the global field (`global_field`), without validation points; leave out outliers and fit it again.
+2. Fit the global field (`global_field`), without validation points; leave out outliers.
 3. Apply the curvature penalties, if any, to the global field (`penalties`).
-4. Choose length scale and noise on the validation points (`denoising`, `model_selection`), then fit the local fields
-   (`local_fields`), or those of a large scan by blocks (`blocks.solve`).
+4. Choose length scale and noise on the validation points (`denoising`, `model_selection`).
+5. Take the network's last steps on all points, if they are few, then fit the local fields (`local_fields`), or those of
+   a large scan by blocks (`blocks.solve`).
 """
 
 from __future__ import annotations
@@ -102,6 +103,7 @@ def fit_two_level(
         _summary(detail, data, options),
         flipped_share=flipped_share,
         outliers=outliers,
+        steps=0 if first.ladder is None else len(first.solution.history),
         averaging_width=averaging_width,
         ball_radius=None if ball is None else ball.radius,
         ball_points=len(samples),

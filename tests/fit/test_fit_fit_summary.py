@@ -13,6 +13,13 @@ def test_a_plain_fit_says_what_was_solved_and_chosen() -> None:
     )
 
 
+def test_a_network_says_by_how_many_steps() -> None:
+    summary = FitSummary(cubes=2, length=0.25, position_noise=0.01, angle_noise=2.0, steps=45)
+    assert describe(summary).startswith(
+        "Fitted a global field by 45 Gauss-Newton steps, and 2 local fields by linear least squares."
+    )
+
+
 def test_each_step_that_did_something_has_a_sentence() -> None:
     summary = FitSummary(
         cubes=1,

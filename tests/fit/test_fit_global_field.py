@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from gnrecon.fit.parameters import GlobalFieldParameters, NetworkLadderParameter
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.optim import Record
+from gnrecon.runtime.progress import ignore_progress
 
 FRAME = Frame(np.array([1.0, 2.0, 3.0]), 2.0)
 TWO_WIDTHS = GlobalFieldParameters(ladder=NetworkLadderParameters(widths=(12, 16), most_members=1))
@@ -57,7 +59,7 @@ def fitted(samples: Samples, parameters: GlobalFieldParameters, records: list[Re
     rows = np.flatnonzero(~out)
     callback = None if records is None else records.append
     rng = np.random.default_rng(3)
-    return fit_global(samples, out, rows, FitOptions(), rng, lambda share: None, callback, parameters=parameters)
+    return fit_global(samples, out, rows, FitOptions(), rng, ignore_progress, callback, parameters=parameters)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,7 @@ def test_steps_are_recorded_with_the_eikonal_residual(network: tuple[GlobalField
     assert found.ladder is not None, "the network is better than the linear field"
     assert tuple(records) == found.solution.history
     assert [record.step for record in records] == list(range(1, len(records) + 1))
-    assert all(0 < a.seconds < b.seconds for a, b in zip(records, records[1:], strict=False))
+    assert all(0 < a.seconds < b.seconds for a, b in itertools.pairwise(records))
     first, last = records[0].eikonal, records[-1].eikonal
     assert first is not None
     assert last is not None
