@@ -40,7 +40,7 @@ class FitOptions:
         Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
         point from 1,000 to 2,000, and of one for four points from there to 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
-        Features of each local field: 300, 600 or 1,000.
+        Features of each local field: 300, 600 or 1,000. A draft's global network has the smallest width alone.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
         Residual of the given normals; see `gnrecon.residuals.constraints`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
@@ -120,7 +120,7 @@ class FitOptions:
         docs/research/2026-11-21-one-wide-layer.md), so that by default the exact linear solve is left as it is.
         """
         if self.adaptive:
-            return 0 if self.regularisers else NetworkLadderParameters().most_steps
+            return 0 if self.regularisers else NetworkLadderParameters().for_quality(self.quality).most_steps
         if self.steps is not None:
             return self.steps
         if self.optimiser == "adam":

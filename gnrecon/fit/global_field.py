@@ -19,7 +19,7 @@ from gnrecon.fit.linear_field import fit_linear
 from gnrecon.fit.network_ladder import NetworkLadder
 from gnrecon.fit.network_terms import NetworkTerms
 from gnrecon.fit.objective import Scene
-from gnrecon.fit.parameters import GlobalFieldParameters
+from gnrecon.fit.parameters import GlobalFieldParameters, NetworkLadderParameters
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
@@ -96,10 +96,11 @@ def fit_global(
         return first
     points, normals = samples.points[held_out], samples.normals[held_out]
     terms = NetworkTerms.draw(scene, points, normals, rng, parameters=parameters.terms)
-    step = _counted(callback, subrange(advance, share, 1.0), parameters)
-    ladder = NetworkLadder(terms, options, rng, step, parameters.ladder)
-    field, solution, score = ladder.fit()
     linear_score = terms.score(linear.sdf.field, linear.sdf.theta)
+    widths = parameters.ladder.for_quality(options.quality)
+    step = _counted(callback, subrange(advance, share, 1.0), widths)
+    ladder = NetworkLadder(terms, options, rng, step, linear_score, widths)
+    field, solution, score = ladder.fit()
     _log.info("Score of the validation points: linear field %.3g, network %.3g disk radii.", linear_score, score)
     if linear_score < score and not solution.interrupted:
         return replace(first, solution=replace(linear.solution, history=solution.history))
@@ -107,11 +108,11 @@ def fit_global(
     return GlobalField(sdf, solution, scene, linear.length, ladder)
 
 
-def _counted(callback: Callback | None, advance: ProgressCallback, parameters: GlobalFieldParameters) -> Callback:
+def _counted(callback: Callback | None, advance: ProgressCallback, parameters: NetworkLadderParameters) -> Callback:
     """Return a callback that also advances the progress, by each step's share of the most steps."""
 
     def step(record: Record) -> None:
-        advance(min(record.step / parameters.ladder.most_steps, 1.0))
+        advance(min(record.step / parameters.most_steps, 1.0))
         if callback is not None:
             callback(record)
 

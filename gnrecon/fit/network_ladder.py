@@ -42,12 +42,14 @@ class NetworkLadder:
     options : of which the device and the residual of the normals are used at the start
     rng : draws the start, new units and the rows of each step
     callback : called with the record of each step
+    rival : score of the field that is used instead where it is better; then no more networks are fitted
     """
 
     terms: NetworkTerms
     options: FitOptions
     rng: np.random.Generator
     callback: Callback | None = None
+    rival: float = np.inf
     parameters: NetworkLadderParameters = NetworkLadderParameters()
 
     def __post_init__(self) -> None:
@@ -67,7 +69,7 @@ class NetworkLadder:
         found = []
         for _ in range(min(max(round(points), 1), self.parameters.most_members)):
             found.append(self.climb())
-            if found[-1][1].interrupted:
+            if found[-1][1].interrupted or found[-1][2] > self.rival:
                 break
         found.sort(key=lambda member: member[2])
         members = [found[0]]
@@ -119,7 +121,7 @@ class NetworkLadder:
         solution = self._fitted(field, theta, self.parameters.first_steps)
         best = field, solution, self.terms.score(field, solution.theta)
         for width in widths[1:]:
-            if solution.interrupted:
+            if solution.interrupted or best[2] > self.parameters.hopeless_ratio * self.rival:
                 break
             self.terms = self.terms.with_wrong_signs(field, solution.theta, rng)
             frequency = InitialisationParameters.first_layer_frequency

@@ -170,10 +170,10 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
     monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0 / (1 + len(made)))
     parameters = NetworkLadderParameters(widths=(4, 24, 32), points_per_member=600, most_members=4)
-    NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, None, parameters).fit()
+    NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, parameters=parameters).fit()
     assert made == [(4,) * 3] * 2, "1,321 parameters are more than the 1,200 rows of 300 points"
     made.clear()
-    NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, None, parameters).fit()
+    NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, parameters=parameters).fit()
     assert made == [(4,) * 3, (24,) * 3, (32,) * 3]
 
 
