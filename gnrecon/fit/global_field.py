@@ -65,6 +65,7 @@ def fit_global(
     advance: ProgressCallback,
     callback: Callback | None = None,
     *,
+    linear_only: bool = False,
     parameters: GlobalFieldParameters = GlobalFieldParameters(),
 ) -> GlobalField:
     """Fit the smooth field to some of the samples.
@@ -78,6 +79,8 @@ def fit_global(
     rng : draws features, units and samples of the volume
     advance : called with the share that is done
     callback : called with the record of each step of Gauss-Newton
+    linear_only : whether the linear field is wanted: as the start of curvature penalties, or for samples that cover the
+        faces of a sharp shape, which leave a network nothing to predict
     parameters : of the linear field and of the network
 
     Raises
@@ -87,16 +90,19 @@ def fit_global(
     """
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
-    share = parameters.linear_time_share if not options.regularisers else 1.0
+    share = 1.0 if linear_only else parameters.linear_time_share
     linear = fit_linear(
         samples, held_out, scene, options, rng, subrange(advance, 0.0, share), parameters=parameters.linear
     )
     first = GlobalField(linear.sdf, linear.solution, scene, linear.length)
-    if options.regularisers:
+    if linear_only:
         return first
     points, normals = samples.points[held_out], samples.normals[held_out]
     terms = NetworkTerms.draw(scene, points, normals, rng, parameters=parameters.terms)
     linear_score = terms.score(linear.sdf.field, linear.sdf.theta)
+    if linear_score < parameters.exact_score:
+        _log.info("The linear field predicts the validation points: %.3g disk radii.", linear_score)
+        return first
     widths = parameters.ladder.for_quality(options.quality)
     step = _counted(callback, subrange(advance, share, 1.0), widths)
     ladder = NetworkLadder(terms, options, rng, step, linear_score, widths)

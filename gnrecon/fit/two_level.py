@@ -256,7 +256,13 @@ class _Steps:
         completed = self._completed(data)
         seen = completed.samples, completed.held_out, completed.seen
         return completed, fit_global(
-            *seen, self.options, self.rng, advance, self.callback, parameters=self.parameters.global_field
+            *seen,
+            self.options,
+            self.rng,
+            advance,
+            self.callback,
+            linear_only=bool(self.options.regularisers) or completed.sharp is not None,
+            parameters=self.parameters.global_field,
         )
 
     def _completed(self, data: _Data) -> _Data:
