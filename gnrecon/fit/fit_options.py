@@ -40,7 +40,7 @@ class FitOptions:
         Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
         point from 1,000 to 2,000, and of one for four points from there to 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
-        Features of each local field: 300, 600 or 1,000. A draft's global network has the smallest width alone.
+        Features of each local field: 300, 600 or 1,000. In high quality, the global field is a network by Gauss-Newton.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
         Residual of the given normals; see `gnrecon.residuals.constraints`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``
@@ -104,6 +104,11 @@ class FitOptions:
         return not one and self.optimiser == "gn" and self.normals == "vector"
 
     @property
+    def fits_network(self) -> bool:
+        """Whether the default fit's global field is a network: in high quality, without curvature penalties."""
+        return self.adaptive and self.quality == "high" and not self.regularisers
+
+    @property
     def regularisers(self) -> tuple[Regulariser, ...]:
         """The curvature penalties."""
         return regularisers(self.smooth, self.fill, self.prior)
@@ -120,7 +125,7 @@ class FitOptions:
         docs/research/2026-11-21-one-wide-layer.md), so that by default the exact linear solve is left as it is.
         """
         if self.adaptive:
-            return 0 if self.regularisers else NetworkLadderParameters().for_quality(self.quality).most_steps
+            return NetworkLadderParameters().most_steps if self.fits_network else 0
         if self.steps is not None:
             return self.steps
         if self.optimiser == "adam":

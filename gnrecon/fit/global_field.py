@@ -1,9 +1,10 @@
-"""The smooth global field: a sine network by Gauss-Newton with eikonal regularisation.
+"""The smooth global field: one linear layer of sine features or, in high quality, a sine network by Gauss-Newton.
 
-A linear field is solved first (`linear_field`), then a network of several layers is fitted (`network_ladder`) to the
-terms of `network_terms`. The one that predicts the validation points and the sign of free space better is the global
-field: nearly always the network. A thin wall that sparse points hardly show may be lost on its way, and then the linear
-field remains. With curvature penalties the global field is the linear one, on which they are then minimised.
+A linear field is solved first (`linear_field`). In high quality a network of several layers is then fitted
+(`network_ladder`) to the terms of `network_terms`, with eikonal regularisation. The one that predicts the validation
+points and the sign of free space better is the global field: on organic scans the network. A thin wall that sparse
+points hardly show may be lost on its way, and then the linear field remains. With curvature penalties the global field
+is the linear one, on which they are then minimised.
 """
 
 from __future__ import annotations
@@ -79,8 +80,8 @@ def fit_global(
     rng : draws features, units and samples of the volume
     advance : called with the share that is done
     callback : called with the record of each step of Gauss-Newton
-    linear_only : whether the linear field is wanted: as the start of curvature penalties, or for samples that cover the
-        faces of a sharp shape, which leave a network nothing to predict
+    linear_only : whether the linear field is wanted: for speed, as the start of curvature penalties, or for samples
+        that cover the faces of a sharp shape, which leave a network nothing to predict
     parameters : of the linear field and of the network
 
     Raises
@@ -103,9 +104,8 @@ def fit_global(
     if linear_score < parameters.exact_score:
         _log.info("The linear field predicts the validation points: %.3g disk radii.", linear_score)
         return first
-    widths = parameters.ladder.for_quality(options.quality)
-    step = _counted(callback, subrange(advance, share, 1.0), widths)
-    ladder = NetworkLadder(terms, options, rng, step, linear_score, widths)
+    step = _counted(callback, subrange(advance, share, 1.0), parameters.ladder)
+    ladder = NetworkLadder(terms, options, rng, step, linear_score, parameters.ladder)
     field, solution, score = ladder.fit()
     _log.info("Score of the validation points: linear field %.3g, network %.3g disk radii.", linear_score, score)
     if linear_score < score and not solution.interrupted:

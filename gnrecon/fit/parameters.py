@@ -7,7 +7,7 @@ shapes of docs/benchmarks.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from gnrecon.fit.shape_priors.prior_parameters import BallFitParameters, ShapePriorParameters
 
@@ -107,10 +107,6 @@ class NetworkLadderParameters:
     points_per_member: int = 2000  # a scan of a half or a third of so many seen points gets two or three networks
     most_members: int = 4
     hopeless_ratio: float = 2.0  # of the first width's score and the linear field's, above which no wider one is tried
-
-    def for_quality(self, quality: str) -> NetworkLadderParameters:
-        """Return the parameters of a quality: a draft has the first width alone, of one network."""
-        return replace(self, widths=self.widths[:1], most_members=1) if quality == "draft" else self
 
     @property
     def most_steps(self) -> int:

@@ -1,14 +1,14 @@
 """The default fit: a smooth global field, and local fields that correct it near the data.
 
-The global field is a sine network that Gauss-Newton fits with an eikonal term. The local fields are sums of sine
-features whose output weights solve linear least-squares problems. The steps, in the order of `fit_two_level`:
+Both are sums of sine features whose output weights solve linear least-squares problems. In high quality the global
+field is a sine network that Gauss-Newton fits with an eikonal term. The steps, in the order of `fit_two_level`:
 
 1. Prepare the data: snap a ball, turn contradicted normals around, extend faces to sharp edges and across holes.
 2. Fit the global field (`global_field`), without validation points; leave out outliers.
 3. Apply the curvature penalties, if any, to the global field (`penalties`).
 4. Choose length scale and noise on the validation points (`denoising`, `model_selection`).
-5. Take the network's last steps on all points, if they are few, then fit the local fields (`local_fields`), or those of
-   a large scan by blocks (`blocks.solve`).
+5. In high quality, take the network's last steps on all points, if they are few. Then fit the local fields
+   (`local_fields`), or those of a large scan by blocks (`blocks.solve`).
 """
 
 from __future__ import annotations
@@ -109,7 +109,8 @@ def fit_two_level(
         ball_points=len(samples),
         ball_samples=0 if ball is None else len(ball.samples) - len(samples),
     )
-    solution = replace(first.solution, status=describe(summary))
+    method = "Exact linear least squares." if first.ladder is None else first.solution.method
+    solution = replace(first.solution, status=describe(summary), method=method)
     return replace(sdf, detail=detail), solution
 
 
@@ -202,7 +203,7 @@ class _Steps:
         )
         if first.solution.interrupted or not outliers.any():
             return completed, first, 0
-        if data.sharp is None and not self.options.regularisers:
+        if data.sharp is None and first.ladder is not None:
             # Robust weights have kept the network from them already, so that it need not be fitted again.
             return self._completed(data.without(outliers)), first, int(outliers.sum())
         if data.sharp is None:
@@ -243,7 +244,7 @@ class _Steps:
             samples, held_out, device = data.samples, data.held_out, options.device
             local = choose_local_data(sdf, samples, held_out, options.features, rng, device, outliers=outliers)
             # The validation points have chosen everything, and may be fitted, too.
-            if len(samples) <= self.parameters.two_level.most_refitted_points:
+            if first.ladder is not None and len(samples) <= self.parameters.two_level.most_refitted_points:
                 sdf = first.refitted(data.samples)
                 local = replace(local, residuals=FieldResiduals.of(sdf, local.samples))
         limits = self.parameters.local_fields
@@ -261,7 +262,7 @@ class _Steps:
             self.rng,
             advance,
             self.callback,
-            linear_only=bool(self.options.regularisers) or completed.sharp is not None,
+            linear_only=not self.options.fits_network or completed.sharp is not None,
             parameters=self.parameters.global_field,
         )
 

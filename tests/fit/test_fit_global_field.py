@@ -182,9 +182,18 @@ def test_an_interrupt_during_the_steps_keeps_the_network_so_far() -> None:
         if record.step == 3:
             raise KeyboardInterrupt
 
-    sdf, solution = fit(capsule(900, 0), FitOptions(), interrupting)
+    sdf, solution = fit(capsule(900, 0), FitOptions(quality="high"), interrupting)
     assert solution.interrupted
     assert sdf.detail is None
     assert len(solution.history) == 3
     assert "Interrupted" in solution.status
     assert "global field alone" in solution.status
+
+
+def test_high_quality_fits_a_network_and_says_so() -> None:
+    _, solution = fit(capsule(900, 0), FitOptions(quality="high"))
+    assert f"by {len(solution.history)} Gauss-Newton steps" in solution.status
+    assert all(record.eikonal is not None for record in solution.history)
+    _, linear = fit(capsule(900, 0), FitOptions())
+    assert linear.history == ()
+    assert FitOptions(quality="high").steps_for(900) >= len(solution.history) > 0 == FitOptions().steps_for(900)
