@@ -125,7 +125,8 @@ class FitOptions:
         docs/research/2026-11-21-one-wide-layer.md), so that by default the exact linear solve is left as it is.
         """
         if self.adaptive:
-            return NetworkLadderParameters().most_steps if self.fits_network else 0
+            # One point in six is left out for validation.
+            return NetworkLadderParameters().most_steps(points - points // 6) if self.fits_network else 0
         if self.steps is not None:
             return self.steps
         if self.optimiser == "adam":

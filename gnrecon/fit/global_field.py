@@ -1,7 +1,7 @@
 """The smooth global field: one linear layer of sine features or, in high quality, a sine network by Gauss-Newton.
 
 A linear field is solved first (`linear_field`). In high quality a network of several layers is then fitted
-(`network_ladder`) to the terms of `network_terms`, with eikonal regularisation. The one that predicts the validation
+(`global_network`) with eikonal regularisation. The one that predicts the validation
 points and the sign of free space better is the global field: on organic scans the network. A thin wall that sparse
 points hardly show may be lost on its way, and then the linear field remains. With curvature penalties the global field
 is the linear one, on which they are then minimised.
@@ -16,11 +16,10 @@ import numpy as np
 
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.global_network import NetworkLadder, NetworkTerms
 from gnrecon.fit.linear_field import fit_linear
-from gnrecon.fit.network_ladder import NetworkLadder
-from gnrecon.fit.network_terms import NetworkTerms
 from gnrecon.fit.objective import Scene
-from gnrecon.fit.parameters import GlobalFieldParameters, NetworkLadderParameters
+from gnrecon.fit.parameters import GlobalFieldParameters
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
@@ -104,7 +103,7 @@ def fit_global(
     if linear_score < parameters.exact_score:
         _log.info("The linear field predicts the validation points: %.3g disk radii.", linear_score)
         return first
-    step = _counted(callback, subrange(advance, share, 1.0), parameters.ladder)
+    step = _counted(callback, subrange(advance, share, 1.0), parameters.ladder.most_steps(len(scene.points)))
     ladder = NetworkLadder(terms, options, rng, step, linear_score, parameters.ladder)
     field, solution, score = ladder.fit()
     _log.info("Score of the validation points: linear field %.3g, network %.3g disk radii.", linear_score, score)
@@ -114,11 +113,11 @@ def fit_global(
     return GlobalField(sdf, solution, scene, linear.length, ladder)
 
 
-def _counted(callback: Callback | None, advance: ProgressCallback, parameters: NetworkLadderParameters) -> Callback:
+def _counted(callback: Callback | None, advance: ProgressCallback, most_steps: int) -> Callback:
     """Return a callback that also advances the progress, by each step's share of the most steps."""
 
     def step(record: Record) -> None:
-        advance(min(record.step / parameters.most_steps, 1.0))
+        advance(min(record.step / most_steps, 1.0))
         if callback is not None:
             callback(record)
 

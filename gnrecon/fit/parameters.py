@@ -70,7 +70,7 @@ class LinearFieldParameters:
 
 @dataclass(frozen=True)
 class NetworkTermParameters:
-    """The rows of the global network's Gauss-Newton steps (`fit.network_terms`)."""
+    """The rows of the global network's Gauss-Newton steps (`fit.global_network`)."""
 
     data_rows: int = 2500  # most points of a step; free space has as many samples, and the eikonal residual half
     pool_samples: int = 20_000  # of free space, of which each step draws a part
@@ -93,7 +93,7 @@ class NetworkTermParameters:
 
 @dataclass(frozen=True)
 class NetworkLadderParameters:
-    """The widths of the global network, and its steps (`fit.network_ladder`)."""
+    """The widths of the global network, and its steps (`fit.global_network`)."""
 
     depth: int = 3  # hidden layers
     widths: tuple[int, ...] = (16, 24, 32)
@@ -108,10 +108,13 @@ class NetworkLadderParameters:
     most_members: int = 4
     hopeless_ratio: float = 2.0  # of the first width's score and the linear field's, above which no wider one is tried
 
-    @property
-    def most_steps(self) -> int:
-        """Steps of the whole ladder."""
-        return self.first_steps + (len(self.widths) - 1) * self.steps
+    def members(self, points: int) -> int:
+        """Return how many networks are fitted to so many seen points."""
+        return min(max(round(self.points_per_member / max(points, 1)), 1), self.most_members)
+
+    def most_steps(self, points: int) -> int:
+        """Return the most steps for so many seen points, of all networks."""
+        return self.members(points) * (self.first_steps + (len(self.widths) - 1) * self.steps)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,10 @@ import torch
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit import network_ladder as ladders
+from gnrecon.fit import global_network as networks
 from gnrecon.fit.global_field import GlobalField, fit_global
+from gnrecon.fit.global_network import Deviations, NetworkLadder, NetworkTerms
 from gnrecon.fit.initialisation import random_network
-from gnrecon.fit.network_ladder import NetworkLadder
-from gnrecon.fit.network_terms import Deviations, NetworkTerms
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import GlobalFieldParameters, NetworkLadderParameters, NetworkTermParameters
 from gnrecon.geometry.arrays import Float, Mask
@@ -162,10 +161,10 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
 ) -> None:
     made: list[tuple[int, ...]] = []
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> ladders.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> networks.Solution:
         del self, steps
         made.append(field.widths)
-        return ladders.Solution(theta, "", ())
+        return networks.Solution(theta, "", ())
 
     monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
     monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0 / (1 + len(made)))
