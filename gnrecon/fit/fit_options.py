@@ -126,7 +126,7 @@ class FitOptions:
         """
         if self.adaptive:
             # One point in six is left out for validation.
-            return NetworkLadderParameters().most_steps(points - points // 6) if self.fits_network else 0
+            return network_steps(points - points // 6) if self.fits_network else 0
         if self.steps is not None:
             return self.steps
         if self.optimiser == "adam":
@@ -171,3 +171,14 @@ def normal_residual(name: str) -> Residual:
     if isinstance(residual, SecondOrder):
         raise UsageError(f"The residual {name!r} needs second derivatives, so that it cannot be that of normals.")
     return residual
+
+
+def network_count(points: int, *, parameters: NetworkLadderParameters = NetworkLadderParameters()) -> int:
+    """Return how many global networks are fitted to so many seen points; their mean is used."""
+    return min(max(round(parameters.points_per_member / max(points, 1)), 1), parameters.most_members)
+
+
+def network_steps(points: int, *, parameters: NetworkLadderParameters = NetworkLadderParameters()) -> int:
+    """Return the most steps of all global networks of so many seen points."""
+    each = parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
+    return network_count(points, parameters=parameters) * each

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.fit_options import FitOptions, network_steps
 from gnrecon.fit.global_network import NetworkLadder, NetworkTerms
 from gnrecon.fit.linear_field import fit_linear
 from gnrecon.fit.objective import Scene
@@ -103,7 +103,9 @@ def fit_global(
     if linear_score < parameters.exact_score:
         _log.info("The linear field predicts the validation points: %.3g disk radii.", linear_score)
         return first
-    step = _counted(callback, subrange(advance, share, 1.0), parameters.ladder.most_steps(len(scene.points)))
+    step = _counted(
+        callback, subrange(advance, share, 1.0), network_steps(len(scene.points), parameters=parameters.ladder)
+    )
     ladder = NetworkLadder(terms, options, rng, step, linear_score, parameters.ladder)
     field, solution, score = ladder.fit()
     _log.info("Score of the validation points: linear field %.3g, network %.3g disk radii.", linear_score, score)

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.field.widening import mean_of, widened
-from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.fit_options import FitOptions, network_count
 from gnrecon.fit.initialisation import WrongSignSearch, spectral_start
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, start_terms
 from gnrecon.fit.parameters import InitialisationParameters, NetworkLadderParameters, NetworkTermParameters
@@ -242,7 +242,7 @@ class NetworkLadder:
             When a linear start cannot be solved.
         """
         found = []
-        for _ in range(self.parameters.members(len(self.terms.scene.points))):
+        for _ in range(network_count(len(self.terms.scene.points), parameters=self.parameters)):
             found.append(self.climb())
             if found[-1][1].interrupted or found[-1][2] > self.rival:
                 break

@@ -108,14 +108,6 @@ class NetworkLadderParameters:
     most_members: int = 4
     hopeless_ratio: float = 2.0  # of the first width's score and the linear field's, above which no wider one is tried
 
-    def members(self, points: int) -> int:
-        """Return how many networks are fitted to so many seen points."""
-        return min(max(round(self.points_per_member / max(points, 1)), 1), self.most_members)
-
-    def most_steps(self, points: int) -> int:
-        """Return the most steps for so many seen points, of all networks."""
-        return self.members(points) * (self.first_steps + (len(self.widths) - 1) * self.steps)
-
 
 @dataclass(frozen=True)
 class GlobalFieldParameters:
