@@ -40,10 +40,11 @@ def widened(
         if number > 0:
             weights = torch.cat([weights, weights.new_zeros(out, added)], 1)
         if number < len(before) - 1:
-            # As at the start of a fit: hidden weights that keep the variance of sines (Sitzmann et al., theorem 1.8).
-            bound = np.sqrt(6.0 / width)
-            incoming = frequency * rng.standard_normal((added, into)) if number == 0 else None
-            if incoming is None:
+            if number == 0:
+                incoming = frequency * rng.standard_normal((added, into))
+            else:
+                # As at the start of a fit: they keep the variance of sines (Sitzmann et al., theorem 1.8).
+                bound = np.sqrt(6.0 / width)
                 incoming = rng.uniform(-bound, bound, (added, width))
             weights = torch.cat([weights, torch.as_tensor(incoming).to(weights)])
             bias = torch.cat([bias, torch.as_tensor(rng.uniform(-np.pi, np.pi, added)).to(bias)])

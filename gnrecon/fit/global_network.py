@@ -246,6 +246,7 @@ class NetworkLadder:
             found.append(self.climb())
             if found[-1][1].interrupted or found[-1][2] > self.rival:
                 break
+        last = found[-1][1]
         found.sort(key=lambda member: member[2])
         members = [found[0]]
         field, theta, score = found[0][0], found[0][1].theta, found[0][2]
@@ -258,10 +259,16 @@ class NetworkLadder:
         self.members = [(one, solution.theta) for one, solution, _ in members]
         scores = ", ".join(f"{one[2]:.3g}" for one in found)
         _log.info("Networks of scores %s; the mean of %d has %.3g disk radii.", scores, len(members), score)
-        return field, replace(found[-1][1], theta=theta, history=tuple(self.history)), score
+        return field, replace(last, theta=theta, history=tuple(self.history)), score
 
     def refit(self, scene: Scene) -> tuple[Siren, Tensor]:
-        """Return the mean of the networks after some steps on other points, such as all of them, and its parameters."""
+        """Return the mean of the networks after some steps on other points, such as all of them, and its parameters.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            On Ctrl-C during the steps; the networks are unchanged.
+        """
         terms = replace(self.terms, scene=scene)
         search = GainRatioDamping(
             initial_damping=self.parameters.damping,
@@ -278,7 +285,10 @@ class NetworkLadder:
                 return terms.problem(field, theta, noise, self.rng)
 
             steps = StopRule(self.parameters.refit_steps, patience=self.parameters.refit_steps + 1)
-            found.append((field, GaussNewton(search, Cholesky()).run(problem_at, theta, steps).theta))
+            solution = GaussNewton(search, Cholesky()).run(problem_at, theta, steps)
+            if solution.interrupted:
+                raise KeyboardInterrupt
+            found.append((field, solution.theta))
         return mean_of(found)
 
     def climb(self) -> tuple[Siren, Solution, float]:
@@ -294,7 +304,8 @@ class NetworkLadder:
         scene, rng = self.terms.scene, self.rng
         theta = spectral_start(field, scene, lambda x, d, n: start_terms(scene, self.options, rng, x, d, n), rng)
         solution = self._fitted(field, theta, self.parameters.first_steps)
-        best = field, solution, self.terms.score(field, solution.theta)
+        score = self.terms.score(field, solution.theta)
+        best = field, solution.theta, score
         for width in widths[1:]:
             if solution.interrupted or best[2] > self.parameters.hopeless_ratio * self.rival:
                 break
@@ -305,12 +316,13 @@ class NetworkLadder:
             score = self.terms.score(field, solution.theta)
             gains = score < (1 - self.parameters.least_gain) * best[2]
             if score < best[2]:
-                best = field, solution, score
+                best = field, solution.theta, score
             if not gains:
                 break
-        field, solution, score = best
+        field, theta, score = best
         _log.info("A network has widths %s, after %d steps.", field.widths, len(self.history))
-        return field, solution, score
+        # Whether and why the steps ended is what the last width's say, whichever width is the best.
+        return field, replace(solution, theta=theta), score
 
     def _widths(self) -> list[int]:
         """Return the first width, and those of networks with no more parameters than the data has rows."""

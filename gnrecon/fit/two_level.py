@@ -203,13 +203,14 @@ class _Steps:
         )
         if first.solution.interrupted or not outliers.any():
             return completed, first, 0
-        if data.sharp is None and first.ladder is not None:
-            # Robust weights have kept the network from them already, so that it need not be fitted again.
-            return self._completed(data.without(outliers)), first, int(outliers.sum())
         if data.sharp is None:
-            return *self._fit_global(data.without(outliers), subrange(advance, 0.5, 1.0)), int(outliers.sum())
-        scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
-        data = self._draw(scan, SharpShape.of(scan, self.parameters.shape_priors))
+            data = data.without(outliers)
+        else:
+            scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
+            data = self._draw(scan, SharpShape.of(scan, self.parameters.shape_priors))
+        if first.ladder is not None:
+            # Robust weights have kept the network from them already, so that it need not be fitted again.
+            return self._completed(data), first, int(outliers.sum())
         return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
 
     def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, PenaltiesFor | None]:

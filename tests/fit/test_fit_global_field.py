@@ -176,6 +176,35 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     assert made == [(4,) * 3, (24,) * 3, (32,) * 3]
 
 
+def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    ends = iter([False, False, False, True])  # two members of two widths; Ctrl-C in the last one
+
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> networks.Solution:
+        del self, field, steps
+        return networks.Solution(theta, "Interrupted.", (), interrupted=next(ends))
+
+    scores = itertools.count(1)  # each network is worse than the one before
+    monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
+    monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0 if next(scores) % 2 else 0.98)
+    parameters = NetworkLadderParameters(widths=(4, 6), points_per_member=600, most_members=2)
+    ladder = NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, parameters=parameters)
+    assert ladder.fit()[1].interrupted
+
+
+def test_an_interrupt_of_the_last_steps_is_not_lost(
+    network: tuple[GlobalField, list[Record]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: NetworkTerms, *args: object) -> None:
+        del self, args
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(NetworkTerms, "problem", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        network[0].refitted(capsule(900, 0))
+
+
 def test_an_interrupt_during_the_steps_keeps_the_network_so_far() -> None:
     def interrupting(record: Record) -> None:
         if record.step == 3:
