@@ -7,6 +7,7 @@ faces that share an edge there leaves one group of corners for each vertex.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -101,6 +102,15 @@ def submesh(mesh: Mesh, faces: Mask) -> Mesh:
     used, inverse = np.unique(mesh.faces[faces], return_inverse=True)
     normals = None if mesh.normals is None else mesh.normals[used]
     return Mesh(mesh.vertices[used], inverse.reshape(-1, 3), normals)
+
+
+def concatenated(parts: Sequence[Mesh]) -> Mesh:
+    """The mesh of the faces of all parts, of which there is at least one; with normals where all parts have them."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    normals = [part.normals for part in parts if part.normals is not None]
+    whole = np.concatenate(normals) if len(normals) == len(parts) else None
+    return Mesh(np.concatenate([part.vertices for part in parts]), faces, whole)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.export.boolean import centre_and_size
+from gnrecon.export.mesh_statistics import concatenated
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -81,7 +82,7 @@ def measure(
     on_mesh = sample_surface(mesh, samples, rng)
     if isinstance(reference, Mesh):
         on_reference = sample_surface(reference, samples, rng)
-        back = _to_surface(on_mesh, reference if lid is None else _together(reference, lid))
+        back = _to_surface(on_mesh, reference if lid is None else concatenated([reference, lid]))
     else:
         on_reference = _samples_of_cloud(reference)
         back = _to_points(on_mesh, on_reference)
@@ -119,13 +120,6 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> SurfaceS
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
     points = np.einsum("ij,ijk->ik", weights, mesh.corners[faces])
     return SurfaceSamples(points, vectors[faces] / areas[faces, None])
-
-
-def _together(mesh: Mesh, other: Mesh) -> Mesh:
-    return Mesh(
-        np.concatenate([mesh.vertices, other.vertices]),
-        np.concatenate([mesh.faces, other.faces + len(mesh.vertices)]),
-    )
 
 
 def _samples_of_cloud(cloud: PointCloud) -> SurfaceSamples:

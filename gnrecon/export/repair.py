@@ -25,7 +25,7 @@ from gnrecon.export.boolean import (
     with_nearest_normals,
 )
 from gnrecon.export.export_parameters import ExportParameters
-from gnrecon.export.mesh_statistics import Edges, corner_fans, face_components, split_vertices, submesh
+from gnrecon.export.mesh_statistics import Edges, concatenated, corner_fans, face_components, split_vertices, submesh
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.export.verify import require_sound, verify
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -222,7 +222,7 @@ def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     turned = sum(new is not old for new, old in zip(oriented, parts, strict=True))
     if turned:
         actions.append(f"Reversed {turned} components, because the shell around them was dropped.")
-    return _concatenate(oriented), actions
+    return concatenated(oriented), actions
 
 
 def drop_stray_components(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
@@ -287,10 +287,3 @@ def _encloses(shell: Mesh, point: Float) -> bool:
         + np.einsum("ij,ij->i", c, a) * lb,
     )
     return bool(abs(half.sum() / (2 * np.pi)) > 0.5)
-
-
-def _concatenate(parts: list[Mesh]) -> Mesh:
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
-    normals = [part.normals for part in parts if part.normals is not None]
-    return Mesh(np.concatenate([part.vertices for part in parts]), faces, np.concatenate(normals) if normals else None)

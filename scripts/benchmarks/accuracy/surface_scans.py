@@ -14,7 +14,8 @@ import numpy as np
 from benchmarks.accuracy.problem import Problem
 from benchmarks.accuracy.scans import ShapeFile, load_shape, unit
 from gnrecon.export.boolean import centre_and_size, from_solid, manifold_error, to_solid
-from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.export.mesh_statistics import submesh
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame, PointCloud
 from gnrecon.runtime.errors import InputError
@@ -172,10 +173,4 @@ def cut_open(mesh: Mesh, cut: Cut, *, on_plane: float = 1e-9) -> tuple[Mesh, Mes
     flat = near[piece.faces].all(axis=1)
     if not flat.any():
         raise InputError(f"The plane {cut.distance:g} from the origin does not cut the shape.")
-    return _of_faces(piece, ~flat), _of_faces(piece, flat)
-
-
-def _of_faces(mesh: Mesh, wanted: Mask) -> Mesh:
-    """Return some of the faces, of shape (F,), with the vertices that they use."""
-    used, corners = np.unique(mesh.faces[wanted], return_inverse=True)
-    return Mesh(mesh.vertices[used], corners.reshape(-1, 3))
+    return submesh(piece, ~flat), submesh(piece, flat)
