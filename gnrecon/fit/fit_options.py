@@ -105,8 +105,8 @@ class FitOptions:
 
     @property
     def fits_network(self) -> bool:
-        """Whether the default fit's global field is a network: in high quality, without curvature penalties."""
-        return self.adaptive and self.quality == "high" and not self.regularisers
+        """Whether the default fit's global field is a network: without curvature penalties, except in draft quality."""
+        return self.adaptive and self.quality != "draft" and not self.regularisers
 
     @property
     def regularisers(self) -> tuple[Regulariser, ...]:

@@ -99,17 +99,19 @@ def fit_global(
         return first
     points, normals = samples.points[held_out], samples.normals[held_out]
     terms = NetworkTerms.draw(scene, points, normals, rng, parameters=parameters.terms)
-    linear_score = terms.score(linear.sdf.field, linear.sdf.theta)
-    if linear_score < parameters.exact_score:
-        _log.info("The linear field predicts the validation points: %.3g disk radii.", linear_score)
+    of_linear = terms.prediction(linear.sdf.field, linear.sdf.theta)
+    if of_linear.score < parameters.exact_score:
+        _log.info("The linear field predicts the validation points: %.3g disk radii.", of_linear.score)
         return first
     step = _counted(
         callback, subrange(advance, share, 1.0), network_steps(len(scene.points), parameters=parameters.ladder)
     )
-    ladder = NetworkLadder(terms, options, rng, step, linear_score, parameters.ladder)
-    field, solution, score = ladder.fit()
-    _log.info("Score of the validation points: linear field %.3g, network %.3g disk radii.", linear_score, score)
-    if linear_score < score and not solution.interrupted:
+    ladder = NetworkLadder(terms, options, rng, step, of_linear.score, parameters.ladder)
+    field, solution, _ = ladder.fit()
+    found = terms.prediction(field, solution.theta)
+    _log.info("Score of validation points: linear field %.3g, network %.3g disk radii.", of_linear.score, found.score)
+    better = found.is_better_than(of_linear, standard_errors=parameters.ladder.gain_standard_errors)
+    if not (better or solution.interrupted):
         return replace(first, solution=replace(linear.solution, history=solution.history))
     sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
     return GlobalField(sdf, solution, scene, linear.length, ladder)

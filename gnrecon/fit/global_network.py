@@ -48,6 +48,38 @@ class Deviations:
 
 
 @dataclass(frozen=True)
+class Prediction:
+    """How a field predicts the validation points and the sign of free space.
+
+    Parameters
+    ----------
+    misfits : of shape (V,), distance of each validation point from the surface, in disk radii, plus |grad f - n|
+    wrong : mask of shape (Q,), of the samples of free space whose sign is wrong
+    wrong_sign_score : what a field costs that is wrong in all of free space
+    """
+
+    misfits: Tensor
+    wrong: Tensor
+    wrong_sign_score: float
+
+    @property
+    def score(self) -> float:
+        """How bad it is, in disk radii."""
+        return float(self.misfits.mean()) + self.wrong_sign_score * float(self.wrong.double().mean())
+
+    def is_better_than(self, other: Prediction, *, standard_errors: float) -> bool:
+        """Whether it gains so many standard errors over another prediction of the same points and samples.
+
+        The noise of a validation point is the same for both, so that their differences, point by point, have little
+        of it.
+        """
+        points = other.misfits - self.misfits
+        signs = self.wrong_sign_score * (other.wrong.double() - self.wrong.double())
+        error = sum(float(part.var(correction=0)) / len(part) for part in (points, signs) if len(part)) ** 0.5
+        return other.score - self.score > standard_errors * error
+
+
+@dataclass(frozen=True)
 class NetworkTerms:
     """The data of a global network.
 
@@ -110,11 +142,15 @@ class NetworkTerms:
         least_angle = self.parameters.least_estimated_deviation if estimated else least
         return Deviations(max(values, least * radius), max(normals, least_angle))
 
-    def score(self, field: Siren, theta: Tensor) -> float:
-        """Return how badly the field predicts the validation points and the sign of free space, in disk radii."""
+    def prediction(self, field: Siren, theta: Tensor) -> Prediction:
+        """Return how the field predicts the validation points and the sign of free space."""
         distance, angle = self._misfits(field, theta)
-        wrong = float(self._is_wrong(field, theta).double().mean())
-        return float(distance.mean()) / self.radius + float(angle.mean()) + self.parameters.wrong_sign_score * wrong
+        wrong = self.distances.sign() * field.value(theta, self.volume) < 0.0
+        return Prediction(distance / self.radius + angle, wrong, self.parameters.wrong_sign_score)
+
+    def score(self, field: Siren, theta: Tensor) -> float:
+        """Return how badly the field predicts, in disk radii."""
+        return self.prediction(field, theta).score
 
     def eikonal_rms(self, field: Siren, theta: Tensor) -> float:
         """Return the root mean square of |grad f| - 1 near the surface."""
@@ -302,7 +338,8 @@ class NetworkLadder:
         widths = self._widths()
         field = Siren((widths[0],) * self.parameters.depth)
         scene, rng = self.terms.scene, self.rng
-        theta = spectral_start(field, scene, lambda x, d, n: start_terms(scene, self.options, rng, x, d, n), rng)
+        share = InitialisationParameters.hidden_weight_share
+        theta = spectral_start(field, scene, lambda x, d, n: start_terms(scene, self.options, rng, x, d, n), rng, share)
         solution = self._fitted(field, theta, self.parameters.first_steps)
         score = self.terms.score(field, solution.theta)
         best = field, solution.theta, score
@@ -313,12 +350,11 @@ class NetworkLadder:
             frequency = InitialisationParameters.first_layer_frequency
             field, theta = widened(field, solution.theta, width, rng, frequency)
             solution = self._fitted(field, theta, self.parameters.steps)
-            score = self.terms.score(field, solution.theta)
-            gains = score < (1 - self.parameters.least_gain) * best[2]
-            if score < best[2]:
-                best = field, solution.theta, score
-            if not gains:
+            found, before = self.terms.prediction(field, solution.theta), self.terms.prediction(*best[:2])
+            # On noisy points a wider network follows the noise, and seems better on the validation points by chance.
+            if not found.is_better_than(before, standard_errors=self.parameters.gain_standard_errors):
                 break
+            best = field, solution.theta, found.score
         field, theta, score = best
         _log.info("A network has widths %s, after %d steps.", field.widths, len(self.history))
         # Whether and why the steps ended is what the last width's say, whichever width is the best.

@@ -106,17 +106,20 @@ def spectral_start(
     scene: Scene,
     terms_of: TermsOf,
     rng: np.random.Generator,
+    hidden_weight_share: float = 1.0,
     *,
     parameters: InitialisationParameters = InitialisationParameters(),
 ) -> Tensor:
     """Return parameters, of shape (p,), of a network of several layers whose last one solves `terms_of` the volume.
+
+    The weights between hidden layers have `hidden_weight_share` of the bound that keeps the variance of sines.
 
     Raises
     ------
     FitError
         When the linear system cannot be solved.
     """
-    theta = random_network(field, rng, scene.points)
+    theta = random_network(field, rng, scene.points, hidden_weight_share)
     count = parameters.spectral_samples
     x, distance = scene.volume(count, rng)
     terms = terms_of(scene.tensor(x), scene.tensor(distance), count)
@@ -128,12 +131,15 @@ def random_network(
     field: Siren,
     rng: np.random.Generator,
     like: Tensor,
+    hidden_weight_share: float = 1.0,
     *,
     first_layer_frequency: float = InitialisationParameters.first_layer_frequency,
 ) -> Tensor:
     """Return random sine layers, of shape (p,), with a last layer of zeros.
 
-    Frequencies of the first layer have the standard deviation `first_layer_frequency`, per radius.
+    Frequencies of the first layer have the standard deviation `first_layer_frequency`, per radius. Weights between
+    hidden layers have `hidden_weight_share` of the bound that keeps the variance of sines (Sitzmann et al., theorem
+    1.8).
     """
     layers = []
     for number, (out, into) in enumerate(field.layout.shapes):
@@ -142,7 +148,7 @@ def random_network(
         elif number == len(field.widths):
             weights, bias = np.zeros((out, into)), np.zeros(out)
         else:
-            bound = np.sqrt(6.0 / into)
+            bound = hidden_weight_share * np.sqrt(6.0 / into)
             weights, bias = rng.uniform(-bound, bound, (out, into)), rng.uniform(-np.pi, np.pi, out)
         layers.append((torch.as_tensor(weights).to(like), torch.as_tensor(bias).to(like)))
     return field.layout.flatten(layers)

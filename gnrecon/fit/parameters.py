@@ -100,7 +100,8 @@ class NetworkLadderParameters:
     first_steps: int = 30  # most Gauss-Newton steps of the first width
     steps: int = 15  # of each further width
     patience_steps: int = 8  # without a better score
-    least_gain: float = 0.01  # share of the score that a wider network must gain
+    least_gain: float = 0.01  # share of the score whose loss ends the steps
+    gain_standard_errors: float = 2.0  # by which a wider network must predict better, and any network than linear field
     damping: float = 1e-2  # of the first step of each width
     refit_steps: int = 12  # with the validation points, once they have chosen everything
     refit_length: float = 0.5  # of these steps: points are drawn for each, so that shorter ones average over more
@@ -142,6 +143,9 @@ class InitialisationParameters:
     wrong_sign_repeats: int = 5  # of such a sample in the next solve; without it, horns grow on sparse scans
     ridge_attempts: int = 6  # each with ten times the ridge
     first_layer_frequency: float = 4.0  # standard deviation, per radius, in networks of several layers
+    # Share of Sitzmann's bound that weights between layers start with: with all of it, the last layer's features are so
+    # rough that a network of 16 units does not find a gyroid in 30 steps; docs/research/2026-11-26-default-network.md
+    hidden_weight_share: float = 0.5
     spectral_ridge: float = 1e-4  # of their last layer, per unit of the terms' weight
     spectral_samples: int = 4000  # points and volume samples of that solve
     search_points: int = 5000  # most data points of all rounds but the last
