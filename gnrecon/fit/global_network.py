@@ -76,7 +76,7 @@ class Prediction:
         points = other.misfits - self.misfits
         signs = self.wrong_sign_score * (other.wrong.double() - self.wrong.double())
         error = sum(float(part.var(correction=0)) / len(part) for part in (points, signs) if len(part)) ** 0.5
-        return other.score - self.score > standard_errors * error
+        return bool(other.score - self.score > standard_errors * error)
 
 
 @dataclass(frozen=True)
