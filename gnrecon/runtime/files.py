@@ -62,7 +62,9 @@ def _output_errors(path: str | Path) -> Iterator[None]:
     except GnreconError:
         raise
     except OSError as error:
-        raise OutputError(f"{path} could not be written: {error.strerror or error}.") from error
+        # numpy says how much it wrote, and not why no more.
+        reason = error.strerror or f"{error} (the disk may be full)"
+        raise OutputError(f"{path} could not be written: {reason}.") from error
 
 
 def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
