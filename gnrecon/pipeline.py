@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from gnrecon.export import (
@@ -48,6 +49,7 @@ from gnrecon.optim import Record
 from gnrecon.options import Options
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
+from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
 from gnrecon.version import __version__
@@ -240,6 +242,7 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
     run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
     warnings = [] if ingested.layers is None else [ingested.layers.describe()]
+    warnings += few_points_remark(samples.frame.to_world(samples.points))
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested
 
@@ -270,6 +273,8 @@ def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
         run.options = replace(run.options, resolution=cells_for_curvature(sdf, run.options.resolution))
+    cell = float(np.ptp(sdf.bounds, axis=0).max()) / run.options.mesh().cells(sdf.bounds)
+    run.remark([] if sdf.data is None else coarse_parts_remark(sdf.data, cell))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     neighbourhood = Neighbourhood(scan.cloud.points)

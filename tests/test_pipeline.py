@@ -22,6 +22,7 @@ from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.report.report import SCHEMA_VERSION
 from gnrecon.runtime.errors import InputError, MemoryLimitError, MeshError, UsageError
+from gnrecon.runtime.parallel import worker_count
 
 RADIUS = 1 + TUBE
 # Enough to reach every stage, where the mesh itself does not matter.
@@ -57,7 +58,7 @@ class Recorder(Progress):
 
     def step(self, record: Record, total: int) -> None:
         self.steps.append((record.step, total))
-        self.threads.add(torch.get_num_threads())
+        self.threads.add(worker_count())
         if record.step == self._interrupt_after:
             raise KeyboardInterrupt
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Callable, Sequence
-from types import FrameType
 from typing import Any, NoReturn
 
 import typer
@@ -28,7 +26,9 @@ from gnrecon.cli.inspect_commands import (
 from gnrecon.cli.learn_command import learn_command
 from gnrecon.cli.mesh_command import mesh_command
 from gnrecon.cli.reconstruct_command import reconstruct_command
+from gnrecon.cli.streams import lenient_streams
 from gnrecon.runtime.errors import ExitCode, failure
+from gnrecon.runtime.interrupts import polite_ends
 from gnrecon.version import __version__
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -51,7 +51,7 @@ def command_line_app() -> typer.Typer:
         name="gnrecon",
         help="Watertight, verified meshes from point clouds: gnrecon SCAN -o MESH",
         epilog="Exit codes: 0 ok, 1 unforeseen, 2 usage, 3 input, 4 fit, 5 mesh not sound, 6 could not write, "
-        "7 memory, 8 some of a batch failed, 130 interrupted.",
+        "7 memory, 8 some of a batch failed, 130 interrupted (Ctrl-C, SIGTERM or SIGHUP).",
         add_completion=False,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -64,23 +64,26 @@ def command_line_app() -> typer.Typer:
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    with lenient_streams() as streams, polite_ends():
+        code = streams.exit_code(_run(list(sys.argv[1:] if arguments is None else arguments)))
+    sys.exit(code)
+
+
+def _run(words: list[str]) -> int:
+    """Run the command line's words and return the exit code."""
     if words == ["--version"]:
         print(f"gnrecon {__version__}")
-        sys.exit(0)
+        return ExitCode.OK
     command = shlex.join(["gnrecon", *words])
     if words and words[0] not in (*COMMANDS, "-h", "--help"):
         words.insert(0, "reconstruct")
     # On a busy machine, threads that spin while they wait slow the run down several times.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # SIGTERM must unwind the stack, so that temporary files are removed.
-    signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(_guarded(words, command))
-
-
-def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    del frame
-    raise SystemExit(128 + number)
+    try:
+        return _guarded(words, command)
+    except SystemExit as end:
+        # Commands end by it; a code that is no number is a sentence.
+        return end.code if isinstance(end.code, int) else ExitCode.OK if end.code is None else ExitCode.UNFORESEEN
 
 
 def _guarded(words: list[str], command: str) -> int:

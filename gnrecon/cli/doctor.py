@@ -40,6 +40,7 @@ PACKAGES = {
     "safetensors": "safetensors",
     "scikit-image": "skimage",
     "scipy": "scipy",
+    "threadpoolctl": "threadpoolctl",
     "tomli-w": "tomli_w",
     "torch": "torch",
     "trimesh": "trimesh",

@@ -106,7 +106,8 @@ def run_learn(
     design = files.read() if name == "bracket" else None
     problem, frame = _problem_and_frame(name, design, files, scan, options.seed)
     console = Console(stderr=True, quiet=quiet)
-    with limited(options.threads):
+    # A budget of time makes no same bytes in any case, and a step is one product after the other.
+    with limited(options.threads, same_bytes=False):
         learned = learn(
             problem,
             options.optimiser,

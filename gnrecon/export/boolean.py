@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.runtime.errors import MeshError
+from gnrecon.runtime.errors import MeshError, UsageError
 
 
 def crop(mesh: Mesh, box: Float, *, snap_sizes: float = 1e-9) -> Mesh:
@@ -155,13 +155,32 @@ def to_meshlab(mesh: Mesh) -> Any:
     """Return a `pymeshlab.MeshSet` of a non-empty mesh's vertices and faces.
 
     Coordinates are centred and scaled to one, because some of pymeshlab's thresholds are lengths.
-    """
-    import pymeshlab
 
+    Raises
+    ------
+    UsageError
+        When pymeshlab, whose licence is the GPL, is not installed.
+    """
+    pymeshlab = imported_pymeshlab()
     centre, size = centre_and_size(mesh)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh((mesh.vertices - centre) / size, mesh.faces.astype(np.int32)))
     return meshes
+
+
+def imported_pymeshlab() -> Any:
+    """Return the package pymeshlab.
+
+    Raises
+    ------
+    UsageError
+        When it is not installed; everything that does not need it works without.
+    """
+    try:
+        import pymeshlab
+    except ImportError:
+        raise UsageError("This needs the package pymeshlab; install it with: pip install pymeshlab") from None
+    return pymeshlab
 
 
 def from_meshlab(meshes: Any, like: Mesh) -> Mesh:

@@ -19,6 +19,7 @@ import numpy as np
 from gnrecon.export.boolean import (
     from_meshlab,
     from_solid,
+    imported_pymeshlab,
     manifold_error,
     to_meshlab,
     to_solid,
@@ -162,8 +163,10 @@ def _patch(
     hole_edges: int = ExportParameters.repair.hole_edges,
 ) -> tuple[Mesh, list[str]]:
     """Cut crowded edges, close small holes and orient the faces with pymeshlab."""
-    import pymeshlab
-
+    try:
+        pymeshlab = imported_pymeshlab()
+    except UsageError:
+        raise MeshError("The mesh needs a repair by pymeshlab, which is not installed.") from None
     work = to_meshlab(mesh)
     work.meshing_remove_duplicate_vertices()
     work.meshing_remove_duplicate_faces()

@@ -17,7 +17,7 @@ from gnrecon.export.boolean import manifold_error, to_meshlab, to_solid
 from gnrecon.export.mesh_statistics import Edges, face_components, split_vertices
 from gnrecon.geometry.arrays import Mask
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.runtime.errors import MeshError
+from gnrecon.runtime.errors import MeshError, UsageError
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class Findings:
     flat_faces : int
         Of three different vertices whose triangle has no area beyond rounding.
     self_intersecting_faces : int or None
-        That pass through another face; None where vertices are not finite.
+        That pass through another face; None where vertices are not finite, or pymeshlab is not installed.
     """
 
     facts: MeshFacts
@@ -246,15 +246,20 @@ def examine(mesh: Mesh) -> Findings:
     )
 
 
-def self_intersecting_faces(mesh: Mesh) -> int:
-    """Count the faces that pass through another one, by pymeshlab; neighbours that share a vertex do not count.
+def self_intersecting_faces(mesh: Mesh) -> int | None:
+    """Count the faces that pass through another one, by pymeshlab; None where it is not installed.
+
+    Neighbours that share a vertex do not count.
 
     Coordinates must be finite. Time grows with the number of faces: about 3 s for a million.
     """
     proper = mesh.faces[~_names_twice(mesh)]
     if not len(proper):
         return 0
-    work = to_meshlab(Mesh(mesh.vertices, proper))
+    try:
+        work = to_meshlab(Mesh(mesh.vertices, proper))
+    except UsageError:
+        return None
     work.compute_selection_by_self_intersections_per_face()
     return int(work.current_mesh().selected_face_number())
 

@@ -19,6 +19,8 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import FitParameters, SingleNetworkParameters
+from gnrecon.fit.shape_priors.ball_fit import BallFit
+from gnrecon.fit.shape_priors.convex_completion import completed_convex
 from gnrecon.fit.single_network import fit_deep, fit_wide
 from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.point_cloud import Samples
@@ -60,6 +62,8 @@ def fit(
     """
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
+    convex = None if BallFit.of(samples, parameters.ball) is not None else completed_convex(samples)
+    given, samples = samples, convex or samples
     if options.adaptive:
         sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler, callback, parameters=parameters)
     elif folder is not None:
@@ -68,7 +72,13 @@ def fit(
         sdf, fitted = _fit_network(samples, options, rng, callback, advance)
     if not sdf.finite:
         raise FitError("The fit ended in parameters that are not finite; fewer steps (--steps) may help.")
-    return replace(sdf, support=_support(samples)), fitted
+    if convex is not None:
+        status = (
+            f"{fitted.status} The {len(given)} points lie on a convex surface, which was filled smoothly with "
+            f"{len(convex) - len(given)} samples."
+        )
+        fitted = replace(fitted, status=status)
+    return replace(sdf, support=_support(given)), fitted
 
 
 def _fit_network(

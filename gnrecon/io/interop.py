@@ -16,7 +16,7 @@ from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import from_columns, no_faces
-from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.errors import InputError, UsageError
 
 
 def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
@@ -247,8 +247,10 @@ def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
     MeshLab always computes the normals of a mesh from its faces. The attribute ``quality`` becomes MeshLab's vertex
     quality; others of one or three columns become custom attributes of the same name.
     """
-    import pymeshlab
-
+    try:
+        import pymeshlab
+    except ImportError:
+        raise UsageError("This needs the package pymeshlab; install it with: pip install pymeshlab") from None
     points, faces = (shape.points, no_faces()) if isinstance(shape, PointCloud) else (shape.vertices, shape.faces)
     normals = shape.normals if isinstance(shape, PointCloud) else None
     colors, values = _colors(shape), shape.attributes.get("quality")

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from gnrecon.runtime.memory import PeakMemory, process_peak_mb
+from gnrecon.runtime.parallel import worker_count
 from gnrecon.version import __version__
 
 _log = logging.getLogger(__name__)
@@ -69,7 +70,7 @@ class Stages:
         return {
             "seconds": round(time.perf_counter() - self._start, 3),
             "cpu_seconds": round(time.process_time() - self._cpu_start, 3),
-            "threads": torch.get_num_threads(),
+            "threads": worker_count(),
             "device": self._device,
             "device_name": torch.cuda.get_device_name(self._device) if self._on_cuda else None,
             "peak_memory_mb": process_peak_mb(),

@@ -8,14 +8,16 @@ from contextlib import contextmanager
 import torch
 
 from gnrecon.runtime.errors import GnreconError, MemoryLimitError, UsageError
-from gnrecon.runtime.parallel import torch_threads
+from gnrecon.runtime.parallel import fixed_sums, torch_threads
 
 
 @contextmanager
-def limited(threads: int | None) -> Iterator[None]:
-    """Run a block with this number of torch threads (None: unchanged), and report failed allocations as such.
+def limited(threads: int | None, *, same_bytes: bool = True) -> Iterator[None]:
+    """Run a block with this number of threads (None: torch's number), and report failed allocations as such.
 
-    Other threads of the program, and those that it starts later, keep their number of torch threads.
+    What the block computes does not depend on the number, see `fixed_sums`, unless `same_bytes` is False: then several
+    threads share each product. Other threads of the program, and those that it starts later, keep their number of
+    torch threads.
 
     Raises
     ------
@@ -23,7 +25,7 @@ def limited(threads: int | None) -> Iterator[None]:
         When an allocation in the block failed.
     """
     try:
-        with torch_threads(threads):
+        with fixed_sums(threads) if same_bytes else torch_threads(threads):
             yield
     except GnreconError:  # among them a MemoryLimitError, which is a MemoryError and already says what is too large
         raise

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gnrecon.runtime.errors import GnreconError, InputError, OutputError, UsageError
@@ -35,23 +36,35 @@ def atomic_write(
         When the folder is missing or not writable, the target exists, or writing fails (a full disk).
     """
     target = Path(os.path.realpath(path))
-    _check(target, path, overwrite)
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
+    temporary = _temporary(target)
+    with _output_errors(path):
+        _check(target, path, overwrite)
     try:
         # Created exclusively: the user's umask applies, and no existing file can be hit.
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        yield temporary
-        if verify is not None:
-            verify(temporary)
-        sync(temporary)
-        _rename(temporary, target, overwrite)
-        sync(target.parent)
+        with _output_errors(path):
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            yield temporary
+            if verify is not None:
+                verify(temporary)
+            sync(temporary)
+            _rename(temporary, target, overwrite)
+            sync(target.parent)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _output_errors(path: str | Path) -> Iterator[None]:
+    """Turn what the system says about writing a target into an `OutputError`."""
+    try:
+        yield
     except GnreconError:
         raise
     except OSError as error:
-        raise OutputError(f"{path} could not be written: {error.strerror or error}.") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        # numpy says how much it wrote, and not why no more.
+        reason = error.strerror or f"{error} (the disk may be full)"
+        raise OutputError(f"{path} could not be written: {reason}.") from error
 
 
 def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
@@ -66,16 +79,46 @@ def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def _temporary(target: Path, *, most_stem: int = 20, most_suffix: int = 8) -> Path:
+    """Return a hidden name in the target's folder, with its suffix, by which formats are found.
+
+    Its length is bounded, in characters: the target's name may be as long as the file system allows.
+    """
+    suffix = target.suffix if len(target.suffix) <= most_suffix else ""
+    return target.with_name(f".{target.stem[:most_stem]}.{secrets.token_hex(6)}{suffix}")
+
+
 def _check(target: Path, path: str | Path, overwrite: bool) -> None:
     """Raise early, with a message that says what to do, where writing cannot succeed."""
     if not target.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {target.parent} does not exist.")
-    if not target.exists():
-        return
-    if not target.is_file():
+    try:
+        found = target.stat()
+    except FileNotFoundError:
+        found = None
+    if found is not None and not stat.S_ISREG(found.st_mode):
         raise OutputError(f"{path} cannot be written: it exists and is not a regular file.")
-    if not overwrite:
-        raise OutputError(f"{path} exists already; choose another name or allow overwriting.")
+    if found is not None and not overwrite:
+        raise OutputError(f"{path} exists already; choose another name or allow overwriting (--overwrite).")
+
+
+def require_writable(path: Path, overwrite: bool) -> None:
+    """Refuse, before any work, a target that could not be written after it.
+
+    Whether its folder takes files only the system knows, so an empty one is made there and removed.
+
+    Raises
+    ------
+    OutputError
+        When the folder is missing or takes no files, the name is too long or a link that leads to itself, or the target
+        exists and is not a regular file or may not be overwritten.
+    """
+    with _output_errors(path):
+        target = Path(os.path.realpath(path))
+        _check(target, path, overwrite)
+        trial = _temporary(target)
+        os.close(os.open(trial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        trial.unlink()
 
 
 def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
@@ -118,21 +161,19 @@ def require_files(inputs: Sequence[Path], targets: Sequence[Path], overwrite: bo
     InputError
         When an input is missing.
     OutputError
-        When a target exists and may not be overwritten, or its folder is missing.
+        As `require_writable` does.
     """
     for path in inputs:
-        if not is_standard_input(path) and not path.exists():
+        if not is_standard_input(path) and not os.path.exists(path):  # noqa: PTH110 - a name too long is no file
             raise InputError(f"There is no file {path}.")
     for index, target in enumerate(targets):
         if any(_same(target, other) for other in [*inputs, *targets[:index]]):
             raise UsageError(f"{target} is named twice; an input or another output is never overwritten.")
-        if not target.parent.is_dir():
-            raise OutputError(f"{target} cannot be written: the folder {target.parent} does not exist.")
-        if target.exists() and not overwrite:
-            raise OutputError(f"{target} exists already; choose another name or add --overwrite.")
+        require_writable(target, overwrite)
 
 
 def _same(one: Path, other: Path) -> bool:
-    if one.exists() and other.exists():
+    try:
         return one.samefile(other)
-    return one.resolve() == other.resolve()
+    except OSError:  # one does not exist, or its name cannot
+        return os.path.realpath(one) == os.path.realpath(other)

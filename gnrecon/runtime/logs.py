@@ -7,8 +7,9 @@ it decides what happens to the records, by Python's `logging`. The command line 
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,24 @@ class _ConsoleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""
         self._console.print(record.getMessage(), style="dim", highlight=False, markup=False, soft_wrap=True)
+
+
+class _FileHandler(logging.FileHandler):
+    """Appends to a file; where that fails, as on a full disk, one sentence says so and the rest is dropped."""
+
+    _failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Say so once."""
+        del record
+        if not self._failed:
+            self._failed = True
+            print(f"The log {self.baseFilename} is not complete: {sys.exception()}.", file=sys.stderr)
+
+    def close(self) -> None:
+        """Close the file; what it does not take has been announced."""
+        with suppress(OSError):
+            super().close()
 
 
 @contextmanager
@@ -70,7 +89,7 @@ def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
     if any(file.resolve() == other.resolve() for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
     try:
-        handler = logging.FileHandler(file, encoding="utf-8")
+        handler = _FileHandler(file, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error
     handler.setLevel(logging.DEBUG)

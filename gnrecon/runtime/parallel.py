@@ -1,19 +1,23 @@
-"""Runs independent tasks in threads, each with one torch thread, and limits torch's threads for a block of code.
+"""Runs independent pieces of work in threads, each with one torch thread, so that results do not depend on the threads.
 
-The matrices of a fit are small. Several threads on one product spend longer waiting for each other than working, so
-each task gets a single torch thread and several tasks run at once. This helps only for tasks that release Python's
-global lock, as torch, numpy and scipy do.
+A sum that several threads share depends in its last digits on how many there are. So each product and sum is that of
+one thread (`fixed_sums`), and several threads work on different pieces, whose results are put together in the order of
+the pieces. It costs little: the matrices of a fit are small, and several threads on one product spend longer waiting
+for each other than working. Threads help only with pieces that release Python's global lock, as torch, numpy and scipy
+do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from threading import Lock
 from typing import TypeVar
 
 import torch
+from threadpoolctl import ThreadpoolController
 
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -23,6 +27,59 @@ Result = TypeVar("Result")
 
 _lock = Lock()
 
+_workers: ContextVar[int | None] = ContextVar("_workers", default=None)
+"""Threads for pieces of work, where a block fixes sums; a thread that starts later does not inherit it."""
+
+
+def worker_count() -> int:
+    """Return how many threads `map_in_threads` uses: those of `fixed_sums`, elsewhere as many as torch has."""
+    return _workers.get() or torch.get_num_threads()
+
+
+@contextmanager
+def fixed_sums(threads: int | None) -> Iterator[None]:
+    """Run a block whose results are the same for any number of threads.
+
+    Each product and sum of torch, and of the OpenBLAS of numpy and scipy, is that of one thread; `map_in_threads`
+    still uses several, for different pieces.
+
+    Parameters
+    ----------
+    threads : for pieces of work; by default as many as the caller has
+    """
+    before = _workers.set(threads or worker_count())
+    try:
+        with torch_threads(1), _one_blas_thread:
+            yield
+    finally:
+        _workers.reset(before)
+
+
+class _OneBlasThread:
+    """Limits OpenBLAS to one thread while any block runs; its number is that of the process, not of one thread."""
+
+    def __init__(self) -> None:
+        self._lock, self._blocks, self._limit = Lock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._blocks == 0:
+                import scipy.linalg  # noqa: F401 - scipy brings an OpenBLAS of its own, which must be loaded to be limited
+
+                # The MKL of torch is not among them: `torch_threads` limits it, in the calling thread alone.
+                libraries = ThreadpoolController().select(internal_api="openblas")
+                self._limit.enter_context(libraries.limit(limits=1))
+            self._blocks += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._blocks -= 1
+            if self._blocks == 0:
+                self._limit.close()
+
+
+_one_blas_thread = _OneBlasThread()
+
 
 def set_threads(count: int) -> None:
     """Set the number of torch threads for calls from this thread, and from no other.
@@ -30,6 +87,7 @@ def set_threads(count: int) -> None:
     `torch.set_num_threads` also sets the number for threads that start later. A fresh thread reads that number and
     restores it.
     """
+    torch.get_num_threads()  # the first call of a thread replaces what was set before it by the default
     with _lock, ThreadPoolExecutor(1) as fresh_thread:
         default = fresh_thread.submit(torch.get_num_threads).result()
         torch.set_num_threads(count)
@@ -40,7 +98,7 @@ def set_threads(count: int) -> None:
 def torch_threads(count: int | None) -> Iterator[None]:
     """Run a block with this number of torch threads, and restore the previous number; None changes nothing.
 
-    With one thread, sums do not depend on the number of processors; with several, they differ in the last digits.
+    Sums depend on the number in their last digits.
     """
     before = torch.get_num_threads()
     try:
@@ -58,7 +116,7 @@ def map_in_threads(
     device: str | torch.device = "cpu",
     advance: ProgressCallback = ignore_progress,
 ) -> list[Result]:
-    """Return ``work(item)`` for all items, in their order, computed in as many threads as torch has.
+    """Return ``work(item)`` for all items, in their order, computed in `worker_count` threads.
 
     Each call has one torch thread, so the results do not depend on the number of threads.
 
@@ -74,7 +132,7 @@ def map_in_threads(
         advance(number / len(items))
         return result
 
-    threads = min(torch.get_num_threads(), len(items))
+    threads = min(worker_count(), len(items))
     if threads <= 1 or torch.device(device).type != "cpu":
         return [report(work(item), number) for number, item in enumerate(items, 1)]
     pool = ThreadPoolExecutor(threads, initializer=set_threads, initargs=(1,))

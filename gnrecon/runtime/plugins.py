@@ -15,6 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
 from gnrecon.runtime.errors import GnreconError, UsageError
+from gnrecon.runtime.interrupts import reraised
 
 PluginKind = Literal["reader", "writer", "residual"]
 """What a plugin is; the group of its entry points is ``gnrecon.`` and the plural."""
@@ -108,7 +109,8 @@ def _capital(plugin: Plugin) -> str:
 def guarded(kind: type[GnreconError], sentence: Callable[[BaseException], str]) -> Iterator[None]:
     """Run a block of third-party code, and turn its exceptions into one sentence.
 
-    `GnreconError`, `MemoryError`, operating system errors with a number, and interrupts pass through unchanged.
+    `GnreconError`, `MemoryError`, operating system errors with a number, and interrupts pass through unchanged, the
+    last even where the code catches them.
 
     Parameters
     ----------
@@ -121,7 +123,8 @@ def guarded(kind: type[GnreconError], sentence: Callable[[BaseException], str]) 
         Of the given kind, for any other exception.
     """
     try:
-        yield
+        with reraised():
+            yield
     except (GnreconError, MemoryError):
         raise
     except BaseException as error:

@@ -325,13 +325,13 @@ def test_an_interrupt_before_the_fit_writes_nothing(out: Path, scan: Path, stage
     assert names(out) == []
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_polite_end_while_writing_leaves_nothing(out: Path, scan: Path, signal_number: signal.Signals) -> None:
     files = ("-o", out / "mesh.obj", "--report", out / "report.json")
     with started(scan, *files, *FAST_WORDS, before=pause_at("gnrecon.pipeline._verify")) as process:
         wait_for(process, "paused")
         process.send_signal(signal_number)
-        assert end(process)[0] == 128 + signal_number
+        assert end(process)[0] == ExitCode.INTERRUPTED
     assert names(out) == []
 
 

@@ -18,6 +18,7 @@ from types import FrameType
 
 import numpy as np
 import pytest
+from benchmarks.damage import mutated
 from scan_writers import FORMS, file_of, random_cloud
 
 from gnrecon.geometry.mesh import Mesh
@@ -29,8 +30,6 @@ MUTATIONS = 76
 
 SECONDS = 20
 """In which any file of a few kilobytes must be read, on a machine that is busy."""
-
-TEXT = [b"nan", b"inf", b"-1", b"0", b"99999999999", b"1e999", b"", b"\n", b" ", b"x", b"4294967295", b'"', b"<", b"{}"]
 
 
 def mesh_of(suffix: str, folder: Path) -> Path:
@@ -55,38 +54,6 @@ def valid(name: str, folder: Path) -> Path:
 
 
 NAMES = [*FORMS, "conf", ".stl", ".3mf"]
-
-
-def mutated(content: bytes, rng: np.random.Generator) -> bytes:
-    """Damage of the usual kinds: bytes, bits, words, sizes and stretches; changed, cut off or doubled."""
-    data = bytearray(content)
-    for _ in range(rng.integers(1, 5)):
-        place = int(rng.integers(0, len(data))) if len(data) else 0
-        length = int(rng.integers(1, 1 + max(len(data) // 4, 1)))
-        match rng.integers(0, 8):
-            case 0:
-                data[place : place + 1] = bytes([rng.integers(0, 256)])
-            case 1 if data:
-                data[place] ^= 1 << int(rng.integers(0, 8))
-            case 2:
-                data[place : place + 4] = rng.choice(
-                    [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80"]
-                )
-            case 3:
-                del data[place:]
-            case 4:
-                del data[place : place + length]
-            case 5:
-                data[place:place] = data[place : place + length]
-            case 6:
-                words = bytes(data).split(b" ")
-                words[int(rng.integers(0, len(words)))] = TEXT[int(rng.integers(0, len(TEXT)))]
-                data = bytearray(b" ".join(words))
-            case _:
-                # Heads hold the counts and sizes that readers trust.
-                head = int(rng.integers(0, min(len(data), 400) + 1))
-                data[head : head + 1] = bytes([rng.integers(0, 256)])
-    return bytes(data)
 
 
 @contextmanager

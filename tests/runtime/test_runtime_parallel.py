@@ -18,11 +18,12 @@ import pytest
 import torch
 from made_shapes import box
 from scan_files import torus
+from threadpoolctl import threadpool_info
 
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.compute_limits import limited
-from gnrecon.runtime.parallel import map_in_threads
+from gnrecon.runtime.parallel import map_in_threads, set_threads, worker_count
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
@@ -94,15 +95,48 @@ def test_the_process_is_left_as_it_was() -> None:
     assert state() == before
 
 
-def test_a_limit_of_threads_is_that_of_one_run() -> None:
-    def counts() -> tuple[int, int]:
-        with ThreadPoolExecutor(1) as fresh:
-            return torch.get_num_threads(), fresh.submit(torch.get_num_threads).result()
+def blas_threads() -> set[int]:
+    import scipy.linalg  # noqa: F401 - brings an OpenBLAS of its own
 
-    before = counts()
+    return {one["num_threads"] for one in threadpool_info() if one["internal_api"] == "openblas"}
+
+
+def test_a_limit_of_threads_is_that_of_one_run() -> None:
+    def counts() -> tuple[int, int, int]:
+        with ThreadPoolExecutor(1) as fresh:
+            return worker_count(), torch.get_num_threads(), fresh.submit(torch.get_num_threads).result()
+
+    before, of_blas = counts(), blas_threads()
     with limited(before[0] + 2):
-        assert counts() == (before[0] + 2, before[1])
+        assert counts() == (before[0] + 2, 1, before[2])
+        assert blas_threads() == {1}
+        with limited(None):
+            assert worker_count() == before[0] + 2
+        assert blas_threads() == {1}
     assert counts() == before
+    assert blas_threads() == of_blas
+
+
+def test_the_number_of_threads_changes_no_byte() -> None:
+    cloud = torus(250, np.random.default_rng(3))
+    options: dict[str, Any] = {"quality": "draft", "resolution": 24}
+    one, many = (reconstruct(*cloud, threads=threads, **options) for threads in (1, 3))
+    assert parts(many) == parts(one)
+    assert many.sdf.detail is not None
+    assert one.sdf.detail is not None
+    assert many.sdf.detail.amplitudes.numpy().tobytes() == one.sdf.detail.amplitudes.numpy().tobytes()
+    assert [one.report["resources"]["threads"], many.report["resources"]["threads"]] == [1, 3]
+
+
+def test_a_thread_that_never_called_torch_keeps_the_number_it_sets() -> None:
+    # Torch replaces the number at the first call of a thread.
+    def product() -> int:
+        set_threads(5)
+        torch.ones(3).sum()
+        return torch.get_num_threads()
+
+    with limited(3), ThreadPoolExecutor(1) as fresh:
+        assert fresh.submit(product).result() == 5
 
 
 def test_pieces_of_work_keep_their_order_and_have_one_thread_each() -> None:
@@ -119,7 +153,7 @@ def test_pieces_of_work_keep_their_order_and_have_one_thread_each() -> None:
     with limited(3):
         assert map_in_threads(piece, range(5), advance=told.append) == [(number, 1) for number in range(5)]
         assert map_in_threads(piece, []) == []
-        assert torch.get_num_threads() == 3
+        assert worker_count() == 3
         assert default() == before
     assert told == [0.2, 0.4, 0.6, 0.8, 1.0]
 

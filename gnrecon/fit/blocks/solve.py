@@ -34,6 +34,7 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import worker_count
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
@@ -89,8 +90,8 @@ def fit_large(
         if scheduler is not None and missing:
             solve_on_cluster(work, missing, scheduler, subrange(advance, chosen, 1.0))
         else:
-            # As many processes as torch has threads: the option, or by default the cores.
-            solve_blocks(work, missing, torch.get_num_threads(), options.device, subrange(advance, chosen, 1.0))
+            # As many processes as threads: the option, or by default the cores.
+            solve_blocks(work, missing, worker_count(), options.device, subrange(advance, chosen, 1.0))
         return _assembled(work, count, arrays["keys"], partition, features, hyperparameters)
 
 

@@ -231,3 +231,19 @@ class ShapePriorParameters:
     unoriented: UnorientedSnappingParameters = UnorientedSnappingParameters()
     resampling: ResamplingParameters = ResamplingParameters()
     sharp: SharpShapeParameters = SharpShapeParameters()
+
+
+@dataclass(frozen=True)
+class ConvexCompletionParameters:
+    """Parameters of the completion of few points in convex position (`fit/shape_priors/convex_completion.py`).
+
+    Parameters
+    ----------
+    most_points : more leave a free field little room between them
+    most_depth_spacings : how deep a point may lie beneath the hull, in median distances of nearest points
+    samples : of the whole hull, about
+    """
+
+    most_points: int = 100
+    most_depth_spacings: float = 0.1
+    samples: int = 300

@@ -192,8 +192,9 @@ def write_ply(mesh: Mesh, path: Path) -> None:
     lines += ["end_header", ""]
     with path.open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
-        vertices.tofile(file)
-        faces.tofile(file)
+        # Not `tofile`, which does not notice when the last bytes find the disk full.
+        file.write(vertices.data)
+        file.write(faces.data)
 
 
 PLY_TYPES = {

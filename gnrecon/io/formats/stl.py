@@ -60,5 +60,6 @@ def write_stl(mesh: Mesh, path: Path) -> None:
     facets["corners"] = mesh.corners if origin is None else mesh.corners - origin
     with path.open("wb") as file:
         file.write(stl_header(origin))
-        np.array(len(facets), "<u4").tofile(file)
-        facets.tofile(file)
+        # Not `tofile`, which does not notice when the last bytes find the disk full.
+        file.write(np.array(len(facets), "<u4").data)
+        file.write(facets.data)

@@ -1,0 +1,44 @@
+"""The list of licences names every package that is required, and gnrecon works without the one under the GPL."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnrecon.export import examine
+from gnrecon.export.boolean import to_meshlab
+from gnrecon.export.repair import repair
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.io import to_pymeshlab
+from gnrecon.runtime.errors import MeshError, UsageError
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def test_the_list_names_what_setup_cfg_requires() -> None:
+    script = "import make_licences as made; print(*made.required()); print(made.licence('numpy'))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=REPOSITORY / "scripts"
+    )
+    names, licence = done.stdout.splitlines()
+    page = (REPOSITORY / "docs" / "licences.md").read_text(encoding="utf-8")
+    assert {"numpy", "pymeshlab", "distributed", "pye57"} <= set(names.split())
+    assert [name for name in names.split() if f"\n| {name} | " not in page] == []
+    assert "BSD" in licence
+
+
+def test_without_pymeshlab(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    whole = Mesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    assert examine(whole).self_intersecting_faces is None
+    assert repair(whole)[1] == []
+    for convert in (to_meshlab, to_pymeshlab):
+        with pytest.raises(UsageError, match="needs the package pymeshlab"):
+            convert(whole)
+    with pytest.raises(MeshError, match="pymeshlab, which is not installed"):
+        repair(Mesh(corners, whole.faces[:3]))
