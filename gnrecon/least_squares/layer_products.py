@@ -21,6 +21,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gnrecon.runtime.parallel import map_in_threads
+
 Pair = tuple[Tensor, Tensor]
 
 
@@ -212,12 +214,16 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         above the diagonal
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
+    blocks = [slice(start, min(start + block_columns, size)) for start in range(0, size, block_columns)]
     for rows in chunks:
-        for start in range(0, size, block_columns):
-            stop = min(start + block_columns, size)
-            place = product[start:stop, :stop]
+
+        def add(block: slice, rows: Tensor = rows) -> None:
+            place = product[block, : block.stop]
             if rows.dtype == like.dtype:
-                place.addmm_(rows[:, start:stop].T, rows[:, :stop])
+                place.addmm_(rows[:, block].T, rows[:, : block.stop])
             else:
-                place += rows[:, start:stop].T @ rows[:, :stop]
+                place += rows[:, block].T @ rows[:, : block.stop]
+
+        # Threads share the blocks and no sum, so that the result is the same for any number of them.
+        map_in_threads(add, blocks, like.device)
     return product

@@ -17,7 +17,6 @@ from threading import Lock
 from typing import TypeVar
 
 import torch
-from threadpoolctl import ThreadpoolController
 
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -65,6 +64,7 @@ class _OneBlasThread:
         with self._lock:
             if self._blocks == 0:
                 import scipy.linalg  # noqa: F401 - scipy brings an OpenBLAS of its own, which must be loaded to be limited
+                from threadpoolctl import ThreadpoolController
 
                 # The MKL of torch is not among them: `torch_threads` limits it, in the calling thread alone.
                 libraries = ThreadpoolController().select(internal_api="openblas")
