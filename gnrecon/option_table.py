@@ -9,11 +9,12 @@ Only the standard library is imported here, because the command line reads the t
 
 from __future__ import annotations
 
-import types
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import cache
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
+
+from gnrecon.runtime.typed_values import value_types
 
 
 class Panel(StrEnum):
@@ -274,18 +275,12 @@ def option_rows() -> dict[str, OptionRow]:
     return {
         option.name: OptionRow(
             option.name,
-            _value_types(hints[option.name]),
+            value_types(hints[option.name]),
             option.default,
             **{**option.metadata, "flag": option.metadata["flag"] or f"--{option.name.replace('_', '-')}"},
         )
         for option in fields(OptionTable)
     }
-
-
-def _value_types(hint: Any) -> tuple[Any, ...]:
-    """The types of a hint besides None, numbers first: any text would pass for text."""
-    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    return tuple(sorted((kind for kind in kinds if kind is not type(None)), key=lambda kind: kind is str))
 
 
 def option_documentation() -> str:

@@ -20,6 +20,7 @@ from gnrecon.ingest.orientation import require_orientation
 from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.option_table import OptionTable, option_documentation, option_rows
 from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.typed_values import require_field_types
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class Options(OptionTable):
     def __post_init__(self) -> None:
         for name in ("crop", "clip_plane"):  # a single box or plane may be given as it is
             value = getattr(self, name)
-            object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+            object.__setattr__(self, name, (value,) if isinstance(value, str) else value)
+        require_field_types(self)
         self.region()
         parse_outliers(self.outliers, self.units)
         require_mode(self.clusters)
@@ -57,8 +59,6 @@ class Options(OptionTable):
             raise UsageError(f"The scan's unit must be one of {', '.join(METRES)}, not {self.units!r}.")
         if self.seed < 0:
             raise UsageError(f"The seed must not be negative, not {self.seed}.")
-        if self.widths is not None and not isinstance(self.widths, list | tuple):
-            raise UsageError(f"The widths must be a sequence such as (2000,), not {self.widths!r}.")
         if not all(name.strip() for name in self.attributes.split(",")):
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
 
@@ -139,7 +139,7 @@ class Options(OptionTable):
     def fit(self) -> FitOptions:
         """Return the options of the fit."""
         return FitOptions(
-            widths=None if self.widths is None else tuple(self.widths),
+            widths=self.widths,
             steps=self.steps,
             quality=self.quality,
             normals=self.normal_residual,

@@ -39,13 +39,16 @@ from gnrecon.io import (
     cropped,
     read_reference,
     read_scans,
+    to_meshio,
     to_open3d,
     to_pymeshlab,
+    to_pyvista,
     to_trimesh,
     write_mesh,
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
+from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
 from gnrecon.runtime.compute_limits import limited, require_device
@@ -105,6 +108,21 @@ class Reconstruction:
     uncertainty: Uncertainty | None = None
     cloud: PointCloud | None = None
 
+    def __repr__(self) -> str:
+        kind = "closed" if self.report["mesh"]["closed"] else "open"
+        return f"<Reconstruction: {kind} mesh of {len(self.mesh.vertices):,} vertices, {len(self.mesh.faces):,} faces>"
+
+    def _repr_html_(self) -> str:
+        """The picture and the facts that a notebook shows."""
+        return result_html(self.report, self.mesh, self.cloud)
+
+    def show(self, height: int = 720) -> Path | None:
+        """Show the interactive page: below a notebook's cell, `height` pixels high, or else in the web browser.
+
+        Returns the file that the browser shows, which is a temporary one; None in a notebook.
+        """
+        return show_page(page_text(self.report, self.mesh, self.cloud), height=height)
+
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
 
@@ -133,6 +151,14 @@ class Reconstruction:
     def to_pymeshlab(self) -> Any:
         """Return the mesh as a `pymeshlab.MeshSet`."""
         return to_pymeshlab(self.mesh)
+
+    def to_pyvista(self) -> Any:
+        """Return the mesh as a `pyvista.PolyData`."""
+        return to_pyvista(self.mesh)
+
+    def to_meshio(self) -> Any:
+        """Return the mesh as a `meshio.Mesh`."""
+        return to_meshio(self.mesh)
 
 
 def reconstruct(

@@ -63,3 +63,7 @@ def test_the_rest_is_not_offered() -> None:
     assert [name for name in gnrecon.__all__ if name.startswith("_")] == ["__version__"]
     with pytest.raises(AttributeError, match="has no attribute 'no_such_name'"):
         gnrecon.no_such_name  # noqa: B018
+
+
+def test_dir_is_what_is_public() -> None:
+    assert dir(gnrecon) == sorted(gnrecon.__all__)
