@@ -22,7 +22,7 @@ from typing import Any, get_args, get_origin
 import tomli_w
 
 from gnrecon.option_table import option_rows
-from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.errors import InputError, UsageError, suggestion
 from gnrecon.runtime.typed_values import described
 from gnrecon.version import __version__
 
@@ -129,7 +129,7 @@ def _checked(table: Mapping[str, Any], where: str, folder: Path) -> dict[str, An
     for key, value in table.items():
         name = key.replace("-", "_")
         if name not in known:
-            raise UsageError(f"{where}there is no option {key!r}; the options are {', '.join(known)}.")
+            raise UsageError(f"{where}there is no option {key!r}{suggestion(name, known)}.")
         if name in found:
             raise UsageError(f"{where}{name} is there twice, with a hyphen and without.")
         if name in ("timeout", "memory"):

@@ -14,12 +14,12 @@ from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Region
-from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach
+from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach, parse_share
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.orientation import require_orientation
 from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.option_table import OptionTable, option_documentation, option_rows
-from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.errors import UsageError, suggestion
 from gnrecon.runtime.typed_values import require_field_types
 
 
@@ -36,6 +36,9 @@ class Options(OptionTable):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else value)
         require_field_types(self)
+        for name in ("fraction", "holdout"):
+            if (share := getattr(self, name)) is not None:
+                object.__setattr__(self, name, parse_share(name, share))
         self.region()
         parse_outliers(self.outliers, self.units)
         require_mode(self.clusters)
@@ -45,7 +48,7 @@ class Options(OptionTable):
         for length in (self.spacing, self.smooth_scan):
             if length is not None:
                 parse_reach(str(length), 1.0, self.units)
-        if self.holdout is not None and not 0 < self.holdout < 1:
+        if self.holdout == 1:
             raise UsageError(f"The share of points to hold out is {self.holdout}, but must lie between 0 and 1.")
         require_orientation(self.orient)
         self._require_block_options()
@@ -81,7 +84,7 @@ class Options(OptionTable):
         known = option_rows()
         for name in values:
             if name not in known:
-                raise UsageError(f"There is no option {name!r}; the options are {', '.join(known)}.")
+                raise UsageError(f"There is no option {name!r}{suggestion(name, known)}.")
         return cls(**values)
 
     def ingest(self) -> dict[str, Any]:

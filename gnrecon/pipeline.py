@@ -48,6 +48,7 @@ from gnrecon.io import (
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
+from gnrecon.report.estimate import estimate
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
@@ -70,6 +71,9 @@ class Progress:
 
     def advance(self, share: float) -> None:
         """Called from time to time with the share of the stage that is done, from 0 to 1, never decreasing."""
+
+    def expect(self, fit_seconds: float, mesh_seconds: float) -> None:
+        """Called before the fit with the seconds that it and the mesh may take, where such runs were measured."""
 
     def step(self, record: Record, total: int) -> None:
         """Called after each step of the fit, of `total` at most."""
@@ -265,6 +269,8 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
     run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
+        run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     warnings = [] if ingested.layers is None else [ingested.layers.describe()]
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested

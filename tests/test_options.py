@@ -63,7 +63,7 @@ from gnrecon.runtime.errors import UsageError
         ({"widths": 300}, "widths must be a list of whole numbers such as 2000 or 32,32,32, not 300"),
         ({"widths": (1.5,)}, "widths must be a list of whole numbers .*, not .1.5,"),
         ({"crop": 5}, "crop must be a list of texts, not 5"),
-        ({"holdout": np.zeros(99)}, "holdout must be a number, not a value of type ndarray"),
+        ({"holdout": np.zeros(99)}, "holdout must be a number or text, not a value of type ndarray"),
         ({"quality": 3}, "quality must be text, not 3"),
         ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
     ],
