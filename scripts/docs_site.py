@@ -7,6 +7,7 @@ that is made from the docstrings of all public names. Links to source files, whi
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def _path(name: str) -> str:
     """Where mkdocstrings, which reads the source and runs nothing, finds a public name."""
     package = REPOSITORY / "gnrecon" / name
     if package.is_dir() or package.with_suffix(".py").is_file():  # of a room of the same name, it would take the room
-        found = getattr(gnrecon, name)
+        found = getattr(import_module(f"gnrecon.{name}"), name)
         return f"{found.__module__}.{found.__qualname__}"
     return f"gnrecon.{name}"
 
