@@ -40,11 +40,16 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
     InputError
         When `obj` is none of these, a file cannot be read, or shapes do not fit.
     """
-    found = _from_file(obj, "read_cloud") if isinstance(obj, str | Path) else _from_library(obj)
+    cloud = _from_file(obj, "read_cloud") if isinstance(obj, str | Path) else _cloud_of_object(obj)
+    return cloud if normals is None else cloud.with_normals(_array(normals))
+
+
+def _cloud_of_object(obj: Any) -> PointCloud:
+    """The cloud of anything but a path."""
+    found = _from_library(obj)
     if found is None:
         found = _columns(obj) if _names(obj) else _from_array(_array(obj))
-    cloud = PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
-    return cloud if normals is None else cloud.with_normals(_array(normals))
+    return PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
 
 
 def as_mesh(obj: Any) -> Mesh:
@@ -76,24 +81,23 @@ def as_mesh(obj: Any) -> Mesh:
 
 
 def as_shape(obj: Any) -> Mesh | PointCloud:
-    """Return a mesh where an object has faces, else a cloud.
+    """Return a mesh where an object has faces, else a cloud; paths are not read, as plugins' results come here.
 
     Raises
     ------
     InputError
         As `as_cloud` does.
     """
-    found = _from_file(obj, "read_reference") if isinstance(obj, str | Path) else _from_library(obj)
-    return as_cloud(obj) if found is None else found
+    found = _from_library(obj)
+    return _cloud_of_object(obj) if found is None else found
 
 
-def _from_file(path: str | Path, kind: str) -> Mesh | PointCloud:
+def _from_file(path: str | Path, kind: str) -> Any:
     """What a function of `gnrecon.io.read` reads from a file."""
     # Imported here, because its table of formats takes what plugins return through this module.
     from gnrecon.io import read
 
-    found: Mesh | PointCloud = getattr(read, kind)(Path(path))
-    return found
+    return getattr(read, kind)(Path(path))
 
 
 def _from_library(obj: Any) -> Mesh | PointCloud | None:
