@@ -1,8 +1,8 @@
 """The time that a running reconstruction still takes: the measured model's, corrected by the run's own pace.
 
 The model of `gnrecon.report.estimate` gives seconds for the fit and for the mesh before the fit begins. As the fit goes
-on, the pace is the time that it took over the time that the model expected for the share that is done. At first, part
-of the model's own time counts as done at the expected pace, so that a slow first moment says little:
+on, the pace is the time that it took over the time that the model expected for the share that is done. What is still to
+do counts at the expected pace, because shares do not grow evenly: trials of length scales come first and report little:
 
     pace = (elapsed + prior) / (share expected + prior)        prior = (1 - share) trust expected
 """
@@ -22,7 +22,7 @@ class TimeLeft:
     trust : share of the expected time of the fit that counts as measured at the expected pace
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, *, trust: float = 0.25) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic, *, trust: float = 1.0) -> None:
         self._clock, self._trust = clock, trust
         self._fit_seconds = self._mesh_seconds = 0.0
         self._stage, self._share = "", 0.0
