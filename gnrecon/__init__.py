@@ -43,8 +43,10 @@ if TYPE_CHECKING:
         read_cloud,
         read_mesh,
         readable,
+        to_meshio,
         to_open3d,
         to_pymeshlab,
+        to_pyvista,
         to_trimesh,
         writable,
         write_cloud,
@@ -78,8 +80,10 @@ _ROOMS = {
         "read_cloud",
         "read_mesh",
         "readable",
+        "to_meshio",
         "to_open3d",
         "to_pymeshlab",
+        "to_pyvista",
         "to_trimesh",
         "writable",
         "write_cloud",
@@ -133,8 +137,10 @@ __all__ = [
     "require_sound",
     "shaped",
     "survey",
+    "to_meshio",
     "to_open3d",
     "to_pymeshlab",
+    "to_pyvista",
     "to_trimesh",
     "trim",
     "verify",
@@ -160,3 +166,8 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(room), name)
     globals()[name] = value
     return value
+
+
+def __dir__() -> list[str]:
+    """The public names, so that completion offers these and nothing else."""
+    return sorted(__all__)

@@ -22,7 +22,8 @@ from typing import Any, get_args, get_origin
 import tomli_w
 
 from gnrecon.option_table import option_rows
-from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.errors import InputError, UsageError, suggestion
+from gnrecon.runtime.typed_values import described
 from gnrecon.version import __version__
 
 
@@ -128,7 +129,7 @@ def _checked(table: Mapping[str, Any], where: str, folder: Path) -> dict[str, An
     for key, value in table.items():
         name = key.replace("-", "_")
         if name not in known:
-            raise UsageError(f"{where}there is no option {key!r}; the options are {', '.join(known)}.")
+            raise UsageError(f"{where}there is no option {key!r}{suggestion(name, known)}.")
         if name in found:
             raise UsageError(f"{where}{name} is there twice, with a hyphen and without.")
         if name in ("timeout", "memory"):
@@ -159,8 +160,7 @@ def typed(name: str, value: Any, where: str = "") -> Any:
         found = _converted(kind, value)
         if found is not None:
             return found
-    expected = " or ".join(dict.fromkeys(_described(kind) for kind in kinds))
-    raise UsageError(f"{where}{name} must be {expected}, not {value!r}.")
+    raise UsageError(f"{where}{name} must be {described(kinds)}, not {value!r}.")
 
 
 def _converted(kind: Any, value: Any) -> Any:
@@ -191,9 +191,3 @@ def _read_value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except (tomllib.TOMLDecodeError, KeyError):
         return text
-
-
-def _described(kind: Any) -> str:
-    if get_origin(kind) is tuple:
-        return "a list of texts" if get_args(kind)[0] is str else "a list of whole numbers such as 2000 or 32,32,32"
-    return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]

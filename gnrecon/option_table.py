@@ -9,11 +9,12 @@ Only the standard library is imported here, because the command line reads the t
 
 from __future__ import annotations
 
-import types
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import cache
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
+
+from gnrecon.runtime.typed_values import value_types
 
 
 class Panel(StrEnum):
@@ -41,6 +42,9 @@ class OptionRow:
     flag : spelling on the command line
     metavar : what ``--help`` shows for the value, where the name of its type says too little
     in_batch : whether the command ``batch`` has it
+    limits : range of its values in words, where the help text does not name the values
+    unset : what holds where the default is None
+    choices : what a shell completes
     """
 
     name: str
@@ -51,6 +55,18 @@ class OptionRow:
     flag: str
     metavar: str | None
     in_batch: bool
+    limits: str
+    unset: str
+    choices: tuple[str, ...]
+
+    @property
+    def described(self) -> str:
+        """The help text, followed by range and default."""
+        if self.default is False:
+            return self.help
+        listed = ", ".join(self.default) if isinstance(self.default, tuple) else self.default
+        default = self.unset if self.default in (None, ()) else f"{listed:,}" if self.limits else str(listed)
+        return f"{self.help} [{'; '.join(part for part in (self.limits, f'default: {default}') if part)}]"
 
 
 def _row(
@@ -61,8 +77,12 @@ def _row(
     flag: str | None = None,
     metavar: str | None = None,
     in_batch: bool = True,
+    limits: str = "",
+    unset: str = "off",
+    choices: tuple[str, ...] = (),
 ) -> Any:
-    entry = {"panel": panel, "help": help, "flag": flag, "metavar": metavar, "in_batch": in_batch}
+    entry: dict[str, Any] = {"panel": panel, "help": help, "flag": flag, "metavar": metavar, "in_batch": in_batch}
+    entry |= {"limits": limits, "unset": unset, "choices": choices}
     return field(default=default, metadata=entry)
 
 
@@ -74,12 +94,14 @@ class OptionTable:
         2_000_000,
         Panel.POINTS,
         "Keep at most this many points while reading; larger scans are thinned by voxels.",
+        limits="at least 1",
     )
     crop: tuple[str, ...] = _row(
         (),
         Panel.POINTS,
         "Keep points in the box xmin,ymin,zmin,xmax,ymax,zmax, in file units; if repeated, in any of the boxes.",
         metavar="BOX",
+        unset="all points",
     )
     clip_plane: tuple[str, ...] = _row(
         (),
@@ -87,57 +109,84 @@ class OptionTable:
         "Keep points with a x + b y + c z + d of at least 0, in file units; if repeated, points that satisfy all "
         "planes.",
         metavar="PLANE",
+        unset="all points",
     )
     units: str | None = _row(
         None,
         Panel.POINTS,
         "Unit of the scan (um, mm, cm, m, km, in, ft); lengths may then have a unit, such as 2mm.",
+        unset="unknown",
+        choices=("um", "mm", "cm", "m", "km", "in", "ft"),
     )
-    fraction: float | None = _row(None, Panel.POINTS, "Share of the points to keep, above 0 and up to 1.")
-    max_points: int | None = _row(None, Panel.POINTS, "Keep at most this many points for the fit.")
+    fraction: float | str | None = _row(
+        None,
+        Panel.POINTS,
+        "Share of the points to keep, such as 0.2 or 20%.",
+        limits="above 0, up to 1 or 100%",
+        unset="1",
+        metavar="SHARE",
+    )
+    max_points: int | None = _row(
+        None,
+        Panel.POINTS,
+        "Keep at most this many points for the fit.",
+        limits="at least 1",
+        unset="all",
+    )
     spacing: float | str | None = _row(
         None,
         Panel.POINTS,
         "Thin the points to this distance: in file units or, as 2s, in multiples of their spacing.",
+        limits="above 0",
+        metavar="LENGTH",
     )
     subsample: str = _row(
         "random",
         Panel.POINTS,
         "How points are chosen: random, voxel, poisson, farthest or curvature (more where the surface bends).",
+        choices=("random", "voxel", "poisson", "farthest", "curvature"),
     )
-    holdout: float | None = _row(
+    holdout: float | str | None = _row(
         None,
         Panel.POINTS,
-        "Exclude this share of the points from the fit, such as 0.1, and report their distances from its surface.",
+        "Exclude this share of the points from the fit, such as 0.1 or 10%, and report their distances from its "
+        "surface.",
+        limits="between 0 and 1 or 100%",
+        metavar="SHARE",
     )
     outliers: str = _row(
         "auto",
         Panel.POINTS,
         "Remove scattered points: auto (unless they are more than 5 %), on or off; or by another rule, statistical:2 "
         "(deviations) or radius:3s,4 (fewer than 4 others within 3 spacings).",
+        choices=("auto", "on", "off"),
     )
     clusters: str = _row(
         "auto",
         Panel.POINTS,
         "Remove small clusters whose distance from the rest exceeds their size: auto, on or off, as above.",
+        choices=("auto", "on", "off"),
     )
     smooth_scan: float | str | None = _row(
         None,
         Panel.POINTS,
         "Smooth the points by moving least squares over this width: in file units or, as 8s, in spacings.",
         metavar="WIDTH",
+        limits="above 0",
     )
     orient: str = _row(
         "auto",
         Panel.POINTS,
         "Normals: auto (estimate missing ones, flip them where all point inward), given (keep them), signs (recompute "
         "their sides) or estimate (recompute them).",
+        choices=("auto", "given", "signs", "estimate"),
     )
     attributes: str = _row(
         "auto",
         Panel.MESH,
         "What vertices carry: auto (all attributes of the points, and the distance to them), none, or names such as "
         "colors,intensity.",
+        choices=("auto", "none"),
     )
     curvature: bool = _row(
         False,
@@ -153,16 +202,22 @@ class OptionTable:
     resolution: int | None = _row(
         None,
         Panel.MESH,
-        "Cells along the longest side of the box, at least 16; by default 128 to 1,024, from the points' spacing.",
+        "Cells along the longest side of the box.",
+        limits="at least 16",
+        unset="128 to 1,024, from the points' spacing",
     )
     edge_length: float | None = _row(
-        None, Panel.MESH, "Choose the resolution by the mean length of the mesh's edges, in file units."
+        None,
+        Panel.MESH,
+        "Choose the resolution by the mean length of the mesh's edges, in file units.",
+        limits="above 0",
     )
     max_error: float | None = _row(
         None,
         Panel.MESH,
         "Refine the mesh, up to 1,024 cells, until 99.9 % of face centres and edge midpoints are this close to the "
         "fitted surface, in file units.",
+        limits="above 0",
     )
     keep_handles: bool = _row(False, Panel.MESH, "Keep handles and tunnels that no points support.")
     trim: float | str | None = _row(
@@ -170,9 +225,15 @@ class OptionTable:
         Panel.MESH,
         "Cut off what is farther than this from all points, in file units or, as 3s, in spacings; the mesh is then "
         "open.",
+        limits="above 0",
+        metavar="LENGTH",
     )
     remesh: float | None = _row(
-        None, Panel.MESH, "Remesh to nearly equilateral faces of this edge length, in file units.", metavar="LENGTH"
+        None,
+        Panel.MESH,
+        "Remesh to nearly equilateral faces of this edge length, in file units.",
+        metavar="LENGTH",
+        limits="above 0",
     )
     adaptive: bool = _row(
         False, Panel.MESH, "With --remesh: shorter edges where the surface bends, down to an eighth of the length."
@@ -182,56 +243,75 @@ class OptionTable:
         Panel.MESH,
         "Remove vertices while the surface moves by at most this distance, in file units.",
         metavar="DISTANCE",
+        limits="above 0",
     )
-    faces: int | None = _row(None, Panel.MESH, "Reduce the mesh to this number of faces.")
+    faces: int | None = _row(
+        None,
+        Panel.MESH,
+        "Reduce the mesh to this number of faces.",
+        limits="at least 4",
+    )
     feature_angle: float = _row(
         30.0,
         Panel.MESH,
         "With --remesh, --simplify or --faces: angle between neighbouring faces, in degrees, from which an edge is "
         "kept sharp.",
+        limits="5 to 90",
     )
     smooth: str | None = _row(
         None,
         Panel.FIT,
         "Penalise curvature: strain=1e-4 (lengths in radii) halves bumps 0.63 long and removes shorter ones.",
         metavar="strain=WEIGHT",
+        limits="a weight above 0",
     )
     fill: str | None = _row(
         None,
         Panel.FIT,
         "Close holes by minimal surfaces, as soap films do, instead of continuing the surface's curvature.",
         metavar="minimal",
+        choices=("minimal",),
     )
     prior: str | None = _row(
         None,
         Panel.FIT,
         "Prefer surfaces that unroll into a plane between sharp edges, as bent sheet metal does.",
         metavar="developable",
+        choices=("developable",),
     )
     widths: tuple[int, ...] | None = _row(
         None,
         Panel.FIT,
-        "Fit one sine network with these hidden layers by Gauss-Newton, such as 2000 or 32,32,32; by default, a global "
-        "field with local corrections.",
+        "Fit one sine network with these hidden layers by Gauss-Newton, such as 2000 or 32,32,32.",
+        limits="each at least 1",
+        unset="a global field with local corrections",
+        metavar="WIDTHS",
     )
     steps: int | None = _row(
         None,
         Panel.FIT,
         "Fit one network with at most this many steps after its linear start. The default for one network: gn 4 (none "
         "below 1,000 points; 120 for several layers), adam 2,000, lbfgs 40.",
+        limits="at least 0",
+        unset="by the network",
     )
     quality: str = _row(
-        "normal", Panel.FIT, "Time against accuracy: draft, normal or high set the number of local features."
+        "normal",
+        Panel.FIT,
+        "Time against accuracy: draft, normal or high set the number of local features.",
+        choices=("draft", "normal", "high"),
     )
     normal_residual: str = _row(
         "vector",
         Panel.FIT,
         "Residual of the normals: vector, projection, cosine, or one from a plug-in. All but vector fit one network.",
+        choices=("vector", "projection", "cosine"),
     )
     optimiser: str = _row(
         "gn",
         Panel.FIT,
         "gn (Gauss-Newton), or the paper's baselines, adam (cosine schedule) and lbfgs, which fit one network.",
+        choices=("gn", "adam", "lbfgs"),
     )
     solver: str = _row(
         "auto",
@@ -239,16 +319,47 @@ class OptionTable:
         "Linear solver of Gauss-Newton's steps: auto (by rows, parameters, memory and device), cholesky, qr, "
         "row-space, cg-sampled, cg-neighbours, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, gmres or "
         "sketched.",
+        choices=(
+            "auto",
+            "cholesky",
+            "qr",
+            "row-space",
+            "cg-sampled",
+            "cg-neighbours",
+            "cg-kronecker",
+            "cg-nystrom",
+            "cg-block-jacobi",
+            "cg-jacobi",
+            "gmres",
+            "sketched",
+        ),
     )
     search: str = _row(
         "auto",
         Panel.FIT,
         "Step control of Gauss-Newton: damping (by gain ratio), geodesic (the same, with geodesic acceleration), line "
         "(log-spaced step lengths) or auto.",
+        choices=("auto", "damping", "geodesic", "line"),
     )
-    seed: int = _row(0, Panel.FIT, "Seed of all random choices.")
-    device: str = _row("cpu", Panel.FIT, "Where the fit and the mesh are computed: cpu or cuda.")
-    threads: int | None = _row(None, Panel.FIT, "CPU threads; by default, torch's choice.")
+    seed: int = _row(
+        0,
+        Panel.FIT,
+        "Seed of all random choices.",
+        limits="at least 0",
+    )
+    device: str = _row(
+        "cpu",
+        Panel.FIT,
+        "Where the fit and the mesh are computed: cpu or cuda.",
+        choices=("cpu", "cuda"),
+    )
+    threads: int | None = _row(
+        None,
+        Panel.FIT,
+        "CPU threads.",
+        limits="at least 1",
+        unset="torch's choice",
+    )
     work_dir: str | None = _row(
         None,
         Panel.FIT,
@@ -274,7 +385,7 @@ def option_rows() -> dict[str, OptionRow]:
     return {
         option.name: OptionRow(
             option.name,
-            _value_types(hints[option.name]),
+            value_types(hints[option.name]),
             option.default,
             **{**option.metadata, "flag": option.metadata["flag"] or f"--{option.name.replace('_', '-')}"},
         )
@@ -282,14 +393,8 @@ def option_rows() -> dict[str, OptionRow]:
     }
 
 
-def _value_types(hint: Any) -> tuple[Any, ...]:
-    """The types of a hint besides None, numbers first: any text would pass for text."""
-    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    return tuple(sorted((kind for kind in kinds if kind is not type(None)), key=lambda kind: kind is str))
-
-
 def option_documentation() -> str:
     """Return the rows as the ``Parameters`` section of a docstring."""
     hints = OptionTable.__annotations__
-    rows = [f"{row.name} : {hints[row.name]}\n        {row.help}" for row in option_rows().values()]
+    rows = [f"{row.name} : {hints[row.name]}\n        {row.described}" for row in option_rows().values()]
     return "\n    ".join(["Parameters", "----------", *rows])

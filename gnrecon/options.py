@@ -14,12 +14,13 @@ from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Region
-from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach
+from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach, parse_share
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.orientation import require_orientation
 from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.option_table import OptionTable, option_documentation, option_rows
-from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.errors import UsageError, suggestion
+from gnrecon.runtime.typed_values import require_field_types
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,11 @@ class Options(OptionTable):
     def __post_init__(self) -> None:
         for name in ("crop", "clip_plane"):  # a single box or plane may be given as it is
             value = getattr(self, name)
-            object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+            object.__setattr__(self, name, (value,) if isinstance(value, str) else value)
+        require_field_types(self)
+        for name in ("fraction", "holdout"):
+            if (share := getattr(self, name)) is not None:
+                object.__setattr__(self, name, parse_share(name, share))
         self.region()
         parse_outliers(self.outliers, self.units)
         require_mode(self.clusters)
@@ -43,7 +48,7 @@ class Options(OptionTable):
         for length in (self.spacing, self.smooth_scan):
             if length is not None:
                 parse_reach(str(length), 1.0, self.units)
-        if self.holdout is not None and not 0 < self.holdout < 1:
+        if self.holdout == 1:
             raise UsageError(f"The share of points to hold out is {self.holdout}, but must lie between 0 and 1.")
         require_orientation(self.orient)
         self._require_block_options()
@@ -57,8 +62,6 @@ class Options(OptionTable):
             raise UsageError(f"The scan's unit must be one of {', '.join(METRES)}, not {self.units!r}.")
         if self.seed < 0:
             raise UsageError(f"The seed must not be negative, not {self.seed}.")
-        if self.widths is not None and not isinstance(self.widths, list | tuple):
-            raise UsageError(f"The widths must be a sequence such as (2000,), not {self.widths!r}.")
         if not all(name.strip() for name in self.attributes.split(",")):
             raise UsageError(f"The attributes are auto, none or names separated by commas, not {self.attributes!r}.")
 
@@ -81,7 +84,7 @@ class Options(OptionTable):
         known = option_rows()
         for name in values:
             if name not in known:
-                raise UsageError(f"There is no option {name!r}; the options are {', '.join(known)}.")
+                raise UsageError(f"There is no option {name!r}{suggestion(name, known)}.")
         return cls(**values)
 
     def ingest(self) -> dict[str, Any]:
@@ -139,7 +142,7 @@ class Options(OptionTable):
     def fit(self) -> FitOptions:
         """Return the options of the fit."""
         return FitOptions(
-            widths=None if self.widths is None else tuple(self.widths),
+            widths=self.widths,
             steps=self.steps,
             quality=self.quality,
             normals=self.normal_residual,

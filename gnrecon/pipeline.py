@@ -40,13 +40,17 @@ from gnrecon.io import (
     cropped,
     read_reference,
     read_scans,
+    to_meshio,
     to_open3d,
     to_pymeshlab,
+    to_pyvista,
     to_trimesh,
     write_mesh,
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
+from gnrecon.report.estimate import estimate
+from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
 from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark
@@ -69,6 +73,9 @@ class Progress:
 
     def advance(self, share: float) -> None:
         """Called from time to time with the share of the stage that is done, from 0 to 1, never decreasing."""
+
+    def expect(self, fit_seconds: float, mesh_seconds: float) -> None:
+        """Called before the fit with the seconds that it and the mesh may take, where such runs were measured."""
 
     def step(self, record: Record, total: int) -> None:
         """Called after each step of the fit, of `total` at most."""
@@ -107,6 +114,21 @@ class Reconstruction:
     uncertainty: Uncertainty | None = None
     cloud: PointCloud | None = None
 
+    def __repr__(self) -> str:
+        kind = "closed" if self.report["mesh"]["closed"] else "open"
+        return f"<Reconstruction: {kind} mesh of {len(self.mesh.vertices):,} vertices, {len(self.mesh.faces):,} faces>"
+
+    def _repr_html_(self) -> str:
+        """The picture and the facts that a notebook shows."""
+        return result_html(self.report, self.mesh, self.cloud)
+
+    def show(self, height: int = 720) -> Path | None:
+        """Show the interactive page: below a notebook's cell, `height` pixels high, or else in the web browser.
+
+        Returns the file that the browser shows, which is a temporary one; None in a notebook.
+        """
+        return show_page(page_text(self.report, self.mesh, self.cloud), height=height)
+
     def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
 
@@ -135,6 +157,14 @@ class Reconstruction:
     def to_pymeshlab(self) -> Any:
         """Return the mesh as a `pymeshlab.MeshSet`."""
         return to_pymeshlab(self.mesh)
+
+    def to_pyvista(self) -> Any:
+        """Return the mesh as a `pyvista.PolyData`."""
+        return to_pyvista(self.mesh)
+
+    def to_meshio(self) -> Any:
+        """Return the mesh as a `meshio.Mesh`."""
+        return to_meshio(self.mesh)
 
 
 def reconstruct(
@@ -241,6 +271,8 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
     run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
+        run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     warnings = [] if ingested.layers is None else [ingested.layers.describe()]
     warnings += few_points_remark(samples.frame.to_world(samples.points))
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])

@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.text import Text
 
 from gnrecon.config import settings_text
 from gnrecon.io import all_input_files, check_writable, written_origin
@@ -22,6 +32,7 @@ from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
 from gnrecon.rendering import render, render_sheet
 from gnrecon.report.html import page_text
+from gnrecon.report.time_left import TimeLeft
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
 from gnrecon.runtime.logs import logged
@@ -178,23 +189,42 @@ def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, An
     )
 
 
-class ConsoleProgress(PipelineProgress):
-    """Shows stages, steps and remarks on a console."""
+class _TimeLeftColumn(ProgressColumn):
+    """The time to the end of the run, not only of the stage."""
 
-    def __init__(self, console: Console, bar: Progress, verbose: bool) -> None:
-        self._console, self._bar, self._verbose = console, bar, verbose
+    def __init__(self, left: TimeLeft) -> None:
+        super().__init__()
+        self._left = left
+
+    def render(self, task: Task) -> Text:
+        """Return the time as text."""
+        del task
+        return Text(self._left.describe(), style="progress.remaining")
+
+
+class ConsoleProgress(PipelineProgress):
+    """Shows stages, steps, remarks and the time left on a console."""
+
+    def __init__(self, console: Console, bar: Progress, verbose: bool, left: TimeLeft) -> None:
+        self._console, self._bar, self._verbose, self._left = console, bar, verbose, left
         self._task: TaskID | None = None
 
     def stage(self, name: str) -> None:
         """Start a bar for a stage."""
+        self._left.stage(name)
         if self._task is not None:
             self._bar.remove_task(self._task)
         self._task = self._bar.add_task(STAGES[name], total=None, detail="")
 
     def advance(self, share: float) -> None:
         """Fill the bar up to a share of the stage."""
+        self._left.advance(share)
         if self._task is not None:
             self._bar.update(self._task, completed=share, total=1.0)
+
+    def expect(self, fit_seconds: float, mesh_seconds: float) -> None:
+        """Show the time left from now on."""
+        self._left.expect(fit_seconds, mesh_seconds)
 
     def step(self, record: Record, total: int) -> None:
         """Show a step's loss, damping and gain ratio."""
@@ -214,13 +244,14 @@ class ConsoleProgress(PipelineProgress):
 @contextmanager
 def progress_bar(console: Console, verbose: bool) -> Iterator[ConsoleProgress]:
     """Show a progress bar on a terminal while the block runs, and yield the callbacks that fill it."""
+    left = TimeLeft()
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:10}"),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[detail]}"),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        _TimeLeftColumn(left),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield ConsoleProgress(console, bar, verbose)
+        yield ConsoleProgress(console, bar, verbose, left)

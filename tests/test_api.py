@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from typing import Any
 
 import make_api
+import numpy as np
 import pytest
+from scan_files import torus
 
 import gnrecon
 
@@ -63,3 +66,15 @@ def test_the_rest_is_not_offered() -> None:
     assert [name for name in gnrecon.__all__ if name.startswith("_")] == ["__version__"]
     with pytest.raises(AttributeError, match="has no attribute 'no_such_name'"):
         gnrecon.no_such_name  # noqa: B018
+
+
+def test_dir_is_what_is_public() -> None:
+    assert dir(gnrecon) == sorted(gnrecon.__all__)
+
+
+def test_a_function_is_not_lost_to_the_package_of_its_name() -> None:
+    package = importlib.import_module("gnrecon.fit")
+    samples, _ = gnrecon.prepare(gnrecon.as_cloud(*torus(300, np.random.default_rng(3))))
+    options = gnrecon.FitOptions(widths=(20,), steps=0)
+    fields = [fit(samples, options)[0] for fit in (package, package.fit)]  # type: ignore[operator]
+    assert float(abs(fields[0].theta - fields[1].theta).max()) == 0

@@ -55,7 +55,7 @@ def test_a_reference_lies_beside_the_configuration(tmp_path: Path) -> None:
     ("text", "sentence"),
     [
         ("resolution = ", "is not TOML"),
-        ("resolutions = 3", "there is no option 'resolutions'; the options are read_points, crop"),
+        ("resolutions = 3", "there is no option 'resolutions'; perhaps you mean 'resolution'"),
         ("resolution = 'fine'", "resolution must be a whole number, not 'fine'"),
         ("resolution = 1.5", "resolution must be a whole number, not 1.5"),
         ("adaptive = 1", "adaptive must be true or false, not 1"),
@@ -64,7 +64,7 @@ def test_a_reference_lies_beside_the_configuration(tmp_path: Path) -> None:
         ("max-points = 1\nmax_points = 2", "max_points is there twice"),
         ("scans = 3", "go into tables such as"),
         ("[scans]\nseed = 3", "go into tables such as"),
-        ("[scans.'a*']\nsead = 3", r"a\*: there is no option 'sead'"),
+        ("[scans.'a*']\nsead = 3", r"a\*: there is no option 'sead'; perhaps you mean 'seed'"),
     ],
 )
 def test_configurations_that_make_no_sense(tmp_path: Path, text: str, sentence: str) -> None:

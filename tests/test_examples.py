@@ -1,4 +1,4 @@
-"""The examples run as they are documented: a folder is watched, and an open3d script goes through gnrecon."""
+"""The examples run as they are documented: a folder is watched, and scripts of other libraries go through gnrecon."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import open3d_pipeline
+import pymeshlab_pipeline
 import pytest
 import watch_folder
 from scan_files import torus, write_scan
@@ -136,3 +137,21 @@ def test_the_open3d_script(scan: Path, tmp_path: Path) -> None:
     assert found.mean < 0.02
     assert found.mean <= found.largest < 0.2
     require_sound(read_mesh(mesh))
+
+
+def test_the_pymeshlab_script(scan: Path, tmp_path: Path) -> None:
+    mesh = tmp_path / "mesh.ply"
+    found = pymeshlab_pipeline.pipeline(scan, mesh, points=400, **FEW)
+    assert found["boundary_edges"] == 0
+    assert found["genus"] == 1
+    require_sound(read_mesh(mesh))
+
+
+def test_the_pyvista_script(scan: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyvista", reason="pyvista is not installed")
+    import pyvista_pipeline
+
+    surface = pyvista_pipeline.pipeline(scan, tmp_path / "mesh.vtp", **FEW)
+    assert surface.is_manifold
+    assert {"distance", "Normals"} <= set(surface.point_data)
+    require_sound(read_mesh(tmp_path / "mesh.vtp"))

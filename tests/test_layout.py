@@ -43,7 +43,8 @@ HEIGHT = {room: height for height, row in enumerate(ROWS) for room in row}
 HEAVY = {"open3d", "pymeshlab", "trimesh", "manifold3d", "skimage"}
 HEAVY_ROOMS = {"io", "ingest", "export", "rendering", "runtime"}
 # These know no geometry, and are tested on problems that are no shapes.
-PURE_ROOMS = {"least_squares": {"least_squares"}, "optim": {"least_squares", "optim"}}
+# Of the runtime, they use threads.
+PURE_ROOMS = {"least_squares": {"least_squares", "runtime"}, "optim": {"least_squares", "optim"}}
 
 
 class Import(NamedTuple):

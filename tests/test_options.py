@@ -5,8 +5,10 @@ from __future__ import annotations
 import inspect
 import json
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gnrecon.cli.batch_command import batch_command
@@ -52,6 +54,17 @@ from gnrecon.runtime.errors import UsageError
         ({"fill": "maximal"}, "option fill takes minimal=WEIGHT or minimal alone, .* not 'maximal'"),
         ({"prior": "developable=inf"}, "weight of prior must be a positive number, .* not 'inf'"),
         ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior are for the default fit"),
+        ({"resolution": "a"}, "resolution must be a whole number, not 'a'"),
+        ({"resolution": 96.5}, "resolution must be a whole number, not 96.5"),
+        ({"seed": None}, "seed must be a whole number, not None"),
+        ({"threads": True}, "threads must be a whole number, not True"),
+        ({"adaptive": 1}, "adaptive must be true or false, not 1"),
+        ({"trim": [2]}, r"trim must be a number or text, not \[2\]"),
+        ({"widths": 300}, "widths must be a list of whole numbers such as 2000 or 32,32,32, not 300"),
+        ({"widths": (1.5,)}, "widths must be a list of whole numbers .*, not .1.5,"),
+        ({"crop": 5}, "crop must be a list of texts, not 5"),
+        ({"holdout": np.zeros(99)}, "holdout must be a number or text, not a value of type ndarray"),
+        ({"quality": 3}, "quality must be text, not 3"),
         ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
     ],
 )
@@ -138,3 +151,19 @@ def test_the_docstring_has_every_option() -> None:
 def test_widths_are_read_from_text() -> None:
     assert typed("widths", "2000") == (2000,)
     assert typed("widths", "32,32,32") == (32, 32, 32)
+
+
+def test_numbers_of_numpy_and_paths_become_plain_values(tmp_path: Path) -> None:
+    made = Options.of(
+        resolution=np.int64(96), holdout=np.float32(0.5), keep_handles=np.True_, widths=np.array([3, 4]), trim=2
+    )
+    plain = (made.resolution, made.holdout, made.keep_handles, made.widths, made.trim)
+    assert plain == (96, 0.5, True, (3, 4), 2)
+    assert [type(value) for value in plain] == [int, float, bool, tuple, int]
+    assert Options.of(work_dir=tmp_path).work_dir == str(tmp_path)
+
+
+def test_options_of_a_fit_have_types_too() -> None:
+    with pytest.raises(UsageError, match="widths must be a list of whole numbers such as 2000 or 32,32,32, not 'a'"):
+        FitOptions(widths="a")  # type: ignore[arg-type]
+    assert FitOptions(widths=[3, 4]).widths == (3, 4)  # type: ignore[arg-type]

@@ -10,11 +10,13 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from inspect import signature
 from typing import Any, NoReturn
 
 import typer
 
 from gnrecon.cli.batch_command import batch_command
+from gnrecon.cli.command_classes import DefaultCommandGroup, EverydayHelpCommand, without_such_option
 from gnrecon.cli.inspect_commands import (
     check_command,
     convert_command,
@@ -52,13 +54,13 @@ def command_line_app() -> typer.Typer:
         help="Watertight, verified meshes from point clouds: gnrecon SCAN -o MESH",
         epilog="Exit codes: 0 ok, 1 unforeseen, 2 usage, 3 input, 4 fit, 5 mesh not sound, 6 could not write, "
         "7 memory, 8 some of a batch failed, 130 interrupted (Ctrl-C, SIGTERM or SIGHUP).",
-        add_completion=False,
-        no_args_is_help=True,
+        cls=DefaultCommandGroup,
+        no_args_is_help=False,  # `main` does it: newer versions of typer also raise an error without a sentence
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     for name, command in COMMANDS.items():
-        app.command(name)(command)
+        app.command(name, cls=EverydayHelpCommand if "help_all" in signature(command).parameters else None)(command)
     return app
 
 
@@ -71,16 +73,16 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 def _run(words: list[str]) -> int:
     """Run the command line's words and return the exit code."""
-    if words == ["--version"]:
+    if words in (["--version"], ["-V"]):
         print(f"gnrecon {__version__}")
         return ExitCode.OK
     command = shlex.join(["gnrecon", *words])
-    if words and words[0] not in (*COMMANDS, "-h", "--help"):
-        words.insert(0, "reconstruct")
     # On a busy machine, threads that spin while they wait slow the run down several times.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        return _guarded(words, command)
+        if words or "_GNRECON_COMPLETE" in os.environ:  # a shell that completes a line gives no words
+            return _guarded(words, command)
+        return _guarded(["--help"], command) or ExitCode.USAGE
     except SystemExit as end:
         # Commands end by it; a code that is no number is a sentence.
         return end.code if isinstance(end.code, int) else ExitCode.OK if end.code is None else ExitCode.UNFORESEEN
@@ -89,7 +91,7 @@ def _run(words: list[str]) -> int:
 def _guarded(words: list[str], command: str) -> int:
     """Run the arguments and turn every failure into a sentence and an exit code; `command` is what was typed."""
     try:
-        result: Any = command_line_app()(words, standalone_mode=False, obj=command)
+        result: Any = command_line_app()(words, prog_name="gnrecon", standalone_mode=False, obj=command)
         # Newer versions of typer turn Ctrl-C into this value silently; `run` and `run_batch` raise SystemExit.
         if result == ExitCode.INTERRUPTED:
             raise KeyboardInterrupt
@@ -97,7 +99,7 @@ def _guarded(words: list[str], command: str) -> int:
     except typer.Exit as request:
         return request.exit_code
     except _click_exception() as error:
-        return _fail(error.format_message(), ExitCode.USAGE, words)
+        return _fail(without_such_option(error), ExitCode.USAGE, words)
     except (KeyboardInterrupt, typer.Abort):
         return _fail(*failure(KeyboardInterrupt()), words)
     except Exception as error:

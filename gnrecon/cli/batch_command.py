@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gnrecon.cli.command_classes import HelpAllOption
 from gnrecon.cli.option_parameters import given_options, with_table_options
 from gnrecon.cli.shared_parameters import ConfigOption, DebugOption, OverwriteOption, QuietOption, SetOption
 from gnrecon.option_table import Panel
@@ -142,6 +143,7 @@ def batch_command(
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
+    help_all: HelpAllOption = False,
     **options: Any,
 ) -> None:
     """Reconstruct many scans, each in its own process; a failure stops no others, and finished scans are skipped."""
@@ -149,7 +151,7 @@ def batch_command(
     from gnrecon.batch.runner import run_batch
     from gnrecon.config import read_settings
 
-    del debug
+    del help_all, debug
     limits = {name: text for name, text in (("timeout", timeout), ("memory", memory)) if text is not None}
     side_files = {"report": reports, "page": pages, "preview": previews, "model": models}
     request = Request(

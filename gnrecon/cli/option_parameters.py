@@ -18,7 +18,21 @@ from gnrecon.option_table import OptionRow, Panel, option_rows
 def table_option(name: str) -> Any:
     """Return the typer option of a row: its flag, help text, panel and metavar."""
     row = option_rows()[name]
-    return typer.Option(row.flag, help=row.help, rich_help_panel=row.panel.value, metavar=row.metavar)
+    return typer.Option(
+        row.flag,
+        help=row.described.replace("[", r"\["),  # typer reads rich's markup
+        show_default=False,  # it is in the help text, with what holds where there is none
+        rich_help_panel=row.panel.value,
+        metavar=row.metavar,
+        autocompletion=_completion(row) if row.choices else None,
+    )
+
+
+def _completion(row: OptionRow) -> Callable[[str], list[str]]:
+    def complete(incomplete: str) -> list[str]:
+        return [choice for choice in row.choices if choice.startswith(incomplete)]
+
+    return complete
 
 
 def with_table_options(*, batch: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gnrecon.cli.command_classes import HelpAllOption
 from gnrecon.cli.option_parameters import given_options, with_table_options
 from gnrecon.cli.shared_parameters import (
     ConfigOption,
@@ -97,13 +98,14 @@ def reconstruct_command(
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
     debug: DebugOption = False,
+    help_all: HelpAllOption = False,
     **options: Any,
 ) -> None:
     """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""
     from gnrecon.config import read_settings
     from gnrecon.run import Files, run
 
-    del debug  # `main` reads it from the arguments, because it handles failures
+    del help_all, debug  # `main` reads it from the arguments, because it handles failures
     settings = read_settings(config, words or (), given_options(context, options))
     chosen, named_reference = settings.for_single_run(scans[0])
     files = Files(

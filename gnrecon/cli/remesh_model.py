@@ -12,12 +12,12 @@ from gnrecon.export import Neighbourhood, require_sound, verify_file
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io import check_writable, supports_attribute, write_mesh
+from gnrecon.io import check_writable, readable, supports_attribute, write_mesh
 from gnrecon.options import Options
 from gnrecon.report.report import Stages
 from gnrecon.run import progress_bar, summarise
 from gnrecon.runtime.compute_limits import limited, require_device
-from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.errors import ExitCode, InputError
 from gnrecon.runtime.files import require_files
 from gnrecon.solid import Shape, shaped
 from gnrecon.vertex_attributes import curvature_attributes, requested_names
@@ -51,7 +51,7 @@ def remesh_model(
     with progress_bar(console, verbose=False) as progress, limited(chosen.threads):
         stages = Stages(progress.stage, chosen.device)
         with stages("read"):
-            sdf = NeuralSDF.load(model, chosen.device)
+            sdf = _load(model, chosen.device)
         mesh, remarks = shaped(sdf, chosen, shape, stages=stages, advance=progress.advance)
         with stages("verify"):
             facts = require_sound(mesh)
@@ -64,6 +64,19 @@ def remesh_model(
     for sentence in [*remarks, *losses, summary]:
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     return ExitCode.OK
+
+
+def _load(model: Path, device: str) -> NeuralSDF:
+    """Load a field; the name of a mesh or a scan says which commands take that."""
+    try:
+        return NeuralSDF.load(model, device)
+    except InputError:
+        if Path(model.name.removesuffix(".gz")).suffix.lower() not in readable():
+            raise
+        raise InputError(
+            f"{model} is not a gnrecon model (.gnr): gnrecon check and gnrecon eval take meshes, and gnrecon SCAN -o "
+            "MESH takes a scan."
+        ) from None
 
 
 def _with_attributes(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path) -> Mesh:

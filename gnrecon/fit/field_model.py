@@ -51,6 +51,10 @@ class NeuralSDF:
     support: npt.NDArray[np.float32] | None = None
     detail: Detail | None = None
 
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.4g}" for side in self.bounds[1] - self.bounds[0])
+        return f"<NeuralSDF: {self.parameters:,} parameters, box of {size}>"
+
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Write the field to one file, conventionally `.gnr`, see `gnrecon.fit.field_model`."""
         from gnrecon.fit.field_model import save_sdf

@@ -12,6 +12,7 @@ from gnrecon.residuals.constraints import Residual, SecondOrder, normal_cosine, 
 from gnrecon.residuals.named_residuals import named
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.plugins import find, installed
+from gnrecon.runtime.typed_values import require_field_types
 
 NORMAL_RESIDUALS: dict[str, Residual] = {
     "vector": normal_vector,
@@ -62,7 +63,7 @@ class FitOptions:
     Raises
     ------
     UsageError
-        When a value is out of its range.
+        When a value is out of its range or of another type.
     """
 
     widths: tuple[int, ...] | None = None
@@ -79,6 +80,7 @@ class FitOptions:
     prior: str | None = None
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         if self.widths is not None and (not self.widths or min(self.widths) < 1):
             raise UsageError(f"Network widths must be positive numbers, not {self.widths}.")
         if self.steps is not None and self.steps < 0:

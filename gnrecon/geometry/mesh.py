@@ -55,6 +55,10 @@ class Mesh:
             if len(values) != len(vertices):
                 raise InputError(f"{len(values)} values of {name!r} do not fit {len(vertices)} vertices.")
 
+    def __repr__(self) -> str:
+        held = "".join(f", {name}" for name in self.attributes)
+        return f"<Mesh: {len(self.vertices):,} vertices, {len(self.faces):,} faces{held}>"
+
     @property
     def corners(self) -> Float:
         """Corner positions of every face, of shape (F, 3, 3)."""

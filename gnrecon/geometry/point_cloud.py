@@ -59,6 +59,11 @@ class PointCloud:
             if len(values) != len(self.points):
                 raise InputError(f"{len(self.points)} points cannot go with {len(values)} values of {name!r}.")
 
+    def __repr__(self) -> str:
+        held = [*(["normals"] if self.normals is not None else []), *self.attributes]
+        held += ["origins"] if self.origins is not None else []
+        return f"<PointCloud: {len(self.points):,} points{''.join(f', {name}' for name in held)}>"
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -135,6 +140,10 @@ class Samples:
     frame: Frame
     held_out: Samples | None = None
     estimated: bool = False
+
+    def __repr__(self) -> str:
+        held_out = "" if self.held_out is None else f", {len(self.held_out):,} held out"
+        return f"<Samples: {len(self):,} points{held_out}, radius {self.frame.scale:.4g}>"
 
     def __len__(self) -> int:
         return len(self.points)

@@ -1,4 +1,4 @@
-"""Parsers for lengths, boxes and planes in options.
+"""Parsers for lengths, shares, boxes and planes in options.
 
 A plain number is in the file's unit; to convert a length with a unit, the file's own unit must be known.
 """
@@ -60,6 +60,32 @@ def parse_reach(text: str, spacing: float, units: str | None) -> float:
     if not 0 < reach < math.inf:
         raise UsageError(f"{text!r} is not a positive distance such as 2.5, 2mm or 3s (spacings).")
     return reach
+
+
+def parse_share(name: str, value: float | str) -> float:
+    """Return a share of the points as a number, from a number or a percentage.
+
+    Parameters
+    ----------
+    name : of the option
+    value : such as 0.2, ``"0.2"`` or ``"20%"``
+
+    Raises
+    ------
+    UsageError
+        When it is no number, or not in (0, 1].
+    """
+    number, percent, _ = value.partition("%") if isinstance(value, str) else (value, "", "")
+    try:
+        share = float(number) / (100 if percent else 1)
+    except ValueError:
+        raise UsageError(f"{name} must be a share such as 0.2 or 20%, not {value!r}.") from None
+    if not 0 < share <= 1:
+        likely = (
+            f"; for {share:g} percent, give {share / 100:g} or {share:g}%" if 1 < share <= 100 and not percent else ""
+        )
+        raise UsageError(f"The {name} of points is {value}, but must lie in (0, 1]{likely}.")
+    return share
 
 
 def parse_box(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

@@ -1,11 +1,14 @@
 """Converts clouds and meshes from and to trimesh, open3d and pymeshlab, and from arrays, tensors and data frames.
 
+pyvista and meshio have a module of their own, `gnrecon.io.interop_grids`.
+
 An object's type is recognised by the module that defines it, so that no library is imported that the caller has not
 loaded. Nothing is processed: vertices and faces stay the same, in the same order.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import from_columns, no_faces
+from gnrecon.io.interop_grids import meshio_parts, pyvista_parts
 from gnrecon.runtime.errors import InputError, UsageError
 
 
@@ -26,21 +30,26 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
     ----------
     obj : array of shape (N, 3), or (N, 6) with normals; torch tensor of the same; structured array, mapping or data
         frame of columns x, y, z, nx, ny, nz, red, ... as in files; open3d PointCloud (legacy or tensor); trimesh
-        PointCloud; pymeshlab Mesh or MeshSet (its current mesh); PointCloud; Mesh and other libraries' meshes, of which
-        the vertices are taken
+        PointCloud; pymeshlab Mesh or MeshSet (its current mesh); pyvista PolyData or DataSet; meshio Mesh; PointCloud;
+        Mesh and other libraries' meshes, of which the vertices are taken; path of a file, which is read
     normals : array of shape (N, 3), optional
         Used instead of those of `obj`.
 
     Raises
     ------
     InputError
-        When `obj` is none of these, or shapes do not fit.
+        When `obj` is none of these, a file cannot be read, or shapes do not fit.
     """
+    cloud = _from_file(obj, "read_cloud") if isinstance(obj, str | Path) else _cloud_of_object(obj)
+    return cloud if normals is None else cloud.with_normals(_array(normals))
+
+
+def _cloud_of_object(obj: Any) -> PointCloud:
+    """The cloud of anything but a path."""
     found = _from_library(obj)
     if found is None:
         found = _columns(obj) if _names(obj) else _from_array(_array(obj))
-    cloud = PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
-    return cloud if normals is None else cloud.with_normals(_array(normals))
+    return PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
 
 
 def as_mesh(obj: Any) -> Mesh:
@@ -48,8 +57,9 @@ def as_mesh(obj: Any) -> Mesh:
 
     Parameters
     ----------
-    obj : open3d TriangleMesh (legacy or tensor); trimesh Trimesh; pymeshlab Mesh or MeshSet (its current mesh); a pair
-        of vertices, of shape (V, 3), and faces, of shape (F, 3), as arrays or tensors; Mesh
+    obj : open3d TriangleMesh (legacy or tensor); trimesh Trimesh; pymeshlab Mesh or MeshSet (its current mesh); pyvista
+        PolyData or DataSet; meshio Mesh; a pair of vertices, of shape (V, 3), and faces, of shape (F, 3), as arrays or
+        tensors; Mesh; path of a file, which is read
 
     Raises
     ------
@@ -57,9 +67,10 @@ def as_mesh(obj: Any) -> Mesh:
         When `obj` is none of these, has no faces, or shapes do not fit.
     """
     expected = (
-        "a mesh of open3d, trimesh or pymeshlab, or a pair of vertices, of shape (V, 3), and faces, of shape (F, 3)"
+        "a mesh of open3d, trimesh, pymeshlab, pyvista or meshio, its file, or a pair of vertices, of shape (V, 3), "
+        "and faces, of shape (F, 3)"
     )
-    found = _from_library(obj)
+    found = _from_file(obj, "read_mesh") if isinstance(obj, str | Path) else _from_library(obj)
     if found is None and isinstance(obj, tuple | list) and len(obj) == 2:
         vertices, faces = (_array(part, expected) for part in obj)
         if vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3:
@@ -70,7 +81,7 @@ def as_mesh(obj: Any) -> Mesh:
 
 
 def as_shape(obj: Any) -> Mesh | PointCloud:
-    """Return a mesh where an object has faces, else a cloud.
+    """Return a mesh where an object has faces, else a cloud; paths are not read, as plugins' results come here.
 
     Raises
     ------
@@ -78,7 +89,15 @@ def as_shape(obj: Any) -> Mesh | PointCloud:
         As `as_cloud` does.
     """
     found = _from_library(obj)
-    return as_cloud(obj) if found is None else found
+    return _cloud_of_object(obj) if found is None else found
+
+
+def _from_file(path: str | Path, kind: str) -> Any:
+    """What a function of `gnrecon.io.read` reads from a file."""
+    # Imported here, because its table of formats takes what plugins return through this module.
+    from gnrecon.io import read
+
+    return getattr(read, kind)(Path(path))
 
 
 def _from_library(obj: Any) -> Mesh | PointCloud | None:
@@ -95,6 +114,10 @@ def _from_library(obj: Any) -> Mesh | PointCloud | None:
         return _from_trimesh(obj)
     if "pymeshlab" in libraries and (hasattr(obj, "current_mesh") or hasattr(obj, "vertex_matrix")):
         return _from_pymeshlab(obj)
+    if "pyvista" in libraries and hasattr(obj, "bounds"):
+        return _mesh_or_cloud(*pyvista_parts(obj))
+    if "meshio" in libraries and hasattr(obj, "cells"):
+        return _mesh_or_cloud(*meshio_parts(obj))
     return None
 
 
@@ -134,9 +157,25 @@ def _from_trimesh(obj: Any) -> Mesh | PointCloud:
     # trimesh may report vertex colours for a cloud that has none.
     held = {"colors": colors} if len(colors) else {}
     if not has_faces:
-        return _mesh_or_cloud(np.array(obj.vertices), None, None, held)
+        return _mesh_or_cloud(np.array(obj.vertices), None, _trimesh_normals(obj), held)
     held = {name: np.array(values) for name, values in obj.vertex_attributes.items()} | held
     return _mesh_or_cloud(np.array(obj.vertices), np.array(obj.faces), np.array(obj.vertex_normals), held)
+
+
+def _trimesh_normals(cloud: Any) -> Float | None:
+    """The normals of a trimesh cloud, which has no place of its own for them.
+
+    They are an attribute that the caller set, or metadata, or columns of the PLY file that trimesh read it from.
+    """
+    places = (vars(cloud), cloud.metadata)
+    found = next((place[name] for name in ("vertex_normals", "normals") for place in places if name in place), None)
+    if found is None:
+        columns = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+        names = columns.dtype.names or () if isinstance(columns, np.ndarray) else columns
+        if {"nx", "ny", "nz"} <= set(names):
+            found = np.stack([np.asarray(columns[name], np.float64).reshape(-1) for name in ("nx", "ny", "nz")], axis=1)
+    # After the caller removed points, columns of the file no longer fit.
+    return None if found is None or np.shape(found) != np.shape(cloud.vertices) else np.array(found, np.float64)
 
 
 def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
@@ -176,8 +215,8 @@ def _column(values: Any) -> npt.NDArray[Any]:
 def _array(
     obj: Any,
     expected: str = (
-        "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, or a cloud of open3d, trimesh or "
-        "pymeshlab"
+        "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, a file's path, or a cloud of "
+        "open3d, trimesh, pymeshlab, pyvista or meshio"
     ),
 ) -> Float:
     """An array of float64; `expected` is what the message on anything else asks for."""
@@ -196,11 +235,15 @@ def _from_array(rows: Float) -> PointCloud:
 
 
 def to_trimesh(shape: Mesh | PointCloud) -> Any:
-    """Return a ``trimesh.Trimesh`` with normals and attributes, or of a cloud a ``trimesh.PointCloud`` with colours."""
+    """Return a ``trimesh.Trimesh`` with normals and attributes, or of a cloud a ``trimesh.PointCloud`` with colours.
+
+    The normals of a cloud are its metadata ``vertex_normals``.
+    """
     import trimesh
 
     if isinstance(shape, PointCloud):
-        return trimesh.PointCloud(shape.points.copy(), _colors(shape))  # type: ignore[no-untyped-call]
+        metadata = None if shape.normals is None else {"vertex_normals": shape.normals.copy()}
+        return trimesh.PointCloud(shape.points.copy(), _colors(shape), metadata)  # type: ignore[no-untyped-call]
     return trimesh.Trimesh(
         shape.vertices,
         shape.faces,

@@ -170,6 +170,8 @@ def check_file(path: Path, extension: str) -> None:
     if not head.strip():
         raise InputError("the file is empty.")
     if not is_readable(extension):
+        if extension == ".gnr":
+            raise InputError("this is a fitted field, not a scan or a mesh: gnrecon mesh MODEL -o MESH meshes it.")
         supported = ", ".join(suffix[1:] for suffix in readable())
         raise InputError(f"the extension {extension!r} is not supported; expected one of {supported}.")
     if extension not in READERS:

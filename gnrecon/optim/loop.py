@@ -251,3 +251,6 @@ class Solution:
     history: tuple[Record, ...]
     interrupted: bool = False
     method: str = ""
+
+    def __repr__(self) -> str:
+        return f"<Solution: {len(self.theta):,} parameters, {len(self.history):,} records; {self.status}>"

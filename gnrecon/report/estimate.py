@@ -30,10 +30,13 @@ class Estimate:
     ----------
     seconds : on two idle cores, to within a factor of about 1.5
     memory_mb : peak of resident memory, in MB of 10^6 bytes
+    fit_seconds, mesh_seconds : those of the fit, and of the mesh
     """
 
     seconds: float
     memory_mb: float
+    fit_seconds: float = 0.0
+    mesh_seconds: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields by name."""
@@ -70,7 +73,8 @@ def estimate(
     seconds = model.two_core_share * (starting + fitting + meshing)
     mesh_memory = model.mesh_memory_mb + model.mesh_cells_memory_mb * (cells / model.mesh_memory_cells) ** 2
     memory = max(model.fit_memory_mb, mesh_memory) + read * model.read_point_bytes / 1e6
-    return Estimate(round(seconds, 1), round(memory))
+    parts = (round(model.two_core_share * part, 1) for part in (fitting, meshing))
+    return Estimate(round(seconds, 1), round(memory), *parts)
 
 
 def _rounded(seconds: float) -> str:

@@ -6,6 +6,8 @@ Every message is one sentence for the user: it names what is wrong and what was 
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class ExitCode(enum.IntEnum):
@@ -72,6 +74,21 @@ class MemoryLimitError(GnreconError, MemoryError):
     """The work needs more memory than is available."""
 
     exit_code = ExitCode.MEMORY
+
+
+def suggestion(word: str, known: Iterable[str], *, kind: str = "options") -> str:
+    """Return the end of a sentence on an unknown name: the likeliest right one, or else all that are known.
+
+    Parameters
+    ----------
+    word : what was written
+    known : the names, as they are written
+    kind : what they are, in the plural; empty to name the likeliest alone
+    """
+    names = list(known)
+    if close := get_close_matches(word.lower(), names, 1):
+        return f"; perhaps you mean {close[0]!r}"
+    return f"; the {kind} are {', '.join(names)}" if kind else ""
 
 
 def failure(error: BaseException) -> tuple[str, ExitCode]:

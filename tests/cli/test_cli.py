@@ -118,7 +118,7 @@ def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -
         (("-o", "{out}/mesh"), "a file without an extension"),
         ((), "Missing option '-o'"),
         (("-o", "{out}/mesh.obj", "--fraction", "1.5"), "fraction of points is 1.5"),
-        (("-o", "{out}/mesh.obj", "--fraction", "half"), "Invalid value for '--fraction'"),
+        (("-o", "{out}/mesh.obj", "--fraction", "half"), "fraction must be a share such as 0.2 or 20%, not 'half'"),
         (("-o", "{out}/mesh.obj", "--resolution", "3"), "at least 16 cells, not 3"),
         (
             ("-o", "{out}/mesh.obj", "--widths", "32;32"),
@@ -390,7 +390,7 @@ def test_version_and_help() -> None:
     assert top.returncode == 0
     for word in ("reconstruct", "batch", "doctor", "Exit codes"):
         assert word in top.stdout
-    details = gnrecon("reconstruct", "--help")
+    details = gnrecon("reconstruct", "--help-all")
     assert details.returncode == 0
     for option in ("--output", "--fraction", "--widths", "--resolution", "--reference", "--overwrite", "--debug"):
         assert option in details.stdout

@@ -14,7 +14,7 @@ import pytest
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io import as_cloud, as_mesh, to_open3d, to_pymeshlab, to_trimesh
+from gnrecon.io import as_cloud, as_mesh, as_shape, to_open3d, to_pymeshlab, to_trimesh, write_cloud, write_mesh
 from gnrecon.runtime.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -75,7 +75,7 @@ def test_own_objects() -> None:
     np.testing.assert_allclose(as_cloud(TRIANGLE).normals, np.full((3, 3), 3**-0.5))
 
 
-@pytest.mark.parametrize("obj", [np.zeros((4, 2)), np.zeros(3), "points", object(), None])
+@pytest.mark.parametrize("obj", [np.zeros((4, 2)), np.zeros(3), b"points", object(), None])
 def test_anything_else_is_refused(obj: object) -> None:
     with pytest.raises(InputError, match="Expected points"):
         as_cloud(obj)
@@ -143,7 +143,7 @@ def test_attributes_go_out_where_there_is_a_place_for_them() -> None:
 def test_clouds_go_through_other_libraries_and_back(out: Callable[[PointCloud], Any], normals: Any) -> None:
     colors = RNG.integers(0, 255, (20, 3), dtype=np.uint8)
     back = as_cloud(out(PointCloud(POINTS, normals, {"colors": colors})))
-    check(back, normals=normals is not None and out is not to_trimesh)
+    check(back, normals=normals is not None)
     np.testing.assert_array_equal(as_bytes(back.attributes["colors"])[:, :3], colors)
 
 
@@ -181,7 +181,7 @@ def test_pairs_of_vertices_and_faces_are_meshes() -> None:
 
 
 @pytest.mark.parametrize(
-    "obj", [POINTS, PointCloud(POINTS), (POINTS, POINTS[:, :2]), (POINTS, "faces"), "mesh.ply", None]
+    "obj", [POINTS, PointCloud(POINTS), (POINTS, POINTS[:, :2]), (POINTS, "faces"), b"mesh.ply", None]
 )
 def test_what_has_no_faces_is_no_mesh(obj: object) -> None:
     with pytest.raises(InputError, match="Expected a mesh of open3d"):
@@ -203,3 +203,30 @@ def test_no_library_is_loaded_that_the_caller_does_not_use() -> None:
     repository = Path(__file__).resolve().parents[2]
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=repository, check=True)
     assert result.stdout == "[]\n"
+
+
+def test_trimesh_clouds_keep_their_normals(tmp_path: Path) -> None:
+    import trimesh
+
+    cloud = PointCloud(POINTS, NORMALS)
+    check(as_cloud(to_trimesh(cloud)), normals=True)
+    named = trimesh.PointCloud(POINTS)
+    named.vertex_normals = NORMALS
+    check(as_cloud(named), normals=True)
+    write_cloud(PointCloud(POINTS - POINTS.mean(axis=0), NORMALS), tmp_path / "cloud.ply")
+    read = trimesh.load(tmp_path / "cloud.ply")
+    np.testing.assert_allclose(as_cloud(read).normals, NORMALS, rtol=1e-6)
+    read.vertices = read.vertices[:10]  # now its file's normals no longer fit
+    assert as_cloud(read).normals is None
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_paths_are_read(tmp_path: Path, kind: type) -> None:
+    write_mesh(TRIANGLE, tmp_path / "mesh.ply")
+    path = kind(tmp_path / "mesh.ply")
+    np.testing.assert_array_equal(as_cloud(path).points, TRIANGLE.vertices)
+    np.testing.assert_array_equal(as_mesh(path).faces, TRIANGLE.faces)
+    with pytest.raises(InputError, match="Expected points"):
+        as_shape(path)  # what a plugin returned is no path to read
+    with pytest.raises(InputError, match="there is no such file"):
+        as_cloud(kind(tmp_path / "none.ply"))

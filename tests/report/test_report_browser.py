@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -225,3 +227,19 @@ def test_paper_is_white_however_dark_the_screen_is(chromium: Browser, file: Path
     shown = "[...document.querySelectorAll('button')].filter(e => e.getClientRects().length).length"
     assert chromium.value(shown) == 0, "nothing can be pressed on paper"
     chromium.ask("Emulation.setEmulatedMedia", media="", features=[])
+
+
+def test_it_works_in_the_frame_of_a_notebook(chromium: Browser, file: Path, tmp_path: Path) -> None:
+    notebook = tmp_path / "notebook.html"
+    framed = escape(file.read_text(encoding="utf-8"))
+    notebook.write_text(
+        f'<!doctype html><html data-viewer="ready"><iframe srcdoc="{framed}"></iframe>', encoding="utf-8"
+    )
+    chromium.events.clear()
+    chromium.open(notebook, 1200, 800)
+    state = "document.querySelector('iframe').contentDocument.documentElement.dataset.viewer"
+    deadline = time.monotonic() + 60
+    while (found := chromium.value(state)) is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert found == "ready"
+    assert chromium.complaints() == []

@@ -18,6 +18,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.report.report import report_schema
+from gnrecon.report.time_left import TimeLeft
 from gnrecon.run import STAGES, ConsoleProgress
 from gnrecon.runtime.errors import Cancelled, ExitCode
 from gnrecon.runtime.progress import subrange
@@ -164,7 +165,7 @@ def test_the_bar_shows_the_share_of_the_stage() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=120)
     with Bar(console=console, auto_refresh=False) as bar:
-        shown = ConsoleProgress(console, bar, verbose=False)
+        shown = ConsoleProgress(console, bar, verbose=False, left=TimeLeft())
         shown.stage("fit")
         assert bar.tasks[0].total is None
         shown.advance(0.25)

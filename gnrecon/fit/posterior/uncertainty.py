@@ -80,6 +80,9 @@ class Uncertainty:
     noise: float
     factor: float
 
+    def __repr__(self) -> str:
+        return f"<Uncertainty: noise {self.noise:.3g} in file units, factor {self.factor:.3g}>"
+
     @classmethod
     def of(
         cls,

@@ -24,7 +24,8 @@ function controls(viewer) {
     byId("sliding").hidden = state.axis === "off";
     slider.value = state.cut;
     byId("cut-at").textContent = viewer.show();
-    history.replaceState(null, "", "#" + new URLSearchParams(state));
+    // A page within a notebook has no address that could hold the view.
+    if (location.protocol !== "about:") history.replaceState(null, "", "#" + new URLSearchParams(state));
   }
   document.addEventListener("click", (event) => {
     const button = event.target.closest("[data-set]");

@@ -1,0 +1,82 @@
+"""Checks that the values of options have the types that their dataclass states, and turns them into plain ones.
+
+Only the standard library is imported here, because the command line reads its table of options whenever it starts.
+"""
+
+from __future__ import annotations
+
+import operator
+import os
+import types
+from dataclasses import fields
+from functools import cache
+from numbers import Real
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from gnrecon.runtime.errors import UsageError
+
+
+def require_field_types(record: Any) -> None:
+    """Check the fields of a dataclass, and replace numbers of numpy and paths by plain numbers and texts.
+
+    Raises
+    ------
+    UsageError
+        When a value has another type than its field; the sentence names the field and the value.
+    """
+    for option in fields(record):
+        value, kinds, optional = getattr(record, option.name), *_field_types(record.__class__, option.name)
+        if value is None and optional:
+            continue
+        found = next((plain for kind in kinds if (plain := _plain(kind, value)) is not None), None)
+        if found is None:
+            text = repr(value)
+            shown = text if len(text) <= 60 and "\n" not in text else f"a value of type {type(value).__name__}"
+            raise UsageError(f"{option.name} must be {described(kinds)}, not {shown}.")
+        object.__setattr__(record, option.name, found)
+
+
+@cache
+def _field_types(record: Any, name: str) -> tuple[tuple[Any, ...], bool]:
+    """The types of a field besides None, and whether it may be None."""
+    hint = get_type_hints(record)[name]
+    return value_types(hint), type(None) in get_args(hint)
+
+
+def value_types(hint: Any) -> tuple[Any, ...]:
+    """Return the types of a hint besides None, numbers first: any text would pass for text."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return tuple(sorted((kind for kind in kinds if kind is not type(None)), key=lambda kind: kind is str))
+
+
+def described(kinds: tuple[Any, ...]) -> str:
+    """Return types in words, for the message on a value of another type."""
+    return " or ".join(dict.fromkeys(map(_described, kinds)))
+
+
+def _described(kind: Any) -> str:
+    if get_origin(kind) is tuple:
+        return "a list of texts" if get_args(kind)[0] is str else "a list of whole numbers such as 2000 or 32,32,32"
+    return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]
+
+
+def _plain(kind: Any, value: Any) -> Any:
+    """The value as a plain one of a type; None where it has another type."""
+    if get_origin(kind) is tuple:
+        if (
+            isinstance(value, str | bytes | dict | set)
+            or not hasattr(value, "__iter__")
+            or not hasattr(value, "__len__")
+        ):
+            return None
+        items = [_plain(get_args(kind)[0], item) for item in value]
+        return None if any(item is None for item in items) else tuple(items)
+    truth = isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
+    if kind is bool or truth:
+        return bool(value) if kind is bool and truth and not getattr(value, "ndim", 0) else None
+    if kind is int:
+        return operator.index(value) if hasattr(value, "__index__") and not getattr(value, "ndim", 0) else None
+    if kind is float:
+        # A whole number stays as the caller wrote it.
+        return value if type(value) is int else float(value) if isinstance(value, Real) else None
+    return os.fspath(value) if isinstance(value, str | os.PathLike) else None
