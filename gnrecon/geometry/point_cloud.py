@@ -71,6 +71,14 @@ class PointCloud:
             None if self.origins is None else self.origins[rows],
         )
 
+    @property
+    def has_directions(self) -> bool:
+        """Whether at least half of the points have a normal that is finite and not zero."""
+        if self.normals is None:
+            return False
+        largest = np.abs(self.normals).max(axis=1, initial=0.0)
+        return bool(2 * (np.isfinite(largest) & (largest > 0)).sum() >= len(self.points))
+
     def with_normals(self, normals: Float | None) -> PointCloud:
         """Return the same cloud with other normals, of shape (N, 3)."""
         return replace(self, normals=normals)

@@ -18,7 +18,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise
-from gnrecon.ingest.orientation import flip_if_inward
+from gnrecon.ingest.orientation import are_inconsistent, flip_if_inward
 from gnrecon.ingest.outliers import find_outliers
 from gnrecon.ingest.repeated_points import repeated_points
 
@@ -104,7 +104,7 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
         density_variation=float(np.percentile(area, 95) / np.percentile(area, 5)),
         noise=noise.deviation,
         noise_limit=noise.limit,
-        normals="missing" if cloud.normals is None else _state(thinned, cloud.normals[rows[chosen]], limits),
+        normals="missing" if cloud.normals is None else _state(centred, cloud.normals[rows], limits),
         border_share=border,
         open=border > limits.open_share and noise.deviation is not None,
         origins=0 if cloud.origins is None else len(np.unique(cloud.origins, axis=0)),
@@ -135,16 +135,12 @@ def _border_share(points: Float, limits: SurveyParameters) -> float:
 
 def _state(points: Float, normals: Float, limits: SurveyParameters) -> str:
     """Return the most severe defect of the normals, or ``"good"``."""
-    from scipy.spatial import cKDTree
-
     lengths = np.linalg.norm(normals, axis=1)
     usable = np.isfinite(lengths) & (lengths > 0)
     if 2 * usable.sum() < len(normals):
         return "zero"
     points, directions = points[usable], normals[usable] / lengths[usable, None]
-    rows = cKDTree(points).query(points, min(9, len(points)))[1][:, 1:]
-    agreeing = np.einsum("gki,gi->gk", directions[rows], directions) > 0
-    if (agreeing.mean(axis=1) < 0.5).mean() > limits.disagreeing_share:
+    if are_inconsistent(points, directions):
         return "inconsistent"
     if flip_if_inward(points, directions)[1]:
         return "inward"
