@@ -171,6 +171,13 @@ class OptionTable:
         "Cut off what is farther than this from all points, in file units or, as 3s, in spacings; the mesh is then "
         "open.",
     )
+    open: bool | None = _row(
+        None,
+        Panel.MESH,
+        "Leave the mesh open where the scan ends: cut off what is farther than 2 spacings, or --trim, from points that "
+        "face the same way. By default, if the scan is a single sheet, such as terrain or a wall.",
+        flag="--open/--no-open",
+    )
     remesh: float | None = _row(
         None, Panel.MESH, "Remesh to nearly equilateral faces of this edge length, in file units.", metavar="LENGTH"
     )

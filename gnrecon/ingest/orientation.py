@@ -24,10 +24,9 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.ingest_parameters import IngestParameters, OrientationParameters
+from gnrecon.ingest.normal_agreement import Agreement, agreement_of
 from gnrecon.ingest.normals import tangent_planes, unoriented_normals
 from gnrecon.ingest.orientation_methods import (
-    Agreement,
-    agreement_of,
     consistent_normals,
     gauss_normals,
     is_open,

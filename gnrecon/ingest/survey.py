@@ -19,6 +19,7 @@ from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise
 from gnrecon.ingest.orientation import are_inconsistent, flip_if_inward
+from gnrecon.ingest.orientation_methods import is_open, outwardness
 from gnrecon.ingest.outliers import find_outliers
 from gnrecon.ingest.repeated_points import repeated_points
 
@@ -109,6 +110,21 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
         open=border > limits.open_share and noise.deviation is not None,
         origins=0 if cloud.origins is None else len(np.unique(cloud.origins, axis=0)),
     )
+
+
+def is_single_sheet(points: Float, normals: Float, *, least_facing_share: float = 0.97) -> bool:
+    """Return whether a scan is a single sheet that was seen from one side, such as terrain, a relief or a wall.
+
+    Its winding number is that of an open surface, without an inside, and nearly all normals are within 90 degrees of
+    their mean. A bowl or half of a sphere has an inside; objects on a ground have sides that face away.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3), outward unit normals
+    least_facing_share : of the normals within 90 degrees of the mean
+    """
+    facing = float((normals @ normals.mean(axis=0) > 0).mean())
+    return facing >= least_facing_share and is_open(outwardness(points - points.mean(axis=0), normals))
 
 
 def _spacings(points: Float, chosen: Int, neighbour: int) -> tuple[Float, Float]:

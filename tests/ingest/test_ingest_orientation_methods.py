@@ -10,8 +10,8 @@ from analytic_clouds import thin_shell, torus
 from made_shapes import sphere
 
 from gnrecon.ingest import flip_if_inward, oriented_normals
+from gnrecon.ingest.normal_agreement import agreement_of
 from gnrecon.ingest.orientation_methods import (
-    agreement_of,
     consistent_normals,
     gauss_normals,
     outwardness,

@@ -8,7 +8,7 @@ import pytest
 from analytic_clouds import torus
 
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.survey import Survey, survey
+from gnrecon.ingest.survey import Survey, is_single_sheet, survey
 
 
 def sphere(rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -70,3 +70,18 @@ def test_borders_counts_and_extent(rng: np.random.Generator) -> None:
     assert (found.points, found.duplicates, found.non_finite, found.outliers) == (6011, 7, 3, 1)
     assert found.upper == [9, 9, 9]
     assert survey(PointCloud(points[:20])) is None
+
+
+def test_single_sheets_are_terrain_and_walls_not_bowls_or_solids(rng: np.random.Generator) -> None:
+    x, y = rng.uniform(-2, 2, (2, 3000))
+    slopes = np.column_stack([-np.cos(2 * x), np.sin(y), np.ones(3000)])
+    up = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+    terrain = np.column_stack([x, y, 0.5 * np.sin(2 * x) + np.cos(y)])
+    assert is_single_sheet(terrain, up)
+    assert is_single_sheet(terrain[:, [2, 0, 1]] + 1e6, up[:, [2, 0, 1]])
+    points, outward = sphere(rng)
+    half = points[:, 2] > 0
+    assert not is_single_sheet(points, outward)
+    assert not is_single_sheet(points[half], outward[half])
+    assert not is_single_sheet(points[half], -outward[half])
+    assert not is_single_sheet(terrain, up * rng.choice([-1.0, 1.0], (3000, 1)))
