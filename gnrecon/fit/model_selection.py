@@ -36,7 +36,8 @@ from gnrecon.runtime.parallel import map_in_threads
 class FieldResiduals:
     """The global field at the points, whose values are residuals: all of shape (N,) or (N, 3), unit coordinates.
 
-    `estimated` is true if the normals were estimated from the points.
+    `estimated` is true if the normals were estimated from the points; `noise` is the deviation along the normal that
+    the points themselves show, or None.
     """
 
     points: Float
@@ -44,12 +45,14 @@ class FieldResiduals:
     value: Float
     gradient: Float
     estimated: bool = False
+    noise: float | None = None
 
     @classmethod
     def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
         """Evaluate a field at samples."""
         value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
-        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
+        off = value / samples.frame.scale
+        return cls(samples.points, samples.normals, off, gradient, samples.estimated, samples.noise)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -343,15 +346,20 @@ class CrossValidation:
     def noises(self, length: float) -> list[tuple[float, float]]:
         """Return the noises of positions and normals to try with a length, the most likely one last.
 
-        Unless it is known, noise is at most the residuals of the global field.
+        Unless it is known, noise is at most the residuals of the global field. Where normals were estimated, only
+        distances of few validation points select it, which hardly tell a field that winds through noisy points from a
+        smooth one; so it is about the noise that the points show.
         """
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
             tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
             tried += [] if self.likelihood is None else [self.likelihood.noise(length)]
-            most = max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
-            self._noises[length] = [(min(position, most), angle) for position, angle in tried]
+            least, most = 0.0, max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
+            if self.residuals.estimated and self.residuals.noise:
+                factor = self.parameters.most_noise_factor
+                least, most = self.residuals.noise / factor, self.residuals.noise * factor
+            self._noises[length] = [(min(max(position, least), most), angle) for position, angle in tried]
         return self._noises[length]
 
     def scores(self, length: float) -> Float:

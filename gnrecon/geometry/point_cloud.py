@@ -136,6 +136,8 @@ class Samples:
         Validation points, which the fit does not use, in the same frame.
     estimated : bool
         Whether the normals or their signs were estimated from the points and may be wrong in places.
+    noise : float, optional
+        Standard deviation of the points along the normal, unit coordinates, where it was measured.
     """
 
     points: Float
@@ -143,6 +145,7 @@ class Samples:
     frame: Frame
     held_out: Samples | None = None
     estimated: bool = False
+    noise: float | None = None
 
     def __len__(self) -> int:
         return len(self.points)

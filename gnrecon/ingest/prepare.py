@@ -12,6 +12,7 @@ from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.clean import clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
+from gnrecon.ingest.noise import estimate_noise
 from gnrecon.ingest.orientation import require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.smooth import smooth_points
@@ -110,4 +111,6 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Sa
     _log.info("The unit ball has the centre %s and the radius %.6g.", frame.center.tolist(), frame.scale)
     if len(held_out) and held_out.normals is not None:
         held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
-    return Samples(frame.to_unit(kept.points), kept.normals, frame, held, estimated)
+    points = frame.to_unit(kept.points)
+    noise = estimate_noise(points, mean_spacing(points)).deviation if estimated and len(points) >= 16 else None
+    return Samples(points, kept.normals, frame, held, estimated, noise)
