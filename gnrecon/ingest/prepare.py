@@ -17,6 +17,7 @@ from gnrecon.ingest.orientation import require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.smooth import smooth_points
 from gnrecon.ingest.subsample import subsample as thin
+from gnrecon.ingest.survey import fill_a_volume, lie_on_lines, outer_surface
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -67,7 +68,16 @@ def prepare(
     require_orientation(orient)
     cleaned, counts = clean(cloud, outliers, clusters=clusters, units=units, parameters=parameters)
     advance(0.2)  # cleaning takes about a fifth of the time, and normals another half
+    centred = cleaned.points - cleaned.points.mean(axis=0)
+    arrangement = "lines" if lie_on_lines(centred) else "volume" if fill_a_volume(centred) else None
+    counts = replace(counts, arrangement=arrangement)
+    if arrangement == "volume" and cleaned.normals is None:
+        outer, normals = outer_surface(centred)
+        cleaned = cleaned.select(outer).with_normals(normals)
+        counts = replace(counts, inner=int((~outer).sum()))
     oriented, orientation = with_outward_normals(cleaned, orient, parameters=parameters)
+    if counts.inner:
+        orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
     oriented, held_out = _hold_out(oriented, holdout, seed)
     # Spacings are those of the whole cloud.
