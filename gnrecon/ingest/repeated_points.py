@@ -45,7 +45,7 @@ def repeated_points(
     if count < 1 or _copies(tree, points[::stride], count, close_share)[1].any(axis=1).mean() < least_share:
         return np.zeros(len(points), bool)
     near, close = _copies(tree, points, count, close_share)
-    copied = close.any(axis=1)
+    copied = np.asarray(close.any(axis=1), dtype=bool)
     if copied[near[copied]].mean() < least_around:
         return np.zeros(len(points), bool)
     rows, columns = np.nonzero(close)

@@ -30,6 +30,7 @@ BENCHMARKS = {
     "orient": Benchmark("accuracy.orientation", "estimated normals, and their meshes, compared with open3d's"),
     "refine": Benchmark("remeshing", "remeshing and decimation, compared with pymeshlab and manifold3d"),
     "batch": Benchmark("batch_recovery", "many scans, some broken, killed and continued; and throughput"),
+    "inputs": Benchmark("inputs", "scans of the kinds that people have, compared with screened Poisson"),
     "export": Benchmark("extraction", "extraction at growing resolutions, compared with the whole grid"),
 }
 
