@@ -228,6 +228,13 @@ class OptionTable:
         limits="above 0",
         metavar="LENGTH",
     )
+    open: bool | None = _row(
+        None,
+        Panel.MESH,
+        "Leave the mesh open where the scan ends: cut off what is farther than 2 spacings, or --trim, from points that "
+        "face the same way. By default, if the scan is a single sheet, such as terrain or a wall.",
+        flag="--open/--no-open",
+    )
     remesh: float | None = _row(
         None,
         Panel.MESH,

@@ -44,7 +44,8 @@ class Options(OptionTable):
         require_mode(self.clusters)
         self.mesh()
         self._require_valid_values()
-        self.trim_at(spacing=1.0)
+        if self.trim_at(spacing=1.0) is not None and self.open is False:
+            raise UsageError("Trimming leaves the mesh open. Give only one of --trim and --no-open.")
         for length in (self.spacing, self.smooth_scan):
             if length is not None:
                 parse_reach(str(length), 1.0, self.units)
@@ -114,17 +115,23 @@ class Options(OptionTable):
         """
         return Region(tuple(map(parse_box, self.crop)), tuple(map(parse_plane, self.clip_plane)))
 
-    def trim_at(self, spacing: float) -> float | None:
+    def trim_at(self, spacing: float, sheet: bool = False, *, open_reach_spacings: float = 2.0) -> float | None:
         """Return the distance beyond which the surface is cut off, in the unit of the points' spacing.
+
+        Parameters
+        ----------
+        spacing : of the points
+        sheet : whether the scan is a single sheet, which is left open unless the options say otherwise
+        open_reach_spacings : the distance where the mesh is to be open and no other was given
 
         Raises
         ------
         UsageError
             When it is not a positive length.
         """
-        if self.trim is None:
-            return None
-        return parse_reach(str(self.trim), spacing, self.units)
+        if self.trim is not None:
+            return parse_reach(str(self.trim), spacing, self.units)
+        return open_reach_spacings * spacing if (sheet if self.open is None else self.open) else None
 
     def for_scan(self, points: Float, bounds: Float) -> Options:
         """Return the options with a resolution that suits a scan where none was given.

@@ -22,6 +22,7 @@ from gnrecon.export import (
     measure,
     require_bordered,
     require_sound,
+    same_side_distances,
     trim,
     unsupported_area,
     verify_file,
@@ -32,7 +33,7 @@ from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.ingest import layers_of, prepare, survey
+from gnrecon.ingest import is_single_sheet, layers_of, prepare, survey
 from gnrecon.io import (
     Reading,
     as_cloud,
@@ -208,7 +209,7 @@ def reconstruct(
         scan = _read(run, source, normals, format, reference)
         ingested = _ingest(run, scan)
         fitted = _fit(run, ingested)
-        surface = _trim(run, _mesh(run, scan, fitted))
+        surface = _trim(run, ingested, _mesh(run, scan, fitted))
         finished, uncertainty = _finish(run, scan, ingested, fitted, surface)
         report = run_report(run.source, run.options, run.stages, scan, ingested, fitted, surface, finished)
     interrupted = fitted.solution.interrupted
@@ -313,13 +314,20 @@ def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, neighbourhood.spacing(), None)
 
 
-def _trim(run: _PipelineRun, surface: MeshedScan) -> MeshedScan:
-    """Cut off what is farther from the points than ``trim``, where that was given."""
-    reach = run.options.trim_at(surface.spacing)
+def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedScan:
+    """Cut off what no points on the same side support, where ``trim`` or ``open`` was given, or the scan is a sheet."""
+    samples, mesh = ingested.samples, surface.mesh
+    by_itself = run.options.trim is None and run.options.open is None
+    sheet = by_itself and ingested.layers is None and is_single_sheet(samples.points, samples.normals)
+    reach = run.options.trim_at(surface.spacing, sheet)
     if reach is not None:
         with run.stages("trim"):
-            mesh, trimming = trim(surface.mesh, surface.neighbourhood.distances(surface.mesh.vertices), reach)
-        actions = [*surface.actions, *trimming.describe()]
+            distances = surface.neighbourhood.distances(mesh.vertices)
+            points = samples.frame.to_world(samples.points)
+            distances = same_side_distances(mesh, distances, points, samples.normals, reach)
+            mesh, trimming = trim(mesh, distances, reach)
+        why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]
+        actions = [*surface.actions, *(why if sheet else []), *trimming.describe()]
         surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)
     run.remark(surface.actions)
     return surface

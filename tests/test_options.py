@@ -37,6 +37,7 @@ from gnrecon.runtime.errors import UsageError
         ({"solver": "gauss"}, "solver must be one of auto, cholesky, qr, .*, not 'gauss'"),
         ({"optimiser": "sgd"}, "optimiser must be one of gn, adam, lbfgs, not 'sgd'"),
         ({"trim": "3m"}, "'3m' needs the file's own unit"),
+        ({"trim": 1, "open": False}, "Give only one of --trim and --no-open"),
         ({"trim": 0}, "'0' is not a positive distance such as 2.5, 2mm or 3s .spacings."),
         ({"trim": "-1s"}, "unknown unit"),
         ({"trim": float("inf")}, "is not a length"),
@@ -102,6 +103,14 @@ def test_ingest_receives_its_options() -> None:
     parameters = inspect.signature(prepare).parameters
     for name, value in Options().ingest().items():
         assert parameters[name].default == value, name
+
+
+def test_meshes_are_open_on_demand_or_where_the_scan_is_a_sheet() -> None:
+    assert Options().trim_at(spacing=0.2) is None
+    assert Options().trim_at(spacing=0.2, sheet=True) == pytest.approx(0.4)
+    assert Options(open=True).trim_at(spacing=0.2) == pytest.approx(0.4)
+    assert Options(open=True, trim=3).trim_at(spacing=0.2) == 3
+    assert Options(open=False).trim_at(spacing=0.2, sheet=True) is None
 
 
 def test_trimming_is_in_file_units_or_spacings() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from gnrecon.fit import bounds_of
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import Layers, layers_of, prepare, survey
+from gnrecon.ingest.ingest_parameters import SurveyParameters
 from gnrecon.io import Reading
 from gnrecon.options import Options
 from gnrecon.pipeline import read_source
@@ -109,7 +110,7 @@ def _unit(facts: Mapping[str, Any], units: str | None) -> str:
 
 
 def _surface(facts: Mapping[str, Any]) -> str:
-    if facts["noise"] is None:
+    if facts["noise"] is None and facts["points"] < SurveyParameters.border_points:
         return "too few points to find borders"
     if not facts["open"]:
         return "closed"

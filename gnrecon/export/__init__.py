@@ -12,7 +12,7 @@ from gnrecon.export.remeshing.refine import RefineOptions, refine
 from gnrecon.export.remeshing.remesh import remesh
 from gnrecon.export.remeshing.sharpen import sharpen
 from gnrecon.export.repair import drop_stray_components, remove_stray, repair
-from gnrecon.export.trim import Trimming, UnsupportedArea, trim, unsupported_area
+from gnrecon.export.trim import Trimming, UnsupportedArea, same_side_distances, trim, unsupported_area
 from gnrecon.export.verify import Findings, MeshFacts, examine, require_bordered, require_sound, verify, verify_file
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "repair",
     "require_bordered",
     "require_sound",
+    "same_side_distances",
     "sharpen",
     "simplify",
     "transfer_attributes",

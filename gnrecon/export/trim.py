@@ -59,7 +59,7 @@ class Trimming:
         filled = f" {self.filled} small gaps were left closed." if self.filled else ""
         return [
             f"Cut off {self.area_share:.1%} of the surface: the parts farther than {self.distance:.6g} from every "
-            f"point{crumbs}.{filled}",
+            f"point that faces the same way{crumbs}.{filled}",
             "The mesh is open: an oriented edge-manifold with borders, not a solid.",
         ]
 
@@ -103,6 +103,57 @@ def trim(
         return mesh, Trimming(reach, 0.0, 0, filled)
     result = cut_at_level(mesh, near, smooth, reach, clearance=parameters.edge_clearance)
     return result, Trimming(reach, 1 - result.area / mesh.area, crumbs, filled)
+
+
+def same_side_distances(
+    mesh: Mesh,
+    distances: Float,
+    points: Float,
+    normals: Float,
+    reach: float,
+    *,
+    neighbours: int = 16,
+    least_cosine: float = 0.25,
+    far_reaches: float = 2.0,
+    batch: int = 200_000,
+) -> Float:
+    """Return distances to data that count only points that face the same way as the surface, of shape (V,).
+
+    A closed mesh of an open sheet has an underside, which may be as near to the points as the sheet itself. Its normals
+    are opposite to theirs, and those of the rim between are at right angles.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With V vertices.
+    distances : array of shape (V,)
+        From each vertex to the nearest scanned point, in file units.
+    points, normals : arrays of shape (N, 3)
+        Scanned points, in file units, and their outward unit normals.
+    reach : float
+        Distance at which support ends, in file units.
+    neighbours : int
+        Nearest points among which one has to face the same way; enough to find the face beyond an edge.
+    least_cosine : float
+        Of the angle between normals that face the same way, about 75 degrees: more than noise and edges need.
+    far_reaches : float
+        Distance that is returned for vertices without such a point.
+    batch : int
+        Vertices handled at a time, which bounds memory.
+    """
+    from scipy.spatial import cKDTree
+
+    middle = points.mean(axis=0)
+    tree, directions = cKDTree(points - middle), mesh.vertex_normals()
+    result = distances.copy()
+    near = np.flatnonzero(distances <= reach)
+    ranks = list(range(1, min(neighbours, len(points)) + 1))
+    for rows in np.array_split(near, -(-max(len(near), 1) // batch)):
+        found = tree.query(mesh.vertices[rows] - middle, ranks)[1]
+        cosines = np.einsum("gki,gi->gk", normals[found], directions[rows])
+        alone = rows[(cosines < least_cosine).all(axis=1)]
+        result[alone] = np.maximum(result[alone], far_reaches * reach)
+    return result
 
 
 def _absorb_small_patches(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:

@@ -93,7 +93,7 @@ def choose_local_data(
         points, normals = samples.points.copy(), samples.normals.copy()
         points[~held_out], normals[~held_out] = averaging.apply(points[~held_out], normals[~held_out])
         # Averaged points have correlated noise, for which the marginal likelihood is wrong.
-        of_averaged = FieldResiduals.of(sdf, replace(samples, points=points, normals=normals))
+        of_averaged = FieldResiduals.of(sdf, replace(samples, points=points, normals=normals, noise=None))
         return replace(validation, residuals=of_averaged, likelihood=None)
 
     first = _candidates(parameters)[0]

@@ -36,7 +36,7 @@ from gnrecon.runtime.parallel import map_in_threads
 class FieldResiduals:
     """The global field at the points, whose values are residuals: all of shape (N,) or (N, 3), unit coordinates.
 
-    `estimated` is true if the normals were estimated from the points.
+    `estimated` says whether normals were estimated; `noise` is the deviation that the points themselves show, or None.
     """
 
     points: Float
@@ -44,12 +44,14 @@ class FieldResiduals:
     value: Float
     gradient: Float
     estimated: bool = False
+    noise: float | None = None
 
     @classmethod
     def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
         """Evaluate a field at samples."""
         value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
-        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, samples.estimated)
+        off = value / samples.frame.scale
+        return cls(samples.points, samples.normals, off, gradient, samples.estimated, samples.noise)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -341,17 +343,17 @@ class CrossValidation:
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
-        """Return the noises of positions and normals to try with a length, the most likely one last.
-
-        Unless it is known, noise is at most the residuals of the global field.
-        """
+        """Return the noises of positions and normals to try with a length, the most likely one last."""
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
             tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
             tried += [] if self.likelihood is None else [self.likelihood.noise(length)]
-            most = max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
-            self._noises[length] = [(min(position, most), angle) for position, angle in tried]
+            # With estimated normals, few validation points hardly tell a smooth field from one that winds through all.
+            least, most = 0.0, max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
+            if self.residuals.estimated and (shown := self.residuals.noise):
+                least, most = shown / self.parameters.most_noise_factor, shown * self.parameters.most_noise_factor
+            self._noises[length] = [(min(max(position, least), most), angle) for position, angle in tried]
         return self._noises[length]
 
     def scores(self, length: float) -> Float:

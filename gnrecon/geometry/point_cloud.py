@@ -76,6 +76,14 @@ class PointCloud:
             None if self.origins is None else self.origins[rows],
         )
 
+    @property
+    def has_directions(self) -> bool:
+        """Whether at least half of the points have a normal that is finite and not zero."""
+        if self.normals is None:
+            return False
+        largest = np.abs(self.normals).max(axis=1, initial=0.0)
+        return bool(2 * (np.isfinite(largest) & (largest > 0)).sum() >= len(self.points))
+
     def with_normals(self, normals: Float | None) -> PointCloud:
         """Return the same cloud with other normals, of shape (N, 3)."""
         return replace(self, normals=normals)
@@ -133,6 +141,8 @@ class Samples:
         Validation points, which the fit does not use, in the same frame.
     estimated : bool
         Whether the normals or their signs were estimated from the points and may be wrong in places.
+    noise : float, optional
+        Standard deviation of the points along the normal, unit coordinates, where it was measured.
     """
 
     points: Float
@@ -140,6 +150,7 @@ class Samples:
     frame: Frame
     held_out: Samples | None = None
     estimated: bool = False
+    noise: float | None = None
 
     def __repr__(self) -> str:
         held_out = "" if self.held_out is None else f", {len(self.held_out):,} held out"

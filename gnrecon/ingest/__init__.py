@@ -11,7 +11,7 @@ from gnrecon.ingest.outliers import find_outliers, parse_outliers
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.prepare import prepare
 from gnrecon.ingest.subsample import subsample
-from gnrecon.ingest.survey import Survey, survey
+from gnrecon.ingest.survey import Survey, is_single_sheet, survey
 from gnrecon.ingest.unit_guess import UnitsGuess, guess_units
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "find_outliers",
     "flip_if_inward",
     "guess_units",
+    "is_single_sheet",
     "isolated_clusters",
     "layers_of",
     "mean_spacing",

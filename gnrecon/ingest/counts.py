@@ -20,6 +20,8 @@ class IngestCounts:
     outliers_found : outliers that were kept, because they are too many or because removal is off
     clusters : dropped, because they are in isolated clusters
     clusters_found : points in isolated clusters that were kept, for the same reasons
+    inner : dropped, because they fill the volume below its surface
+    arrangement : ``"lines"`` or ``"volume"`` where the points lie along lines or fill a volume; None on surfaces
     held_out : validation points, which the fit does not use
     moved : root mean square distance by which smoothing moved the points, in file units; None without smoothing
     thinned : dropped by subsampling
@@ -38,6 +40,8 @@ class IngestCounts:
     outliers_found: int = 0
     clusters: int = 0
     clusters_found: int = 0
+    inner: int = 0
+    arrangement: str | None = None
     held_out: int = 0
     moved: float | None = None
     thinned: int = 0
@@ -65,6 +69,15 @@ class IngestCounts:
             sentences.append(f"Kept {self.outliers_found} points that look like outliers.")
         if self.clusters_found:
             sentences.append(f"Kept {self.clusters_found} points in isolated clusters.")
+        if self.arrangement == "lines":
+            sentences.append(
+                "The points lie along lines that are far apart for the distance of points on a line; what is between "
+                "the lines is interpolated. Normals from the scanner, or --spacing of about half the distance of the "
+                "lines, help."
+            )
+        if self.arrangement == "volume":
+            what = f" Kept its outer surface, without {self.inner} points below it." if self.inner else ""
+            sentences.append(f"The points fill a volume instead of lying on its surface.{what}")
         if self.moved is not None:
             sentences.append(f"Smoothed the points; they moved by {self.moved:.3g} file units (root mean square).")
         if self.normals != "given":

@@ -74,6 +74,8 @@ class OrientationParameters:
     consistent_points: int = 4000  # at most, in the refinement, which needs matrices of 64 MB
     most_disorder: float = 0.25  # of the winding number, above which signs are doubtful in places, or the scan is open
     better_disorder_ratio: float = 0.8  # that the global methods must reach against propagation to replace it
+    most_conflicting: float = 0.003  # share of pairs of neighbours, see `Agreement`: 0.005 to 0.09 for signs by winding
+    # number in open scenes, where propagation has up to 0.002
 
 
 @dataclass(frozen=True)
@@ -94,12 +96,12 @@ class SurveyParameters:
 
     points: int = 10_000  # at which neighbourhoods are measured; more would not change the figures
     border_neighbours: tuple[int, int] = (24, 40)  # both must show a gap: by chance, one may
+    border_points: int = 2000  # from which borders show though the noise cannot be determined
     density_neighbour: int = 8  # whose distance measures the density
     border_gap_degrees: float = (
         120.0  # widest angle without neighbours, seen along the normal: 180 at a straight border
     )
     open_share: float = 0.005  # of points at a border, above which the scan is open
-    disagreeing_share: float = 0.02  # of points whose normal disagrees with most neighbours', above: inconsistent
     length_tolerance: float = 0.05  # by which the length of unit normals may differ from 1
 
 

@@ -9,22 +9,27 @@ of the scanner is known, the line of sight decides (`orient_towards_scanner`). O
   number (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by construction; used
   on up to a few thousand points, from which the others take their sign.
 
-The winding number of the result (`winding_at_points`) decides between them and measures the confidence.
+The winding number of the result (`winding_at_points`) measures the confidence. It decides between them only where
+neighbours do not contradict it: in an open scene, such as objects on a ground, normals of changing signs may have a
+winding number nearer to that of a closed surface than the right ones. Signs that change within a sheet show: the
+neighbours that face the other way lie in front of a point as often as behind it (`Agreement`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.ingest_parameters import IngestParameters
+from gnrecon.ingest.ingest_parameters import IngestParameters, OrientationParameters
+from gnrecon.ingest.normal_agreement import Agreement, agreement_of
 from gnrecon.ingest.normals import tangent_planes, unoriented_normals
 from gnrecon.ingest.orientation_methods import (
     consistent_normals,
     gauss_normals,
+    is_open,
     orient_towards_scanner,
     outwardness,
     propagate_orientation,
@@ -41,11 +46,12 @@ class Orientation:
     Parameters
     ----------
     normals : array of shape (N, 3), of unit length
-    how : such as ``"estimated"``; ``"estimated, orientation uncertain"`` where the winding number is far from that of a
-        closed surface; ``"estimated, oriented by origins"``
+    how : such as ``"estimated"``; ``"estimated, upward, as of an open surface"`` where neighbours agree on an open
+        surface; ``"estimated, orientation uncertain"`` where the winding number is far from that of a closed surface
+        otherwise; ``"estimated, oriented by origins"``
     confidence : share in [0, 1] of the points that confirm their sign: the winding number there is that of a closed
-        surface with outward normals or, by origins, the line of sight is clear of the tangent plane; None for given
-        signs
+        surface with outward normals; on an open surface, most neighbours do not face the other way; by origins, the
+        line of sight is clear of the tangent plane; None for given signs
     flipped : share in [0, 1] of the given normals that were flipped
     """
 
@@ -92,22 +98,27 @@ def oriented_normals(
     if seen is not None:
         return Orientation(seen[0], "estimated, oriented by origins", seen[1])
     normals, disorder = _by_shape(centred, axes, along is None, parameters)
-    certain = disorder <= parameters.orientation.most_disorder
-    how = "estimated" if certain else "estimated, orientation uncertain"
-    return Orientation(normals, how, winding_agreement(centred, normals))
+    if disorder <= parameters.orientation.most_disorder:
+        return Orientation(normals, "estimated", winding_agreement(centred, normals))
+    agreement = agreement_of(centred, normals)
+    if is_open(outwardness(centred, normals)) and agreement.conflicting <= parameters.orientation.most_conflicting:
+        return Orientation(normals, "estimated, upward, as of an open surface", 1 - agreement.mostly)
+    return Orientation(normals, "estimated, orientation uncertain", winding_agreement(centred, normals))
 
 
 def _by_shape(points: Float, axes: Float, free: bool, parameters: IngestParameters) -> tuple[Float, float]:
     """Return the normals whose winding number is closest to that of a closed surface, and their disorder.
 
-    `free` says whether the axes may be replaced by better ones.
+    Signs by winding number that neighbours contradict are not among them. `free` says whether the axes may be replaced
+    by better ones.
     """
     limits, planes = parameters.orientation, parameters.normals
     by_winding: list[Float] = []
     if len(points) <= limits.gauss_points:
         by_winding = _by_winding(points, axes, free, parameters)
         disorder = winding_disorder(points, by_winding[-1])
-        if disorder <= limits.most_disorder:
+        agreement = agreement_of(points, by_winding[-1])
+        if disorder <= limits.most_disorder and _uncontradicted(agreement, 0.0, limits):
             return by_winding[-1], disorder
     local = tangent_planes(points, limits.local_neighbours, parameters=planes)
     normals = propagate_orientation(points, axes, local, 0.0)
@@ -116,11 +127,38 @@ def _by_shape(points: Float, axes: Float, free: bool, parameters: IngestParamete
         return normals, disorder
     smooth = tangent_planes(points, limits.smooth_neighbours, parameters=planes)
     second = propagate_orientation(points, axes, smooth, limits.off_plane_penalty)
-    normals, disorder = min((normals, disorder), (second, winding_disorder(points, second)), key=_disorder)
+    normals, disorder, own = _propagated(points, normals, second, limits)
     others = by_winding or _by_winding(points, axes, free, parameters)
     third, other = min(((found, winding_disorder(points, found)) for found in others), key=_disorder)
-    # An open scan is disorderly with either method, and only propagation can be right there.
-    return (third, other) if other < limits.better_disorder_ratio * disorder else (normals, disorder)
+    agreement = agreement_of(points, third)
+    allowed = agreement.shows_walls() or agreement.conflicting < own.conflicting - limits.most_conflicting
+    allowed |= other <= limits.most_disorder and _uncontradicted(agreement, own.conflicting, limits)
+    better = other < limits.better_disorder_ratio * disorder
+    return (third, other) if allowed and better else (normals, disorder)
+
+
+def _uncontradicted(agreement: Agreement, usual: float, limits: OrientationParameters) -> bool:
+    """Return whether neighbours agree, but at thin walls, up to what is usual for the scan."""
+    return agreement.shows_walls() or agreement.conflicting <= usual + limits.most_conflicting
+
+
+def _propagated(
+    points: Float, first: Float, second: Float, limits: OrientationParameters, *, least_facing: float = 0.3
+) -> tuple[Float, float, Agreement]:
+    """Return the better one of two propagated orientations, its disorder, and how its neighbours agree.
+
+    Where neighbours contradict one of them more than the other, it is the other, else that of less disorder. In an
+    open scene, which was seen from one side, it is the one that faces one side more: whose mean normal is longer, and
+    at least `least_facing`. Normals of closed surfaces cancel.
+    """
+    found = [(normals, winding_disorder(points, normals), agreement_of(points, normals)) for normals in (first, second)]
+    conflicts = [agreement.conflicting for _, _, agreement in found]
+    if abs(conflicts[0] - conflicts[1]) > limits.most_conflicting:
+        return found[int(conflicts[1] < conflicts[0])]
+    facing = [float(np.linalg.norm(normals.mean(axis=0))) for normals, _, _ in found]
+    if min(found[0][1], found[1][1]) > limits.most_disorder and max(facing) > least_facing:
+        return found[int(facing[1] > facing[0])]
+    return min(found, key=lambda one: one[1])
 
 
 def _disorder(candidate: tuple[Float, float]) -> float:
@@ -164,8 +202,22 @@ def flip_if_inward(points: Float, normals: Float, *, inward_outwardness: float =
     return (-normals, True) if inward else (normals, False)
 
 
+def are_inconsistent(points: Float, normals: Float, *, most_opposed_share: float = 0.02) -> bool:
+    """Return whether many normals contradict their neighbours', other than on both sides of thin walls.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), distinct, N > 1
+    normals : array of shape (N, 3), of unit length
+    most_opposed_share : of points that most neighbours oppose, above which normals are inconsistent: where a part of a
+        scan has the wrong signs consistently, only the points at its edge are among them
+    """
+    agreement = agreement_of(points, normals)
+    return agreement.mostly > most_opposed_share and not agreement.lie_behind()
+
+
 ORIENTATIONS = {
-    "auto": "estimated where missing; all flipped where they point into a closed surface",
+    "auto": "estimated where missing or inconsistent; all flipped where they point into a closed surface",
     "given": "estimated where missing, and otherwise unchanged",
     "signs": "directions kept, signs estimated",
     "estimate": "estimated from the points",
@@ -203,6 +255,9 @@ def with_outward_normals(
     normals = cloud.normals
     if normals is None or mode == "estimate":
         found = oriented_normals(cloud.points, cloud.origins, parameters=parameters)
+    elif mode == "auto" and are_inconsistent(cloud.points - cloud.points.mean(axis=0), normals):
+        found = oriented_normals(cloud.points, cloud.origins, parameters=parameters)
+        found = replace(found, how=f"{found.how}, because the given ones are inconsistent")
     elif mode == "signs":
         sides = oriented_normals(cloud.points, cloud.origins, along=normals, parameters=parameters)
         turned = float((np.einsum("ij,ij->i", sides.normals, normals) < 0).mean())

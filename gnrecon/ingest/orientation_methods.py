@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.ingest.point_spacing import mean_distances
 from gnrecon.runtime.errors import InputError
 
@@ -18,12 +18,11 @@ def propagate_orientation(
     *,
     neighbours: int = 8,
     jitter_extents: float = 1e-6,
-    open_outwardness: float = 0.1,
 ) -> Float:
     """Return `directions` with signs propagated along a minimum spanning tree of nearly parallel tangent planes.
 
-    The signs as a whole are outward, or upward for an open surface. Source: Hoppe et al., *Surface Reconstruction from
-    Unorganized Points* (1992), in open3d's implementation. It fails at thin walls and in sparse regions.
+    The signs as a whole are those of `with_outside`. Source: Hoppe et al., *Surface Reconstruction from Unorganized
+    Points* (1992), in open3d's implementation. It fails at thin walls and in sparse regions.
 
     Parameters
     ----------
@@ -32,7 +31,6 @@ def propagate_orientation(
     neighbours : of each point in the graph
     jitter_extents : by which points are moved, in extents of the cloud: the tree comes from a Delaunay triangulation,
         which fails for exactly cospherical points
-    open_outwardness : magnitude of `outwardness` below which the surface is open
 
     Raises
     ------
@@ -50,11 +48,58 @@ def propagate_orientation(
         except RuntimeError:  # from open3d, for points that cannot be triangulated
             raise InputError(f"Normals cannot be estimated from {len(points)} points that span no volume.") from None
     signs = np.where(np.einsum("ij,ij->i", directions, np.asarray(cloud.normals)) < 0, -1.0, 1.0)
-    normals: Float = directions * signs[:, None]
+    return with_outside(points, directions * signs[:, None])
+
+
+def is_open(side: float, *, most: float = 0.3) -> bool:
+    """Return whether an `outwardness` is that of an open surface, without an inside.
+
+    Half a sphere has 0.6, sheets and scenes on the ground have less than 0.2; the signs of random ones have 0, too.
+    """
+    return abs(side) < most
+
+
+def with_outside(points: Float, normals: Float, *, gap_spacings: float = 2.0, least_part_points: int = 50) -> Float:
+    """Return consistent normals with the signs that the surface as a whole shows: outward, or upward if it is open.
+
+    The tree of a propagation jumps from one part of a scene to the next where nothing says which sides belong together,
+    as from the ground to an object whose underside was not seen. So each part gets its own sign.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3)
+    gap_spacings : parts are farther apart than this, in the median distance to the eighth neighbour
+    least_part_points : a part with fewer keeps its sign, because its own winding number says little
+    """
+    normals = _turned_outside(points, normals)
+    parts = _parts(points, gap_spacings)
+    if parts.any():
+        for part in np.flatnonzero(np.bincount(parts) >= least_part_points):
+            rows = parts == part
+            normals[rows] = _turned_outside(points[rows] - points[rows].mean(axis=0), normals[rows])
+    return normals
+
+
+def _turned_outside(points: Float, normals: Float) -> Float:
+    """Return the normals of one surface, all or none turned around."""
     side = outwardness(points, normals)
-    if abs(side) < open_outwardness:
+    if is_open(side):
         side = float(normals[:, 2].mean())
     return -normals if side < 0 else normals
+
+
+def _parts(points: Float, gap_spacings: float, *, neighbours: int = 8) -> Int:
+    """Return the number, from 0, of the part that each point is in, of shape (N,)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    count = min(neighbours, len(points) - 1)
+    distances, near = cKDTree(points).query(points, count + 1)
+    first, column = np.nonzero(distances < gap_spacings * np.median(distances[:, -1]))
+    links = coo_matrix((np.ones(len(first), np.int8), (first, near[first, column])), shape=(len(points),) * 2)
+    parts: Int = connected_components(links, directed=False)[1].astype(np.intp)
+    return parts
 
 
 def orient_towards_scanner(

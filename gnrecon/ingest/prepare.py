@@ -12,10 +12,12 @@ from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.clean import clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
+from gnrecon.ingest.noise import estimate_noise
 from gnrecon.ingest.orientation import require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.smooth import smooth_points
 from gnrecon.ingest.subsample import subsample as thin
+from gnrecon.ingest.survey import fill_a_volume, lie_on_lines, outer_surface
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -66,7 +68,16 @@ def prepare(
     require_orientation(orient)
     cleaned, counts = clean(cloud, outliers, clusters=clusters, units=units, parameters=parameters)
     advance(0.2)  # cleaning takes about a fifth of the time, and normals another half
+    centred = cleaned.points - cleaned.points.mean(axis=0)
+    arrangement = "lines" if lie_on_lines(centred) else "volume" if fill_a_volume(centred) else None
+    counts = replace(counts, arrangement=arrangement)
+    if arrangement == "volume" and cleaned.normals is None:
+        outer, normals = outer_surface(centred)
+        cleaned = cleaned.select(outer).with_normals(normals)
+        counts = replace(counts, inner=int((~outer).sum()))
     oriented, orientation = with_outward_normals(cleaned, orient, parameters=parameters)
+    if counts.inner:
+        orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
     oriented, held_out = _hold_out(oriented, holdout, seed)
     # Spacings are those of the whole cloud.
@@ -110,4 +121,6 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Sa
     _log.info("The unit ball has the centre %s and the radius %.6g.", frame.center.tolist(), frame.scale)
     if len(held_out) and held_out.normals is not None:
         held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
-    return Samples(frame.to_unit(kept.points), kept.normals, frame, held, estimated)
+    points = frame.to_unit(kept.points)
+    noise = estimate_noise(points, mean_spacing(points)).deviation if estimated and len(points) >= 16 else None
+    return Samples(points, kept.normals, frame, held, estimated, noise)

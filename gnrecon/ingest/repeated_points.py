@@ -21,6 +21,7 @@ def repeated_points(
     neighbours: int = 16,
     close_share: float = 0.02,
     least_share: float = 0.05,
+    least_around: float = 0.5,
     queries: int = 20_000,
 ) -> Mask:
     """Return the mask, of shape (N,), of points that repeat an earlier one; empty unless the scan is repeated.
@@ -31,6 +32,8 @@ def repeated_points(
     neighbours : searched for copies; the distance of the last one is the measure of closeness
     close_share : of that distance, below which a point is a copy; less than 1 % of a scan's points are so close
     least_share : of points with a copy, from which the scan is repeated; well above this 1 %
+    least_around : share of points with a copy among the neighbours of those with one: where a scan is repeated, nearly
+        all of them; where strips of a survey overlap, pairs come close by chance, one here and one there
     queries : evenly chosen points that decide whether it is
     """
     from scipy.sparse import coo_matrix
@@ -42,6 +45,9 @@ def repeated_points(
     if count < 1 or _copies(tree, points[::stride], count, close_share)[1].any(axis=1).mean() < least_share:
         return np.zeros(len(points), bool)
     near, close = _copies(tree, points, count, close_share)
+    copied = np.asarray(close.any(axis=1), dtype=bool)
+    if copied[near[copied]].mean() < least_around:
+        return np.zeros(len(points), bool)
     rows, columns = np.nonzero(close)
     pairs = (np.ones(len(rows), np.int8), (rows, near[rows, columns]))
     links: Any = coo_matrix(pairs, shape=(len(points), len(points)))

@@ -151,7 +151,8 @@ def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
         # Two thousand points are enough for the median spacing.
         some = cloud.points[:: -(-len(cloud) // 2000)]
         spacing = float(np.median(cKDTree(cloud.points).query(some, k=2)[0][:, 1]))
-    normals = cloud.normals
+    # Files that hold zeros for normals hold none; points without a side are seen from all sides.
+    normals = cloud.normals if cloud.has_directions else None
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     return draw_points(cloud.points, normals, min(0.55 * spacing, 0.02), camera, color, _background(camera))

@@ -31,6 +31,7 @@ BENCHMARKS = {
     "refine": Benchmark("remeshing", "remeshing and decimation, compared with pymeshlab and manifold3d"),
     "batch": Benchmark("batch_recovery", "many scans, some broken, killed and continued; and throughput"),
     "fuzz": Benchmark("fuzz", "damaged and odd scans in whole reconstructions: how they end, time and memory"),
+    "inputs": Benchmark("inputs", "scans of the kinds that people have, compared with screened Poisson"),
     "export": Benchmark("extraction", "extraction at growing resolutions, compared with the whole grid"),
 }
 

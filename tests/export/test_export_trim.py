@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from analytic_fields import Field, sphere, torus, union
 
-from gnrecon.export import Neighbourhood, extract, require_bordered, require_sound, trim, unsupported_area, verify_file
+from gnrecon.export import (
+    Neighbourhood,
+    extract,
+    require_bordered,
+    require_sound,
+    same_side_distances,
+    trim,
+    unsupported_area,
+    verify_file,
+)
 from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.mesh_statistics import Edges, split_vertices
 from gnrecon.geometry.mesh import Mesh
@@ -175,3 +184,19 @@ def test_what_is_no_edge_manifold_is_refused() -> None:
     with pytest.raises(MeshError, match="is empty"):
         require_bordered(Mesh(np.eye(3), np.empty((0, 3))))
     assert require_bordered(Mesh(np.eye(3), [[0, 1, 2]])).boundary_edges == 3
+
+
+def test_the_underside_of_a_slab_is_not_supported_by_the_points_of_its_top() -> None:
+    slab = extract(Field(lambda p: np.abs(p / [1, 1, 0.1]).max(axis=1) * 0.1 - 0.09), resolution=60)
+    points = slab.vertices[slab.vertices[:, 2] > 0.085]
+    normals = np.tile([0.0, 0, 1], (len(points), 1))
+    distances = Neighbourhood(points).distances(slab.vertices)
+    assert trim(slab, distances, 0.25)[1].area_share == 0
+    sheet, trimming = trim(slab, same_side_distances(slab, distances, points, normals, 0.25), 0.25)
+    require_bordered(sheet)
+    assert sheet.vertices[:, 2].min() > 0
+    assert sheet.area == pytest.approx(1.8**2, rel=0.05)
+    assert trimming.area_share == pytest.approx(1 - sheet.area / slab.area)
+    both = np.concatenate([points, points * [1, 1, -1]]), np.concatenate([normals, -normals])
+    kept = same_side_distances(slab, distances, *both, 0.25)
+    assert (kept[slab.vertices[:, 2] < -0.085] <= 0.25).mean() > 0.95

@@ -12,7 +12,7 @@ from gnrecon.fit import FitOptions, NeuralSDF, fit
 from gnrecon.fit import denoising as averaged
 from gnrecon.fit.denoising import LocalData, _best, _candidates, choose_local_data, has_edges
 from gnrecon.fit.local_solve import Hyperparameters
-from gnrecon.fit.model_selection import FieldResiduals, SelectedModel
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, SelectedModel
 from gnrecon.fit.parameters import DenoisingParameters
 from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -116,3 +116,16 @@ def test_clean_points_and_estimated_normals_are_left_alone(monkeypatch: pytest.M
     assert result(DenoisingParameters.least_noise_disk_radii, estimated=False) is not None
     assert result(1.1 * DenoisingParameters.least_noise_disk_radii, estimated=True) is not None
     assert result(1.1 * DenoisingParameters.least_noise_disk_radii, estimated=False) is None
+
+
+def test_the_noise_of_estimated_normals_is_about_that_of_the_points() -> None:
+    points = made_shapes.sphere(500, np.random.default_rng(0))[0]
+    residuals = FieldResiduals(points, points, np.full(500, 0.05), points, estimated=True, noise=0.03)
+    held_out = np.arange(500) % 8 == 0
+    for known, least, most in ((0.03, 0.015, 0.06), (None, 0.0, 0.051)):
+        of_points = replace(residuals, noise=known)
+        validation = CrossValidation.draw(of_points, held_out, 0.1, np.random.default_rng(0), "cpu")
+        positions = [position for position, _ in validation.noises(0.4)]
+        assert least <= min(positions)
+        assert max(positions) <= most
+    assert min(positions) < 0.015

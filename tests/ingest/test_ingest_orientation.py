@@ -12,7 +12,7 @@ from made_shapes import sphere
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest import prepare
-from gnrecon.ingest.orientation import oriented_normals
+from gnrecon.ingest.orientation import are_inconsistent, oriented_normals
 from gnrecon.ingest.orientation_methods import orient_towards_scanner
 from gnrecon.io import read_scans
 from gnrecon.runtime.errors import UsageError
@@ -117,3 +117,26 @@ def test_the_bunnys_range_scans_are_oriented_by_their_origins(shared_data: Path)
     assert (facing > 0).mean() > 0.99
     assert found.confidence is not None
     assert found.confidence > 0.95
+
+
+@pytest.mark.parametrize("share", [0.06, 0.5])
+def test_inconsistent_normals_are_estimated_again(share: float, rng: np.random.Generator) -> None:
+    points, truth = torus(1500, rng)
+    mixed = PointCloud(points, truth * np.where(rng.random((1500, 1)) < share, -1.0, 1.0))
+    samples, counts = prepare(mixed)
+    assert (np.einsum("ij,ij->i", samples.normals, truth) > 0).mean() > 0.995
+    assert samples.estimated
+    assert "because the given ones are inconsistent" in " ".join(counts.remarks())
+    np.testing.assert_allclose(prepare(mixed, orient="given")[0].normals, mixed.normals, atol=1e-12)
+
+
+def test_normals_at_right_angles_or_on_two_sides_of_a_sheet_are_consistent(rng: np.random.Generator) -> None:
+    for thickness in (2.0, 0.05):
+        low, high = np.array([0, 0, 0.0]), np.array([2, 2, thickness])
+        points = rng.uniform(low, high, (3000, 3))
+        axis, side = rng.integers(0, 3, 3000) if thickness > 1 else np.full(3000, 2), rng.integers(0, 2, 3000)
+        rows, normals = np.arange(3000), np.zeros((3000, 3))
+        points[rows, axis] = np.where(side == 1, high[axis], low[axis])
+        normals[rows, axis] = 2 * side - 1
+        assert not are_inconsistent(points, normals)
+        assert are_inconsistent(points, normals * rng.choice([-1.0, 1.0], (3000, 1)))

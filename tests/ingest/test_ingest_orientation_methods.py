@@ -10,6 +10,7 @@ from analytic_clouds import thin_shell, torus
 from made_shapes import sphere
 
 from gnrecon.ingest import flip_if_inward, oriented_normals
+from gnrecon.ingest.normal_agreement import agreement_of
 from gnrecon.ingest.orientation_methods import (
     consistent_normals,
     gauss_normals,
@@ -67,7 +68,7 @@ def test_a_terrain_looks_upward() -> None:
     x, y = np.random.default_rng(0).uniform(-1, 1, (2, 4000))
     found = oriented_normals(np.column_stack([x, y, 0.1 * np.sin(4 * x) * np.cos(3 * y)]))
     assert (found.normals[:, 2] > 0).mean() >= 0.99
-    assert found.how == "estimated, orientation uncertain"
+    assert found.how == "estimated, upward, as of an open surface"
 
 
 def test_the_smallest_clouds_are_served() -> None:
@@ -156,3 +157,39 @@ def test_a_few_wrong_normals_do_not_flip_the_rest() -> None:
     points, truth = sphere(3000, np.random.default_rng(0))
     wrong = np.where(np.arange(3000)[:, None] % 5 == 0, -truth, truth)
     assert not flip_if_inward(points, wrong)[1]
+
+
+def table_scene(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A ball on a plate, as seen from above: without its underside, and no plate below it."""
+    ball, outward = sphere(count // 3, rng)
+    plate = np.column_stack([rng.uniform(-4, 4, (count, 2)), np.zeros(count)])
+    plate = plate[np.hypot(plate[:, 0] + 2, plate[:, 1]) > 1.1]
+    seen = ball[:, 2] > -0.3
+    truth = np.concatenate([outward[seen], np.tile([0.0, 0, 1], (len(plate), 1))])
+    return np.concatenate([ball[seen] * 1.2 + [-2, 0, 1.2], plate]), truth
+
+
+def waves(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    x, y = rng.uniform(-5, 5, (2, count))
+    slopes = np.column_stack([-np.cos(x), 1.3 * np.sin(1.3 * y), np.ones(count)])
+    return np.column_stack([x, y, np.sin(x) + np.cos(1.3 * y)]), slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("scene", [table_scene, waves])
+def test_open_scenes_keep_the_signs_that_neighbours_agree_on(scene: Shape) -> None:
+    points, truth = scene(1500, np.random.default_rng(5))
+    points += 0.01 * np.random.default_rng(6).standard_normal(points.shape)
+    found = oriented_normals(points)
+    assert agreement(found.normals, truth) >= 0.99
+    assert found.how == "estimated, upward, as of an open surface"
+    assert found.confidence is not None
+    assert found.confidence > 0.99
+
+
+def test_neighbours_that_contradict_each_other_are_no_thin_wall(rng: np.random.Generator) -> None:
+    points, truth = thin_shell(3000, rng)
+    right, mixed = agreement_of(points, truth), agreement_of(points, truth * rng.choice([-1.0, 1.0], (len(truth), 1)))
+    assert right.shows_walls() == (right.opposing > 0.02)
+    assert right.conflicting < 0.002
+    assert not mixed.shows_walls()
+    assert mixed.conflicting > 0.1

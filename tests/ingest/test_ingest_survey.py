@@ -8,7 +8,9 @@ import pytest
 from analytic_clouds import torus
 
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.survey import Survey, survey
+from gnrecon.ingest import IngestCounts, prepare
+from gnrecon.ingest.repeated_points import repeated_points
+from gnrecon.ingest.survey import Survey, fill_a_volume, is_single_sheet, lie_on_lines, survey
 
 
 def sphere(rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -70,3 +72,62 @@ def test_borders_counts_and_extent(rng: np.random.Generator) -> None:
     assert (found.points, found.duplicates, found.non_finite, found.outliers) == (6011, 7, 3, 1)
     assert found.upper == [9, 9, 9]
     assert survey(PointCloud(points[:20])) is None
+
+
+def test_single_sheets_are_terrain_and_walls_not_bowls_or_solids(rng: np.random.Generator) -> None:
+    x, y = rng.uniform(-2, 2, (2, 3000))
+    slopes = np.column_stack([-np.cos(2 * x), np.sin(y), np.ones(3000)])
+    up = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+    terrain = np.column_stack([x, y, 0.5 * np.sin(2 * x) + np.cos(y)])
+    assert is_single_sheet(terrain, up)
+    assert is_single_sheet(terrain[:, [2, 0, 1]] + 1e6, up[:, [2, 0, 1]])
+    points, outward = sphere(rng)
+    half = points[:, 2] > 0
+    assert not is_single_sheet(points, outward)
+    assert not is_single_sheet(points[half], outward[half])
+    assert not is_single_sheet(points[half], -outward[half])
+    assert not is_single_sheet(terrain, up * rng.choice([-1.0, 1.0], (3000, 1)))
+
+
+def profiles(ratio: int, rng: np.random.Generator) -> np.ndarray:
+    """Rings around a tube, with points `ratio` times denser along them than the rings are apart."""
+    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 20 * ratio, endpoint=False), 0.314 * np.arange(20))
+    points = np.column_stack([np.cos(angle).ravel(), np.sin(angle).ravel(), height.ravel()])
+    return points + 0.002 * rng.standard_normal(points.shape)
+
+
+@pytest.mark.parametrize("ratio", [6, 30])
+def test_points_on_lines_are_said_to_be(ratio: int, rng: np.random.Generator) -> None:
+    assert lie_on_lines(profiles(ratio, rng))
+    assert "The points lie along lines" in " ".join(IngestCounts(1, arrangement="lines").remarks())
+
+
+def test_a_filled_volume_is_its_outer_surface(rng: np.random.Generator) -> None:
+    points = sphere(rng)[0][:4000] * rng.random((4000, 1)) ** (1 / 3) * [1.0, 2.0, 1.5] + 10
+    samples, counts = prepare(PointCloud(points))
+    assert counts.arrangement == "volume"
+    assert counts.inner == 4000 - len(samples) > 1000
+    assert "The points fill a volume instead of lying on its surface." in " ".join(counts.remarks())
+    kept = (samples.frame.to_world(samples.points) - 10) / [1.0, 2.0, 1.5]
+    assert np.median(np.linalg.norm(kept, axis=1)) > 0.85
+    assert (np.einsum("ij,ij->i", samples.normals, kept) > 0).mean() > 0.95
+
+
+def test_surfaces_are_neither_lines_nor_volumes(rng: np.random.Generator) -> None:
+    grid = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0)), -1).reshape(-1, 2)
+    clouds = [sphere(rng, 0.04)[0], profiles(2, rng), np.column_stack([grid, np.zeros(1600)])]
+    clouds.append(np.concatenate([clouds[2], clouds[2] + [0.5, 0.5, 0.3]]))  # both sides of a thin sheet
+    for points in clouds:
+        assert not lie_on_lines(points)
+        assert not fill_a_volume(points)
+
+
+def test_overlapping_strips_are_no_repeated_scan(rng: np.random.Generator) -> None:
+    """Two surveys of one terrain that share a strip, in which one point in eight lies close to one of the other."""
+    first, second = rng.uniform(0, 1, (2, 3000, 3)) * [1, 1, 0.01]
+    second[:, 0] += 0.7
+    strip = np.flatnonzero(first[:, 0] > 0.7)[::2]
+    second[: len(strip)] = first[strip] + 1e-5
+    assert not repeated_points(np.concatenate([first, second])).any()
+    part = first[first[:, 0] > 0.7]
+    assert repeated_points(np.concatenate([first, part + 1e-5])).sum() == pytest.approx(len(part), rel=0.01)

@@ -165,3 +165,9 @@ def test_colours_of_vertices_are_drawn(ball: Mesh) -> None:
     red, _, blue = np.moveaxis(image, 2, 0)
     assert (red - blue)[40:50, 35:50].min() > 50
     assert (blue - red)[40:50, 70:85].min() > 50
+
+
+def test_points_whose_normals_are_zero_are_seen(ball: Mesh) -> None:
+    points = ball.vertices
+    without = render(None, size=SIZE, points=PointCloud(points))
+    np.testing.assert_array_equal(render(None, size=SIZE, points=PointCloud(points, 0 * points)), without)

@@ -148,7 +148,7 @@ def _add_points(buffers: dict[str, str], cloud: PointCloud, centre: Float, radiu
         finite = np.sort(np.random.default_rng(0).choice(finite, most, replace=False))
     points = (cloud.points[finite] - centre) / radius
     buffers["points"] = pack(points.astype("<f4"))
-    if cloud.normals is not None:
+    if cloud.normals is not None and cloud.has_directions:
         lengths = np.maximum(np.linalg.norm(cloud.normals[finite], axis=1, keepdims=True), 1e-300)
         normals = np.zeros((len(finite), 4))
         normals[:, :3] = np.nan_to_num(cloud.normals[finite] / lengths)
