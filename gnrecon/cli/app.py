@@ -10,6 +10,7 @@ import os
 import shlex
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any, NoReturn
@@ -72,6 +73,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if words and words[0] not in (*COMMANDS, "-h", "--help"):
         words.insert(0, "reconstruct")
     # On a busy machine, threads that spin while they wait slow the run down several times.
+    # Warnings of libraries are for programmers; -W and PYTHONWARNINGS show them.
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # SIGTERM must unwind the stack, so that temporary files are removed.
     signal.signal(signal.SIGTERM, _terminate)
