@@ -239,6 +239,7 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
     run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    run.options.require_reachable(bounds)
     warnings = [] if ingested.layers is None else [ingested.layers.describe()]
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested

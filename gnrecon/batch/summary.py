@@ -178,7 +178,7 @@ def _row(scan: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _link(path: str, folder: Path) -> str:
-    return quote(os.path.relpath(path, folder))
+    return quote(os.fsencode(os.path.relpath(path, folder)))
 
 
 def _picture_uri(path: str, *, colors: int = 64) -> str | None:

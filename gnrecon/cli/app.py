@@ -6,6 +6,7 @@ stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon
 
 from __future__ import annotations
 
+import io
 import os
 import shlex
 import signal
@@ -77,6 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Names of files may hold bytes that are not UTF-8.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     # SIGTERM must unwind the stack, so that temporary files are removed.
     signal.signal(signal.SIGTERM, _terminate)
     sys.exit(_guarded(words, command))

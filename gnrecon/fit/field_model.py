@@ -304,9 +304,9 @@ def _require_sense(
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise InputError(f"{path} holds numbers in {name!r} that are not finite.")
         unit = name in ("box", "support", "detail.lattice")
-        if name != "frame.center" and name != "frame.scale" and tensor.numel():
-            if float(tensor.double().abs().max()) > (most_unit if unit else most_number):
-                raise InputError(f"{path} holds numbers in {name!r} that are too large.")
+        world, most = name in ("frame.center", "frame.scale"), most_unit if unit else most_number
+        if not world and tensor.numel() and float(tensor.double().abs().max()) > most:
+            raise InputError(f"{path} holds numbers in {name!r} that are too large.")
     box, support, scale = tensors["box"], tensors.get("support"), float(tensors["frame.scale"])
     if not (scale > 0 and bool((box[1] - box[0] > least_length).all())):
         raise InputError(f"{path} holds a frame or a box without extent.")

@@ -27,9 +27,10 @@ def clean(
 ) -> tuple[PointCloud, IngestCounts]:
     """Return the usable points, with unit normals where the cloud has some, and the numbers of dropped points.
 
-    Dropped are points that are not finite or out of all proportion, see `usable_positions`, exact duplicates (the first is kept), points without a normal where most
-    have one (where most have none, all normals are discarded), copies of points where a scan is contained twice, see
-    `repeated_points`, outliers, and isolated clusters, see `isolated_clusters`.
+    Dropped are points that are not finite or out of all proportion, see `usable_positions`, exact duplicates (the first
+    is kept), points without a normal where most have one (where most have none, all normals are discarded), copies of
+    points where a scan is contained twice, see `repeated_points`, outliers, and isolated clusters, see
+    `isolated_clusters`.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ class Survey:
 
     Parameters
     ----------
-    points, non_finite, duplicates, repeated, clusters : numbers of points: all, those not finite or far too far, those at
+    points, non_finite, duplicates, repeated, clusters : numbers of points: all, unusable ones, those at
         the position of another, copies of others where a scan is contained twice, and those in isolated clusters
     outliers : their number among at most `SurveyParameters.points` of the others
     lower, upper : corners of the bounding box

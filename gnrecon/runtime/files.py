@@ -54,6 +54,11 @@ def atomic_write(
         temporary.unlink(missing_ok=True)
 
 
+def printable(text: str) -> str:
+    r"""Return a text that UTF-8 can hold: bytes of file names that are no UTF-8 are written as ``\udcff``."""
+    return text.encode("utf-8", errors="backslashreplace").decode("utf-8")
+
+
 def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
     """Write a text file, UTF-8, atomically.
 
@@ -63,7 +68,7 @@ def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
         As `atomic_write` does.
     """
     with atomic_write(path, overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(printable(text), encoding="utf-8", newline="\n")
 
 
 def _check(target: Path, path: str | Path, overwrite: bool) -> None:

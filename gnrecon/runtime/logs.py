@@ -88,7 +88,7 @@ def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
     if any(file.resolve() == other.resolve() for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
     try:
-        handler = logging.FileHandler(file, encoding="utf-8")
+        handler = logging.FileHandler(file, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error
     handler.setLevel(logging.DEBUG)
