@@ -23,6 +23,7 @@ import tomli_w
 
 from gnrecon.option_table import option_rows
 from gnrecon.runtime.errors import InputError, UsageError, suggestion
+from gnrecon.runtime.files import printable
 from gnrecon.runtime.typed_values import described
 from gnrecon.version import __version__
 
@@ -98,12 +99,15 @@ def settings_text(values: Mapping[str, Any], scan: Path) -> str:
     scan : whose options these are
     """
     plain = {name: _plain(value) for name, value in values.items() if value is not None}
-    head = f"# All options in effect, for {scan.name}, of gnrecon {__version__}.\n"
+    head = f"# All options in effect, for {_plain(scan.name)}, of gnrecon {__version__}.\n"
     return head + tomli_w.dumps(plain)
 
 
 def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else str(value.absolute()) if isinstance(value, Path) else value
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    value = str(value.absolute()) if isinstance(value, Path) else value
+    return printable(value) if isinstance(value, str) else value
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -111,7 +115,7 @@ def _read(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"The configuration {path} cannot be read: {error.strerror or error}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"The configuration {path} is not TOML: {error}.") from error
 
 
@@ -171,7 +175,10 @@ def _converted(kind: Any, value: Any) -> Any:
         return value if isinstance(value, str) else None
     read = _read_value(value) if isinstance(value, str) else value
     if kind is float and isinstance(read, int | float) and not isinstance(read, bool):
-        return float(read)
+        try:
+            return float(read)
+        except OverflowError:  # a whole number beyond the range of doubles
+            return None
     return read if type(read) is kind else None
 
 
@@ -189,5 +196,5 @@ def _read_value(text: str) -> Any:
     """The TOML value that a text stands for; the text itself where it stands for none."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, KeyError):
+    except (tomllib.TOMLDecodeError, KeyError, RecursionError):
         return text

@@ -127,11 +127,7 @@ class OptionTable:
         metavar="SHARE",
     )
     max_points: int | None = _row(
-        None,
-        Panel.POINTS,
-        "Keep at most this many points for the fit.",
-        limits="at least 1",
-        unset="all",
+        None, Panel.POINTS, "Keep at most this many points for the fit.", limits="at least 1", unset="all"
     )
     spacing: float | str | None = _row(
         None,
@@ -252,12 +248,7 @@ class OptionTable:
         metavar="DISTANCE",
         limits="above 0",
     )
-    faces: int | None = _row(
-        None,
-        Panel.MESH,
-        "Reduce the mesh to this number of faces.",
-        limits="at least 4",
-    )
+    faces: int | None = _row(None, Panel.MESH, "Reduce the mesh to this number of faces.", limits="at least 4")
     feature_angle: float = _row(
         30.0,
         Panel.MESH,
@@ -348,25 +339,11 @@ class OptionTable:
         "(log-spaced step lengths) or auto.",
         choices=("auto", "damping", "geodesic", "line"),
     )
-    seed: int = _row(
-        0,
-        Panel.FIT,
-        "Seed of all random choices.",
-        limits="at least 0",
-    )
+    seed: int = _row(0, Panel.FIT, "Seed of all random choices.", limits="at least 0")
     device: str = _row(
-        "cpu",
-        Panel.FIT,
-        "Where the fit and the mesh are computed: cpu or cuda.",
-        choices=("cpu", "cuda"),
+        "cpu", Panel.FIT, "Where the fit and the mesh are computed: cpu or cuda.", choices=("cpu", "cuda")
     )
-    threads: int | None = _row(
-        None,
-        Panel.FIT,
-        "CPU threads.",
-        limits="at least 1",
-        unset="torch's choice",
-    )
+    threads: int | None = _row(None, Panel.FIT, "CPU threads.", limits="at least 1", unset="torch's choice")
     work_dir: str | None = _row(
         None,
         Panel.FIT,

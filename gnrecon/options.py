@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -54,7 +55,39 @@ class Options(OptionTable):
         require_orientation(self.orient)
         self._require_block_options()
 
+    def _require_bounded(
+        self,
+        *,
+        most_threads: int = 256,
+        most_cells: int = 16_384,
+        most_count: int = 2**48,
+        most_seed: int = 2**63 - 1,
+        most_length: float = 1e30,
+        least_length: float = 1e-30,
+    ) -> None:
+        """Refuse numbers that no machine can serve.
+
+        Parameters
+        ----------
+        most_threads : or the processors, where there are more; thousands of stacks end the process
+        most_cells : along a side; coordinates of the nodes are packed into 64 bits
+        most_count : of points, faces and steps
+        most_seed : what all generators take
+        most_length, least_length : in file units; squares and cubes of other lengths under- or overflow
+        """
+        counts = ("read_points", "max_points", "faces", "steps")
+        most = dict.fromkeys(counts, most_count) | {"resolution": most_cells, "seed": most_seed}
+        most["threads"] = max(most_threads, os.cpu_count() or 1)
+        for name, limit in most.items():
+            if (value := getattr(self, name)) is not None and value > limit:
+                raise UsageError(f"{name} must be at most {limit:,}, not {_shortened(value)}.")
+        for name in ("edge_length", "max_error", "remesh", "simplify"):
+            value = getattr(self, name)
+            if value is not None and not least_length <= value <= most_length:
+                raise UsageError(f"{name} must lie between {least_length:g} and {most_length:g}, not {value:g}.")
+
     def _require_valid_values(self) -> None:
+        self._require_bounded()
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"The number of threads must be positive, not {self.threads}.")
         if self.read_points < 1:
@@ -146,6 +179,34 @@ class Options(OptionTable):
         longest = float(np.ptp(bounds, axis=0).max())
         return replace(self, resolution=_default_cells(longest, points))
 
+    def require_reachable(self, bounds: Float, *, most_faces: float = 1e8, least_error: float = 1e-9) -> None:
+        """Refuse lengths for which the mesh would not fit into memory, before the work.
+
+        Parameters
+        ----------
+        bounds : box in which the points will be meshed, of shape (2, 3), file units
+        most_faces : with `remesh`, of a surface as large as that of the box; a hundred bytes and more for each
+        least_error : of `max_error`, in longest sides of the box; doubles resolve hardly less
+
+        Raises
+        ------
+        UsageError
+            With the least length.
+        """
+        x, y, z = np.ptp(bounds, axis=0)
+        if self.remesh is not None:
+            # Faces of an equilateral mesh have an area of sqrt(3) / 4 of their squared edge.
+            least = math.sqrt(2 * (x * y + y * z + z * x) / (most_faces * math.sqrt(3) / 4))
+            if self.remesh < least:
+                raise UsageError(
+                    f"Faces with edges of {self.remesh:g} would be more than {most_faces:,.0f} on this scan; "
+                    f"give --remesh at least {least:.2g}."
+                )
+        if self.max_error is not None and self.max_error < (least := least_error * max(x, y, z)):
+            raise UsageError(
+                f"An error of {self.max_error:g} cannot be reached; give --max-error at least {least:.2g}."
+            )
+
     def fit(self) -> FitOptions:
         """Return the options of the fit."""
         return FitOptions(
@@ -179,6 +240,13 @@ class Options(OptionTable):
 
 
 Options.__doc__ = f"{Options.__doc__}\n    {option_documentation()}"
+
+
+def _shortened(value: float, *, most_digits: int = 30) -> str:
+    """A number as text; one of more digits than anybody reads, by their number."""
+    # Python refuses to print whole numbers of thousands of digits.
+    large = isinstance(value, int) and abs(value) >= 10**most_digits
+    return f"a number of more than {most_digits} digits" if large else f"{value}"
 
 
 def _default_cells(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +146,7 @@ class Reconstruction:
         # Only trimming makes a mesh open, and the file is verified as the mesh was.
         bordered = not self.report["mesh"]["closed"]
         mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
-        return write_mesh(mesh, path, overwrite, verify=lambda written: _verify(written, bordered))
+        return write_mesh(mesh, path, overwrite, verify=partial(verify_file, bordered=bordered))
 
     def to_trimesh(self) -> Any:
         """Return the mesh as a `trimesh.Trimesh`."""
@@ -272,11 +273,12 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
     run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    run.options.require_reachable(bounds)
     if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     warnings = [] if ingested.layers is None else [ingested.layers.describe()]
-    warnings += few_points_remark(samples.frame.to_world(samples.points))
-    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
+    few = few_points_remark(samples.frame.to_world(samples.points))
+    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings, *few])
     return ingested
 
 
@@ -290,9 +292,8 @@ def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
         run.progress.step(record, total)
 
     with run.stages("fit"):
-        sdf, solution = fit(
-            samples, options.fit(), step, run.progress.advance, options.work_dir, options.block_scheduler
-        )
+        where = options.work_dir, options.block_scheduler
+        sdf, solution = fit(samples, options.fit(), step, run.progress.advance, *where)
         residuals = Misfit.of(sdf, samples)
         held_out = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
     run.remark([solution.status])
@@ -397,7 +398,3 @@ def _reference(reference: Any) -> Mesh | PointCloud | None:
     if reference is None:
         return None
     return read_reference(reference) if isinstance(reference, str | Path) else as_shape(reference)
-
-
-def _verify(path: Path, bordered: bool) -> None:
-    verify_file(path, bordered)

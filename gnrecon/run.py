@@ -34,7 +34,7 @@ from gnrecon.rendering import render, render_sheet
 from gnrecon.report.html import page_text
 from gnrecon.report.time_left import TimeLeft
 from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.runtime.files import atomic_write, require_files
+from gnrecon.runtime.files import atomic_write, printable, require_files
 from gnrecon.runtime.logs import logged
 
 STAGES = {
@@ -172,7 +172,7 @@ def _write(files: Files, result: Reconstruction, *, thumbnail_pixels: tuple[int,
             config.write_text(settings_text(values, files.scans[0]), encoding="utf-8")
         if files.html is not None:
             page = stack.enter_context(atomic_write(files.html, files.overwrite))
-            page.write_text(page_text(result.report, result.mesh, result.cloud), encoding="utf-8")
+            page.write_text(printable(page_text(result.report, result.mesh, result.cloud)), encoding="utf-8")
         return result.save(files.output, files.overwrite)
 
 

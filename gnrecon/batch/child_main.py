@@ -43,7 +43,7 @@ def work(argument: dict[str, Any]) -> int:
         traceback.print_exc()
         sentence, code = failure(error)
         print(f"gnrecon: {sentence}", file=sys.stderr)
-        failure_file(folder).write_text(sentence, encoding="utf-8")
+        failure_file(folder).write_text(sentence, encoding="utf-8", errors="backslashreplace")
         return code
 
 

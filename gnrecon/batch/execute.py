@@ -40,7 +40,7 @@ from gnrecon.batch.job import (
     read_record,
     running_folder,
 )
-from gnrecon.runtime.errors import ExitCode, GnreconError, OutputError
+from gnrecon.runtime.errors import ExitCode, GnreconError, OutputError, failure
 from gnrecon.runtime.files import sync
 
 
@@ -63,6 +63,10 @@ def run_job(
     except OSError as error:
         sentence = f"{error.filename or job.output}: {error.strerror or error}."
         return _failed(job, Cause.OUTPUT, sentence, ExitCode.OUTPUT)
+    except Exception as error:
+        # Whatever happens to one scan costs that scan, and not the batch.
+        sentence, code = failure(error)
+        return _failed(job, cause_of(code), sentence, code)
 
 
 @dataclass(frozen=True)

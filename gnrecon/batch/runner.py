@@ -48,6 +48,7 @@ def run_batch(request: Request) -> int:
         without = sum(job.reference is None for job in jobs)
         if request.references is not None and without:
             console.print(f"{without} of {len(jobs)} scans have no reference in {request.references}.", soft_wrap=True)
+        reserve = _reserved_space(request.output, len(jobs))
         board = ProgressBoard(console, len(jobs), request.output)
 
         def done(outcome: JobOutcome) -> None:
@@ -64,13 +65,35 @@ def run_batch(request: Request) -> int:
             interrupted = True
         ordered = tuple(outcomes[job.name] for job in jobs if job.name in outcomes)
         summary = BatchSummary(ordered, len(jobs), count, threads, time.monotonic() - start, request.command)
-        written = write_summary(summary, request.output)
-    for line in _closing_lines(summary):
-        console.print(line, highlight=False, markup=False)
+        reserve.unlink(missing_ok=True)
+        try:
+            written = write_summary(summary, request.output)
+        finally:
+            for line in _closing_lines(summary):
+                console.print(line, highlight=False, markup=False)
     if interrupted:
         print(f"gnrecon: Interrupted; {written} lists what was done until then.", file=sys.stderr)
         return ExitCode.INTERRUPTED
     return ExitCode.BATCH if summary.count(Status.FAILED) else ExitCode.OK
+
+
+def _reserved_space(output: Path, scans: int, *, least_bytes: int = 1 << 18, scan_bytes: int = 1 << 15) -> Path:
+    """Fill a file with as much as the summary needs, so that it finds space where the results filled the disk.
+
+    `scan_bytes` is about twice the size of a scan's thumbnail and figures in the three formats.
+
+    Raises
+    ------
+    OutputError
+        When there is not even that much space.
+    """
+    path = state_folder(output) / "reserve"
+    try:
+        path.write_bytes(b"\0" * (least_bytes + scans * scan_bytes))
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise OutputError(f"The folder {output} has no space for the summary: {error.strerror or error}.") from error
+    return path
 
 
 def _closing_lines(summary: BatchSummary) -> list[RenderableType]:

@@ -117,8 +117,17 @@ def summary_csv(outcomes: Sequence[JobOutcome]) -> str:
     table = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     for outcome in outcomes:
-        table.writerow({**outcome.as_dict(), **outcome.figures, **_numeric(outcome.metrics)})
+        row = {**outcome.as_dict(), **outcome.figures, **_numeric(outcome.metrics)}
+        table.writerow({name: _not_a_formula(value) for name, value in row.items()})
     return text.getvalue()
+
+
+def _not_a_formula(value: Any) -> Any:
+    """Text that a spreadsheet would run as a formula begins with an apostrophe, which spreadsheets take for text.
+
+    Source: https://owasp.org/www-community/attacks/CSV_Injection
+    """
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value
 
 
 def _numeric(metrics: Mapping[str, Any] | None) -> dict[str, float]:
@@ -169,7 +178,7 @@ def _row(scan: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _link(path: str, folder: Path) -> str:
-    return quote(os.path.relpath(path, folder))
+    return quote(os.fsencode(os.path.relpath(path, folder)))
 
 
 def _picture_uri(path: str, *, colors: int = 64) -> str | None:

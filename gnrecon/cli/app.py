@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any, NoReturn
@@ -78,6 +79,9 @@ def _run(words: list[str]) -> int:
         return ExitCode.OK
     command = shlex.join(["gnrecon", *words])
     # On a busy machine, threads that spin while they wait slow the run down several times.
+    # Warnings of libraries are for programmers; -W and PYTHONWARNINGS show them.
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         if words or "_GNRECON_COMPLETE" in os.environ:  # a shell that completes a line gives no words

@@ -7,6 +7,7 @@ standard output has not taken are a failure, unless the program that reads them 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Iterator
@@ -75,6 +76,9 @@ def lenient_streams() -> Iterator[Streams]:
     """Make the standard streams lenient while the block runs, and open the null device for those that were closed."""
     _open_missing()
     before = sys.stdout, sys.stderr
+    if isinstance(before[0], io.TextIOWrapper):
+        # Names of files may hold bytes that are not UTF-8; Python escapes them on standard error alone.
+        before[0].reconfigure(errors="backslashreplace")
     with Path(os.devnull).open("w", encoding="utf-8") as null:
         # Python has None for a stream that was closed.
         output, errors = LenientStream(before[0] or null), LenientStream(before[1] or null)

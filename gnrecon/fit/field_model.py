@@ -244,8 +244,8 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a mapping)
         if not isinstance(facts, dict) or facts.get("format") != FORMAT:
             raise InputError(f"{path} is not a gnrecon model of the format {FORMAT!r}.")
-        field = Siren(tuple(int(width) for width in facts["widths"]))
-        if tensors["theta"].shape != (field.layout.count,) or not tensors["theta"].is_floating_point():
+        field = Siren(_require_widths(path, facts["widths"]))
+        if tensors["theta"].shape != (field.layout.count,):
             raise InputError(f"{path} holds {tuple(tensors['theta'].shape)} parameters for widths {field.widths}.")
         _require_sense(path, tensors)
         frame = Frame(tensors["frame.center"].cpu().numpy(), float(tensors["frame.scale"]))
@@ -255,24 +255,77 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
         return NeuralSDF(field, tensors["theta"], frame, Box(lower, upper), dict(facts["options"]), support, detail)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+    # JSON that is nested too deeply, and numbers that are too large for their use, are damage as well.
+    except (SafetensorError, KeyError, ValueError, TypeError, RecursionError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} is not a gnrecon model ({error}).") from error
 
 
-def _require_sense(path: str | Path, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Raise an error for shapes and numbers that no fit makes."""
+def _require_widths(path: str | Path, widths: Any, *, most_layers: int = 64) -> tuple[int, ...]:
+    """Return the widths of a network, or raise an error where they are no list of positive whole numbers."""
+    if not isinstance(widths, list) or not 1 <= len(widths) <= most_layers:
+        raise InputError(f"{path} holds no list of 1 to {most_layers} network widths.")
+    if not all(type(width) is int and width >= 1 for width in widths):
+        raise InputError(f"{path} holds network widths that are not positive whole numbers.")
+    return tuple(widths)
+
+
+def _require_sense(
+    path: str | Path,
+    tensors: Mapping[str, torch.Tensor],
+    *,
+    most_unit: float = 100.0,
+    most_number: float = 1e15,
+    scales: tuple[float, float] = (1e-16, 1e25),
+    least_length: float = 1e-9,
+    least_overlap: float = 1e-3,
+) -> None:
+    """Raise an error for types, shapes and numbers that no fit makes.
+
+    Parameters
+    ----------
+    path : named in the error
+    tensors : of the file, by name
+    most_unit : largest coordinate in units of the frame, where all data lies in the unit ball
+    most_number : largest other number; sums of squares of larger ones leave no digits
+    scales : range of the frame's scale, in file units, which includes every scan that ingest accepts
+    least_length : of the cubes and correlation lengths of local fields, in units of the frame
+    least_overlap : of the cubes, as a share of their edge
+    """
+    for name, tensor in tensors.items():
+        whole = name == "detail.keys"
+        if tensor.dtype not in ((torch.int64, torch.int32) if whole else (torch.float32, torch.float64)):
+            kind = str(tensor.dtype).removeprefix("torch.")
+            raise InputError(f"{path} holds {name!r} as {kind}, not as {'whole' if whole else 'real'} numbers.")
+    for name in ("frame.center", "frame.scale", "box"):
+        if tensors[name].dtype != torch.float64:
+            raise InputError(f"{path} holds {name!r} in single precision, not in double.")
     shapes = {"frame.center": (3,), "frame.scale": (), "box": (2, 3)}
     for name, tensor in tensors.items():
         if name in shapes and tensor.shape != shapes[name]:
             raise InputError(f"{path} holds {name!r} of shape {tuple(tensor.shape)}, not {shapes[name]}.")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise InputError(f"{path} holds numbers in {name!r} that are not finite.")
-    box, support = tensors["box"], tensors.get("support")
-    if not (float(tensors["frame.scale"]) > 0 and bool((box[1] > box[0]).all())):
+        unit = name in ("box", "support", "detail.lattice")
+        world, most = name in ("frame.center", "frame.scale"), most_unit if unit else most_number
+        if not world and tensor.numel() and float(tensor.double().abs().max()) > most:
+            raise InputError(f"{path} holds numbers in {name!r} that are too large.")
+    box, support, scale = tensors["box"], tensors.get("support"), float(tensors["frame.scale"])
+    if not (scale > 0 and bool((box[1] - box[0] > least_length).all())):
         raise InputError(f"{path} holds a frame or a box without extent.")
-    if support is not None and (support.dtype != torch.float32 or support.ndim != 2 or support.shape[1:] != (3,)):
+    if not scales[0] < scale < scales[1]:
+        raise InputError(f"{path} holds a frame of the scale {scale:g}, which cannot be computed with.")
+    # Farther from the origin, float64 does not tell the corners of the box apart.
+    if float(tensors["frame.center"].abs().max()) > most_number * scale:
+        raise InputError(f"{path} holds a frame that lies too far from the origin for its scale.")
+    if "detail.lattice" in tensors:
+        lattice, lengths = tensors["detail.lattice"], tensors["detail.lengths"]
+        if lattice.shape != (5,) or not (float(lattice[3]) >= least_length and bool((lengths >= least_length).all())):
+            raise InputError(f"{path} holds local fields whose lengths are not positive.")
+        if float(lattice[4]) < least_overlap:
+            raise InputError(f"{path} holds local fields that do not overlap.")
+    if support is not None and (support.dtype != torch.float32 or support.shape[1:] != (3,) or not len(support)):
         raise InputError(f"{path} holds {tuple(support.shape)} numbers as the data's points, not rows of three.")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 from gnrecon.fit.parameters import NetworkLadderParameters, SingleNetworkParameters
@@ -83,6 +84,7 @@ class FitOptions:
         require_field_types(self)
         if self.widths is not None and (not self.widths or min(self.widths) < 1):
             raise UsageError(f"Network widths must be positive numbers, not {self.widths}.")
+        self._require_bounded_network()
         if self.steps is not None and self.steps < 0:
             raise UsageError(f"The number of steps must not be negative, not {self.steps}.")
         normal_residual(self.normals)
@@ -97,6 +99,17 @@ class FitOptions:
             raise UsageError(
                 "smooth, fill and prior are for the default fit; they cannot be combined with widths, steps, another "
                 "optimiser or another normal residual."
+            )
+
+    def _require_bounded_network(self, *, most_layers: int = 64, most_parameters: int = 2_000_000) -> None:
+        """Refuse networks whose Jacobian fits into no memory; one of 2,000,000 parameters takes 16 MB for each row."""
+        widths = self.widths or ()
+        sizes = (3, *widths, 1)
+        count = sum((into + 1) * out for into, out in pairwise(sizes))
+        if len(widths) > most_layers or count > most_parameters:
+            raise UsageError(
+                f"The network may have at most {most_layers} layers and {most_parameters:,} parameters; "
+                f"choose fewer or smaller widths."
             )
 
     @property

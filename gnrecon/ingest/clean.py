@@ -27,9 +27,10 @@ def clean(
 ) -> tuple[PointCloud, IngestCounts]:
     """Return the usable points, with unit normals where the cloud has some, and the numbers of dropped points.
 
-    Dropped are points that are not finite, exact duplicates (the first is kept), points without a normal where most
-    have one (where most have none, all normals are discarded), copies of points where a scan is contained twice, see
-    `repeated_points`, outliers, and isolated clusters, see `isolated_clusters`.
+    Dropped are points that are not finite or out of all proportion, see `usable_positions`, exact duplicates (the first
+    is kept), points without a normal where most have one (where most have none, all normals are discarded), copies of
+    points where a scan is contained twice, see `repeated_points`, outliers, and isolated clusters, see
+    `isolated_clusters`.
 
     Parameters
     ----------
@@ -46,14 +47,14 @@ def clean(
     UsageError
         When an argument is out of its range.
     InputError
-        When fewer than 10 points remain, or all lie on a line or in a plane.
+        When fewer than 10 points remain, all lie on a line or in a plane, or they extend too far or not far enough.
     """
     rule = parse_outliers(outliers, units)
     require_mode(clusters)
     if not 0 <= max_outlier_share <= 1:
         raise UsageError(f"The largest share of outliers is {max_outlier_share}, but must lie in [0, 1].")
     counts = IngestCounts(read=len(cloud))
-    finite = np.asarray(np.isfinite(cloud.points).all(axis=1), dtype=bool)
+    finite = usable_positions(cloud.points)
     cloud, counts = cloud.select(finite), replace(counts, non_finite=int((~finite).sum()))
     cloud, dropped = _with_unit_normals(cloud)
     _, first = np.unique(cloud.points, axis=0, return_index=True)
@@ -75,6 +76,44 @@ def clean(
     _require_points(cloud, counts, parameters.least_points)
     _require_volume(cloud.points)
     return cloud, replace(counts, kept=len(cloud), normals="missing" if cloud.normals is None else "given")
+
+
+def usable_positions(
+    points: Float, *, most_spreads: float = 1e9, least_spread: float = 1e-15, most_spread: float = 1e15
+) -> Mask:
+    """Return the mask, of shape (N,), of points whose coordinates are numbers that can be computed with.
+
+    Others are not finite, or come from damaged bytes: next to a point at 1e38, float64 cannot tell the others apart,
+    and squares overflow.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), file units
+    most_spreads : largest distance from the median, in medians of this distance; float64 resolves 1e-16 of it
+    least_spread, most_spread : range of the median distance, in file units, wide enough for atoms in metres and stars
+        in kilometres; the sixth powers of lengths stay far from the limits of float64
+
+    Raises
+    ------
+    InputError
+        When the median distance lies outside this range.
+    """
+    usable = np.asarray(np.isfinite(points).all(axis=1), dtype=bool)
+    if not usable.any():
+        return usable
+    # A quarter of the coordinates, so that no sum or difference of two of them overflows.
+    quarters = points[usable] / 4
+    away = np.abs(quarters - np.median(quarters, axis=0)).max(axis=1)
+    # Points at the same position, such as pulses without an echo, must not make the spread zero.
+    apart = away[away > 0]
+    if not len(apart):
+        return usable
+    spread = 4 * min(float(np.median(apart)), most_spread)
+    if not least_spread < spread < most_spread:
+        extent = f"less than {least_spread:g}" if spread <= least_spread else f"more than {most_spread:g}"
+        raise InputError(f"The points extend over {extent} file units, which cannot be computed with; scale the scan.")
+    usable[usable] = away / spread <= most_spreads / 4
+    return usable
 
 
 def _with_unit_normals(cloud: PointCloud) -> tuple[PointCloud, int]:

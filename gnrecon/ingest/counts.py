@@ -12,7 +12,7 @@ class IngestCounts:
     Parameters
     ----------
     read : points in the file
-    non_finite : dropped, because a coordinate was NaN or infinite
+    non_finite : dropped, because a coordinate was NaN, infinite or out of all proportion
     zero_normals : dropped, because they had no direction although most others did
     duplicates : dropped, because another point has exactly the same position
     repeated : dropped, because they are copies of others, as where a scan is contained twice
@@ -57,7 +57,7 @@ class IngestCounts:
     def remarks(self) -> list[str]:
         """Return a sentence for each change."""
         dropped = {
-            "with a non-finite coordinate": self.non_finite,
+            "with a coordinate that is not finite or out of all proportion": self.non_finite,
             "with a zero or non-finite normal": self.zero_normals,
             "that duplicate another": self.duplicates,
             "that repeat another to within rounding": self.repeated,

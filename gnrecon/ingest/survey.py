@@ -15,6 +15,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.local_pca import principal_sums, tangent_coordinates
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.ingest.clean import usable_positions
 from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise
@@ -31,7 +32,7 @@ class Survey:
 
     Parameters
     ----------
-    points, non_finite, duplicates, repeated, clusters : numbers of points: all, those that are not finite, those at
+    points, non_finite, duplicates, repeated, clusters : numbers of points: all, unusable ones, those at
         the position of another, copies of others where a scan is contained twice, and those in isolated clusters
     outliers : their number among at most `SurveyParameters.points` of the others
     lower, upper : corners of the bounding box
@@ -76,9 +77,14 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
     ----------
     cloud : in file units
     parameters : tuning constants
+
+    Raises
+    ------
+    InputError
+        When the points extend too far or not far enough, see `usable_positions`.
     """
     limits = parameters.survey
-    finite = np.isfinite(cloud.points).all(axis=1)
+    finite = usable_positions(cloud.points)
     points, first = np.unique(cloud.points[finite], axis=0, return_index=True)
     if len(points) <= min(limits.border_neighbours):
         return None

@@ -149,7 +149,7 @@ def input_errors_for(path: Path) -> Iterator[None]:
     except UsageError:
         raise
     # Damaged numbers can break a parser in ways that its checks do not cover; the user still gets one sentence.
-    except (ValueError, OverflowError, IndexError, KeyError, TypeError, RuntimeError) as error:
+    except (ValueError, ArithmeticError, LookupError, TypeError, RuntimeError, AttributeError, EOFError) as error:
         raise InputError(f"{name}: the file is malformed ({error}).") from None
 
 

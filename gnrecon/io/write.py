@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 def write_mesh(
-    mesh: Mesh, path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
+    mesh: Mesh, path: str | Path, overwrite: bool = False, verify: Callable[[Path], object] | None = None
 ) -> list[str]:
     """Write a mesh and return sentences on what the format could not keep.
 
@@ -66,7 +66,7 @@ def write_mesh(
 
 
 def write_cloud(
-    cloud: PointCloud, path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
+    cloud: PointCloud, path: str | Path, overwrite: bool = False, verify: Callable[[Path], object] | None = None
 ) -> None:
     """Write points with their normals and all their attributes; colours are written as 8-bit numbers.
 

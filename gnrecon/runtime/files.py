@@ -20,7 +20,7 @@ from gnrecon.runtime.errors import GnreconError, InputError, OutputError, UsageE
 
 @contextmanager
 def atomic_write(
-    path: str | Path, overwrite: bool = False, verify: Callable[[Path], None] | None = None
+    path: str | Path, overwrite: bool = False, verify: Callable[[Path], object] | None = None
 ) -> Iterator[Path]:
     """Yield a temporary path with the target's suffix; rename it to the target if the block succeeds.
 
@@ -67,6 +67,11 @@ def _output_errors(path: str | Path) -> Iterator[None]:
         raise OutputError(f"{path} could not be written: {reason}.") from error
 
 
+def printable(text: str) -> str:
+    r"""Return a text that UTF-8 can hold: bytes of file names that are no UTF-8 are written as ``\udcff``."""
+    return text.encode("utf-8", errors="backslashreplace").decode("utf-8")
+
+
 def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
     """Write a text file, UTF-8, atomically.
 
@@ -76,7 +81,7 @@ def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:
         As `atomic_write` does.
     """
     with atomic_write(path, overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(printable(text), encoding="utf-8", newline="\n")
 
 
 def _temporary(target: Path, *, most_stem: int = 20, most_suffix: int = 8) -> Path:

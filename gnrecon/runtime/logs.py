@@ -85,11 +85,29 @@ def logged(console: Console | None, file: Path | None, others: Sequence[Path] = 
             raise
 
 
+@contextmanager
+def unprinted_log(name: str) -> Iterator[None]:
+    """Keep Python from printing a library's records to stderr; handlers that a program attached still get them.
+
+    Python prints records of level WARNING and above where no handler is attached.
+
+    Parameters
+    ----------
+    name : of the library's logger
+    """
+    logger, handler = logging.getLogger(name), logging.NullHandler()
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
 def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
     if any(file.resolve() == other.resolve() for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
     try:
-        handler = _FileHandler(file, encoding="utf-8")
+        handler = _FileHandler(file, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error
     handler.setLevel(logging.DEBUG)

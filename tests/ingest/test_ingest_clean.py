@@ -34,7 +34,7 @@ def test_every_reason_is_counted_and_attributes_follow() -> None:
     assert cloud.normals is not None
     np.testing.assert_allclose(cloud.normals, normals[kept] / 3, atol=1e-15)
     assert counts.remarks() == [
-        "Dropped 2 of 200 points with a non-finite coordinate.",
+        "Dropped 2 of 200 points with a coordinate that is not finite or out of all proportion.",
         "Dropped 2 of 200 points with a zero or non-finite normal.",
         "Dropped 2 of 200 points that duplicate another.",
     ]

@@ -30,6 +30,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, guard_parser
 from gnrecon.io.parse import sibling_path
 from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.logs import unprinted_log
 
 
 def glb_supports(name: str, values: Values) -> bool:
@@ -60,7 +61,7 @@ def read_glb_bytes(data: bytes) -> Contents:
     """Read the bytes of a GLB file, as `read_glb` does."""
     import trimesh
 
-    with guard_parser("GLB"):
+    with guard_parser("GLB"), unprinted_log("trimesh"):
         file = trimesh.util.wrap_as_stream(_readable_by_trimesh(data))
         scene = trimesh.load_scene(file, file_type="glb", process=False, skip_materials=True)
         return _collected(scene, _unread(data))
@@ -109,6 +110,7 @@ def _readable_by_trimesh(data: bytes) -> bytes:
     if data[16:20] != b"JSON":
         return data
     tree = json.loads(data[20 : 20 + length])
+    _require_bounded(tree, len(data))
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
             _rename(primitive["attributes"], "COLOR_0", "_COLOR_0")
@@ -116,6 +118,17 @@ def _readable_by_trimesh(data: bytes) -> bytes:
                 tree["accessors"].append({"componentType": 5121, "type": "SCALAR", "count": 3})
                 primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
     return pack_glb(tree, data[20 + length :])
+
+
+def _require_bounded(tree: dict[str, Any], size: int) -> None:
+    """Refuse counts that the file's bytes cannot hold, before trimesh allocates arrays of their size."""
+    views = tree.get("bufferViews", [])
+    for accessor in tree.get("accessors", []):
+        # Without a view, the values are zero or sparse; a file that uses them has at least as many bytes.
+        view = accessor.get("bufferView")
+        held = size if view is None else min(size, int(views[view]["byteLength"]))
+        if not 0 <= int(accessor["count"]) <= held:
+            raise InputError(f"an accessor declares {accessor['count']} values, more than the file holds.")
 
 
 def pack_glb(tree: dict[str, Any], rest: bytes) -> bytes:

@@ -42,9 +42,10 @@ def read_pcd(path: Path) -> Contents:
         raise InputError(f"the header declares {declared} points, but {len(points)} could be read.")
     normals = arrays.pop("normals", None)
     columns = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in arrays.items()}
-    return Contents(
-        points.astype(np.float64), None if normals is None else normals.astype(np.float64), no_faces(), columns
-    )
+    # Damaged bytes may be numbers that warn when they are converted; ingest drops them.
+    with np.errstate(invalid="ignore"):
+        directions = None if normals is None else normals.astype(np.float64)
+        return Contents(points.astype(np.float64), directions, no_faces(), columns)
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:

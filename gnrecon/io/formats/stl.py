@@ -14,6 +14,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.origin import float32_origin, parse_origin, stl_header
 from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.logs import unprinted_log
 
 
 def read_stl(path: Path) -> Contents:
@@ -31,7 +32,9 @@ def read_stl(path: Path) -> Contents:
             warnings.simplefilter("error", DeprecationWarning)  # how numpy reports words that are not numbers
             origin = parse_origin(file.read(80))
             file.seek(0)
-            loaded = load_stl(file)
+            # trimesh logs what it raises, with a trace, and Python prints the log of a library to stderr.
+            with unprinted_log("trimesh"):
+                loaded = load_stl(file)
     except (HeaderError, DeprecationWarning, ValueError):
         raise InputError("the file is neither a complete binary STL nor a well-formed text STL.") from None
     solids = [loaded] if "vertices" in loaded else list(loaded["geometry"].values())

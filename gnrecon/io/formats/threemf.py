@@ -161,6 +161,7 @@ def read_3mf(path: Path) -> Contents:
             model = _load(archive)
     except (zipfile.BadZipFile, zlib.error, expat.ExpatError, KeyError, EOFError) as error:
         raise InputError(f"the file is not a well-formed 3MF archive ({error}).") from None
+    _require_bounded(model)
     pieces = [piece for key, matrix in model.items for piece in _transformed(model, key, matrix, 0)]
     if not pieces:
         raise InputError("the 3MF model builds no mesh.")
@@ -250,6 +251,31 @@ class _Part:
         # With the production extension, the object may be in another part.
         path = next((value for name, value in values.items() if name.endswith("}path")), self._name)
         return (posixpath.normpath(path).lstrip("/"), values["objectid"]), matrix
+
+
+def _require_bounded(
+    model: _Model, *, most_depth: int = 32, most_instances: int = 1_000_000, most_vertices: int = 100_000_000
+) -> None:
+    """Refuse a model that builds more than memory holds; objects that contain others twice multiply at each level."""
+    known: dict[Key, tuple[int, int]] = {}
+
+    def counted(key: Key, depth: int) -> tuple[int, int]:
+        """Instances and vertices of an object with all that it contains."""
+        if key not in known:
+            if key not in model.objects or depth > most_depth:
+                raise InputError(f"the 3MF model builds the object {key[1]!r}, which is missing or contains itself.")
+            current = model.objects[key]
+            inner = [counted(part, depth + 1) for part, _ in current.parts]
+            own = len(current.vertices) // 3 + len(current.corners) // 3
+            known[key] = 1 + sum(one for one, _ in inner), own + sum(vertices for _, vertices in inner)
+        return known[key]
+
+    totals = [counted(key, 0) for key, _ in model.items]
+    instances, vertices = (sum(column) for column in zip(*totals, strict=True)) if totals else (0, 0)
+    if instances > most_instances or vertices > most_vertices:
+        raise InputError(
+            f"the 3MF model builds {instances:,} objects with {vertices:,} vertices and faces, too many for memory."
+        )
 
 
 def _transformed(model: _Model, key: Key, matrix: Float, depth: int, *, most_depth: int = 32) -> Iterator[Mesh]:
