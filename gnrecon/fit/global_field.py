@@ -20,7 +20,7 @@ from gnrecon.fit.global_network import NetworkLadder, NetworkTerms
 from gnrecon.fit.linear_field import fit_linear
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import GlobalFieldParameters
-from gnrecon.geometry.arrays import Int, Mask
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.progress import ProgressCallback, subrange
@@ -39,6 +39,7 @@ class GlobalField:
     scene : what it saw
     length : of the linear field's features, in radii
     ladder : the network's, or None of a linear field
+    linear : the linear field that the network was compared with, or None
     """
 
     sdf: NeuralSDF
@@ -46,6 +47,12 @@ class GlobalField:
     scene: Scene
     length: float
     ladder: NetworkLadder | None = None
+    linear: NeuralSDF | None = None
+
+    def values(self, samples: Samples) -> list[Float]:
+        """Return the values at samples, each of shape (N,), world units, of all fields that were fitted."""
+        x = samples.frame.to_world(samples.points)
+        return [field.sdf(x) for field in (self.sdf, self.linear) if field is not None]
 
     def refitted(self, samples: Samples) -> NeuralSDF:
         """Return the field after some steps on all samples, which the validation points are a part of."""
@@ -114,7 +121,7 @@ def fit_global(
     if not (better or solution.interrupted):
         return replace(first, solution=replace(linear.solution, history=solution.history))
     sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
-    return GlobalField(sdf, solution, scene, linear.length, ladder)
+    return GlobalField(sdf, solution, scene, linear.length, ladder, linear.sdf)
 
 
 def _counted(callback: Callback | None, advance: ProgressCallback, most_steps: int) -> Callback:

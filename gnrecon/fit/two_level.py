@@ -198,9 +198,10 @@ class _Steps:
         if self.by_blocks:
             return completed, first, 0
         scan = data.scan
-        outliers = find_outliers(
-            first.sdf.sdf(scan.frame.to_world(scan.points)), Density(scan.points), parameters=self.parameters.outliers
-        )
+        density, limits = Density(scan.points), self.parameters.outliers
+        # One field alone may miss a thin part; a point that no field explains is none of the surface.
+        found = [find_outliers(value, density, parameters=limits) for value in first.values(scan)]
+        outliers: Mask = np.logical_and.reduce(found)
         if first.solution.interrupted or not outliers.any():
             return completed, first, 0
         if data.sharp is None:
