@@ -7,7 +7,7 @@ runs them in order, times them, passes on what users should know, and returns a 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -224,7 +224,9 @@ class _PipelineRun:
 def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
     """Read the scan and the reference."""
     with run.stages("read"):
-        cloud, reading = read_source(source, normals, format, run.options.read_points, run.options.region())
+        cloud, reading = read_source(
+            source, normals, format, run.options.read_points, run.options.region(), run.options.column_names()
+        )
         run.progress.advance(0.5)
         scan = ScanRead(cloud, reading, _reference(reference))
     requested_names(cloud, run.options.attributes)  # a misspelt name is refused before the work
@@ -320,7 +322,9 @@ def _measure(run: _PipelineRun, finished: FinishedMesh, reference: Mesh | PointC
     return replace(finished, mesh=mesh, attributes=attributes, metrics=metrics)
 
 
-def read_source(source: Any, normals: Any, format: str | None, most: int, region: Region) -> tuple[PointCloud, Reading]:
+def read_source(
+    source: Any, normals: Any, format: str | None, most: int, region: Region, columns: Sequence[str] = ()
+) -> tuple[PointCloud, Reading]:
     """Return the cloud that `reconstruct` makes of its source, and what was read.
 
     Of files, at most `most` points are kept; of all sources, those in the region.
@@ -331,7 +335,7 @@ def read_source(source: Any, normals: Any, format: str | None, most: int, region
         When it cannot be read, holds no points, or none lie in the region.
     """
     if files := _files(source):
-        return read_scans(files, format, most, region)
+        return read_scans(files, format, most, region, columns=columns)
     return cropped(as_cloud(source, normals), region)
 
 

@@ -55,7 +55,7 @@ def test_a_reference_lies_beside_the_configuration(tmp_path: Path) -> None:
     ("text", "sentence"),
     [
         ("resolution = ", "is not TOML"),
-        ("resolutions = 3", "there is no option 'resolutions'; the options are read_points, crop"),
+        ("resolutions = 3", "there is no option 'resolutions'; the options are read_points, columns, crop"),
         ("resolution = 'fine'", "resolution must be a whole number, not 'fine'"),
         ("resolution = 1.5", "resolution must be a whole number, not 1.5"),
         ("adaptive = 1", "adaptive must be true or false, not 1"),

@@ -52,7 +52,7 @@ from gnrecon.runtime.errors import UsageError
         ({"fill": "maximal"}, "option fill takes minimal=WEIGHT or minimal alone, .* not 'maximal'"),
         ({"prior": "developable=inf"}, "weight of prior must be a positive number, .* not 'inf'"),
         ({"fill": "minimal", "widths": (100,)}, "smooth, fill and prior are for the default fit"),
-        ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
+        ({"detail": 3}, "no option 'detail'; the options are read_points, columns, crop, clip_plane, units, fraction"),
     ],
 )
 def test_values_out_of_range_and_unknown_names(values: dict[str, Any], sentence: str) -> None:
