@@ -195,7 +195,8 @@ def _require_unambiguous(dialect: Dialect, rows: list[list[str]]) -> None:
     digits = [all(map(str.isdecimal, column)) for column in whole]
     # Digits after a decimal mark begin with zeros in places; numbers of their own do not.
     padded = [
-        all_digits and any(cell[0] == "0" < cell[1:] for cell in column) for all_digits, column in zip(digits, whole)
+        all_digits and any(cell[0] == "0" < cell[1:] for cell in column)
+        for all_digits, column in zip(digits, whole, strict=True)
     ]
     if sum(padded) >= 2:
         raise InputError(
