@@ -215,6 +215,8 @@ def _header(dialect: Dialect, head: list[str]) -> tuple[int, list[str] | None]:
         # A separator at the start stays: pandas leaves the name of its index empty.
         text = line.replace("\ufeff", "").strip(" \r\n").lstrip("#/%!").strip(" ")
         text = text.lstrip("; ") if dialect.separator != ";" else text
+        if dialect.separator == BLANKS:
+            text = re.sub(r"\s+(?=\[\w+\]|\(\w+\))", "", text)  # a unit belongs to its name
         splits = [dialect.cells(text), [word.strip("\"'") for word in re.split(r"[\s,;]+", text)]]
         for names in sorted(splits, key=lambda words: len(words) != dialect.width):
             names = [name.rstrip(",;") for name in names]
