@@ -33,7 +33,7 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Contents:
     Raises
     ------
     InputError
-        When a word is not a number, rows differ in length, a count is wrong, or the columns cannot be told.
+        When a word is not a number, rows differ in length, a count is wrong, or the columns are ambiguous.
     """
     return concatenated(list(table_chunks(path, None, columns)))
 

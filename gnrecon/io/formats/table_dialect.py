@@ -120,7 +120,7 @@ def find_dialect(lines: list[str]) -> Dialect:
     Raises
     ------
     InputError
-        When there are no rows, no columns x, y, z, or columns that can be told apart in several ways.
+        When there are no rows, no columns x, y, z, or ambiguous columns.
     """
     texts = [COMMENT.sub("", line.replace("\ufeff", "")) for line in lines]
     dialect, rows = _best(texts)
