@@ -96,6 +96,12 @@ class OptionTable:
         "Keep at most this many points while reading; larger scans are thinned by voxels.",
         limits="at least 1",
     )
+    columns: str | None = _row(
+        None,
+        Panel.POINTS,
+        "Names of the columns of a table in text or NPY, in order, such as x,y,z,nx,ny,nz,- where - skips one.",
+        metavar="NAMES",
+    )
     crop: tuple[str, ...] = _row(
         (),
         Panel.POINTS,

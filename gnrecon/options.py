@@ -19,6 +19,7 @@ from gnrecon.geometry.units import METRES, parse_box, parse_plane, parse_reach, 
 from gnrecon.ingest import parse_outliers, require_mode
 from gnrecon.ingest.orientation import require_orientation
 from gnrecon.ingest.point_spacing import neighbour_spacing
+from gnrecon.io import parse_columns
 from gnrecon.option_table import OptionTable, option_documentation, option_rows
 from gnrecon.runtime.errors import UsageError, suggestion
 from gnrecon.runtime.typed_values import require_field_types
@@ -41,6 +42,7 @@ class Options(OptionTable):
             if (share := getattr(self, name)) is not None:
                 object.__setattr__(self, name, parse_share(name, share))
         self.region()
+        self.column_names()
         parse_outliers(self.outliers, self.units)
         require_mode(self.clusters)
         self.mesh()
@@ -147,6 +149,16 @@ class Options(OptionTable):
             When a text is not a box or a plane.
         """
         return Region(tuple(map(parse_box, self.crop)), tuple(map(parse_plane, self.clip_plane)))
+
+    def column_names(self) -> tuple[str, ...]:
+        """Return the names of a table's columns; none where they are found out.
+
+        Raises
+        ------
+        UsageError
+            When x, y or z is missing.
+        """
+        return parse_columns(self.columns)
 
     def trim_at(self, spacing: float, sheet: bool = False, *, open_reach_spacings: float = 2.0) -> float | None:
         """Return the distance beyond which the surface is cut off, in the unit of the points' spacing.

@@ -7,7 +7,7 @@ runs them in order, times them, passes on what users should know, and returns a 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -258,7 +258,8 @@ class _PipelineRun:
 def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
     """Read the scan and the reference."""
     with run.stages("read"):
-        cloud, reading = read_source(source, normals, format, run.options.read_points, run.options.region())
+        limits = run.options.read_points, run.options.region(), run.options.column_names()
+        cloud, reading = read_source(source, normals, format, *limits)
         run.progress.advance(0.5)
         scan = ScanRead(cloud, reading, _reference(reference))
     requested_names(cloud, run.options.attributes)  # a misspelt name is refused before the work
@@ -366,18 +367,17 @@ def _measure(run: _PipelineRun, finished: FinishedMesh, reference: Mesh | PointC
     return replace(finished, mesh=mesh, attributes=attributes, metrics=metrics)
 
 
-def read_source(source: Any, normals: Any, format: str | None, most: int, region: Region) -> tuple[PointCloud, Reading]:
+def read_source(
+    source: Any, normals: Any, format: str | None, most: int, region: Region, columns: Sequence[str] = ()
+) -> tuple[PointCloud, Reading]:
     """Return the cloud that `reconstruct` makes of its source, and what was read.
 
     Of files, at most `most` points are kept; of all sources, those in the region.
 
-    Raises
-    ------
-    InputError, UsageError
-        When it cannot be read, holds no points, or none lie in the region.
+    Raises `InputError` or `UsageError` when it cannot be read, holds no points, or none lie in the region.
     """
     if files := _files(source):
-        return read_scans(files, format, most, region)
+        return read_scans(files, format, most, region, columns=columns)
     return cropped(as_cloud(source, normals), region)
 
 

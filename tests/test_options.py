@@ -66,7 +66,7 @@ from gnrecon.runtime.errors import UsageError
         ({"crop": 5}, "crop must be a list of texts, not 5"),
         ({"holdout": np.zeros(99)}, "holdout must be a number or text, not a value of type ndarray"),
         ({"quality": 3}, "quality must be text, not 3"),
-        ({"detail": 3}, "no option 'detail'; the options are read_points, crop, clip_plane, units, fraction"),
+        ({"detail": 3}, "no option 'detail'; the options are read_points, columns, crop, clip_plane, units, fraction"),
     ],
 )
 def test_values_out_of_range_and_unknown_names(values: dict[str, Any], sentence: str) -> None:

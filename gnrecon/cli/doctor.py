@@ -33,6 +33,7 @@ PACKAGES = {
     "manifold3d": "manifold3d",
     "numpy": "numpy",
     "open3d": "open3d",
+    "pandas": "pandas",
     "pillow": "PIL",
     "psutil": "psutil",
     "pymeshlab": "pymeshlab",

@@ -7,7 +7,14 @@ from typing import Annotated
 
 import typer
 
-from gnrecon.cli.shared_parameters import DebugOption, FormatOption, OverwriteOption, QuietOption, SeedOption
+from gnrecon.cli.shared_parameters import (
+    ColumnsOption,
+    DebugOption,
+    FormatOption,
+    OverwriteOption,
+    QuietOption,
+    SeedOption,
+)
 from gnrecon.option_table import Panel
 from gnrecon.runtime.errors import ExitCode
 
@@ -59,6 +66,7 @@ def check_command(
 def info_command(
     scans: Annotated[list[Path], typer.Argument(help="One or more scans; - is standard input.")],
     format: FormatOption = None,
+    columns: ColumnsOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
     debug: DebugOption = False,
 ) -> None:
@@ -66,7 +74,7 @@ def info_command(
     from gnrecon.cli.scan_info import info
 
     del debug
-    raise SystemExit(info(scans, {}, format, as_json=as_json))
+    raise SystemExit(info(scans, {} if columns is None else {"columns": columns}, format, as_json=as_json))
 
 
 def doctor_command() -> None:

@@ -30,7 +30,7 @@ def info(scans: Sequence[Path], options: dict[str, Any], format: str | None = No
         When the scan cannot be read, or no surface can be fitted to it.
     """
     chosen = Options.of(**options)
-    cloud, reading = read_source(list(scans), None, format, chosen.read_points, chosen.region())
+    cloud, reading = read_source(list(scans), None, format, chosen.read_points, chosen.region(), chosen.column_names())
     plan, layers = _plan(cloud, reading, chosen)
     facts = scan_facts(survey(cloud), layers, reading)
     if facts is None:

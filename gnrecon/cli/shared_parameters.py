@@ -22,6 +22,7 @@ FormatOption = Annotated[
         help="Format of the scan, such as ply; by default its file's extension.", rich_help_panel=Panel.POINTS
     ),
 ]
+ColumnsOption = Annotated[str | None, table_option("columns")]
 CurvatureOption = Annotated[bool, table_option("curvature")]
 SeedOption = Annotated[int, table_option("seed")]
 ThreadsOption = Annotated[int | None, table_option("threads")]

@@ -1,5 +1,6 @@
 """Reads and writes point clouds and meshes, and converts objects of other libraries."""
 
+from gnrecon.io.column_names import parse_columns
 from gnrecon.io.format_registry import CLOUD_WRITERS, READERS, WRITERS, readable, writable
 from gnrecon.io.interop import as_cloud, as_mesh, as_shape, to_open3d, to_pymeshlab, to_trimesh
 from gnrecon.io.interop_grids import to_meshio, to_pyvista
@@ -28,6 +29,7 @@ __all__ = [
     "check_writable",
     "cropped",
     "extension_of",
+    "parse_columns",
     "read_any",
     "read_cloud",
     "read_mesh",

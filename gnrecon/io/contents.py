@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.io.column_names import COLOR, NORMAL, columns_of_role, require_position
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.plugins import describe_error, guarded
 
@@ -35,6 +36,7 @@ class Contents:
     attributes : mapping of name to array of N rows
     unread : descriptions of what else the file holds, such as ``"texture coordinates"``
     origins : array of shape (N, 3), optional, the scanner position for each point; NaN where it is unknown
+    remarks : sentences about how the file was read, where it could be read in several ways
     """
 
     points: Float
@@ -43,15 +45,7 @@ class Contents:
     attributes: Columns = field(default_factory=dict)
     unread: tuple[str, ...] = ()
     origins: Float | None = None
-
-
-def _take(columns: dict[str, Values], choices: tuple[tuple[str, ...], ...]) -> Columns | None:
-    """Remove and return the first complete choice of names (case does not matter), or None."""
-    for names in choices:
-        spelled = {name.lower(): name for name in columns}
-        if all(name in spelled for name in names):
-            return {name: columns.pop(spelled[name]) for name in names}
-    return None
+    remarks: tuple[str, ...] = ()
 
 
 def from_columns(columns: Columns, faces: Int | None = None) -> Contents:
@@ -60,32 +54,54 @@ def from_columns(columns: Columns, faces: Int | None = None) -> Contents:
     Raises
     ------
     InputError
-        When x, y or z is missing.
+        When x, y or z is missing; see `gnrecon.io.column_names` for the names that they may have.
     """
     rest = dict(columns)
-    position = _take(rest, (("x", "y", "z"),))
-    if position is None:
-        found = ", ".join(columns) if columns else "none"
-        raise InputError(f"expected columns named x, y and z, but found {found}.")
-    normal = _take(rest, (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz")))
-    color = _take(
-        rest,
-        (
-            ("red", "green", "blue", "alpha"),
-            ("red", "green", "blue"),
-            ("r", "g", "b", "a"),
-            ("r", "g", "b"),
-            ("diffuse_red", "diffuse_green", "diffuse_blue"),
-        ),
+    position = [rest.pop(name) for name in require_position(rest)]
+    normal = [rest.pop(name) for name in columns_of_role(rest, NORMAL) or []]
+    names = columns_of_role(rest, (*COLOR, "alpha")) or columns_of_role(rest, COLOR) or []
+    if names:
+        rest["colors"] = np.column_stack([rest.pop(name) for name in names])
+    normals, unread = decoded_normals(np.column_stack(normal)) if normal else (None, ())
+    points = np.column_stack([values.astype(np.float64) for values in position])
+    return Contents(points, normals, no_faces() if faces is None else faces, rest, unread)
+
+
+def decoded_normals(
+    stored: Values, *, least_share: float = 0.9, tolerance: float = 0.05
+) -> tuple[Float | None, tuple[str, ...]]:
+    """Return normals, of shape (N, 3), as float64, and what could not be read of them.
+
+    Integers of 8 or 16 bits hold shares of the largest one: signed, or with the middle of the range for zero. So do
+    whole numbers in text. The encoding is that in which at least a share of the non-zero rows has unit
+    length; normals that have it in none are kept where they are signed, because their directions are right.
+
+    Parameters
+    ----------
+    stored : array of shape (N, 3)
+    least_share : of the rows, which must have unit length
+    tolerance : of the length; bytes round to one hundredth
+    """
+    values = stored.astype(np.float64)
+    whole = stored.dtype.kind in "iu" or bool(np.isfinite(values).all() and (values == np.rint(values)).all())
+    rows = values[(values != 0).any(axis=1)] if whole else values[:0]
+    if not len(rows):
+        return values, ()
+    signed = bool((rows < 0).any()) or stored.dtype.kind == "i"
+    tops = (
+        [255 >> signed, 65535 >> signed] if stored.dtype.kind == "f" else [(256**stored.dtype.itemsize - 1) >> signed]
     )
-    if color is not None:
-        rest["colors"] = np.column_stack(list(color.values()))
-    return Contents(
-        np.column_stack([values.astype(np.float64) for values in position.values()]),
-        None if normal is None else np.column_stack([values.astype(np.float64) for values in normal.values()]),
-        no_faces() if faces is None else faces,
-        rest,
-    )
+    scales = [(1.0, 0.0)]
+    for top in tops:
+        # Zero is the middle of the range, or the whole number above it.
+        scales += [(top, 0.0)] if signed else [(top / 2, 1.0), ((top - 1) / 2, (top + 1) / (top - 1))]
+    for scale, middle in scales:
+        lengths = np.linalg.norm(rows / scale - middle, axis=1)
+        if (np.abs(lengths - 1) < tolerance).mean() >= least_share:
+            return (values / scale - middle if scale > 1 else values), ()
+    if signed:
+        return values, ()
+    return None, (f"normals, which are {stored.dtype} and not of unit length in any usual encoding",)
 
 
 def concatenated(pieces: Sequence[Contents]) -> Contents:
@@ -111,6 +127,7 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
         {name: np.concatenate(values) for name, values in shared.items()},
         tuple(dict.fromkeys([*(words for piece in pieces for words in piece.unread), *lost])),
         _origins(pieces),
+        tuple(dict.fromkeys(sentence for piece in pieces for sentence in piece.remarks)),
     )
 
 
@@ -127,6 +144,11 @@ def _origins(pieces: Sequence[Contents]) -> Float | None:
     return np.concatenate(
         [np.full((len(piece.points), 3), np.nan) if piece.origins is None else piece.origins for piece in pieces]
     )
+
+
+def faces_cover(contents: Contents, *, least_share: float = 0.5) -> bool:
+    """Whether there are faces, and at least a share of the points is a corner of one and gets a normal from it."""
+    return len(contents.faces) > 0 and len(np.unique(contents.faces)) >= least_share * len(contents.points)
 
 
 def fan_triangles(counts: Int, corners: Int) -> Int:

@@ -22,6 +22,7 @@ from gnrecon.io.contents import Contents
 from gnrecon.io.formats.e57 import read_e57
 from gnrecon.io.formats.gltf import glb_supports, read_glb, read_gltf, write_glb
 from gnrecon.io.formats.las import read_las
+from gnrecon.io.formats.npy import read_npy
 from gnrecon.io.formats.obj import read_obj, write_obj
 from gnrecon.io.formats.off import read_off, write_off
 from gnrecon.io.formats.pcd import read_pcd
@@ -29,10 +30,10 @@ from gnrecon.io.formats.ply import read_ply, write_ply
 from gnrecon.io.formats.ptx import read_ptx
 from gnrecon.io.formats.stanford_conf import read_conf
 from gnrecon.io.formats.stl import read_stl, write_stl
+from gnrecon.io.formats.table import TABLE_SUFFIXES, read_table, write_table
 from gnrecon.io.formats.threemf import read_3mf, write_3mf
 from gnrecon.io.formats.vtk import read_vtk
 from gnrecon.io.formats.vtp import read_vtp
-from gnrecon.io.formats.xyz import read_xyz, write_xyz
 from gnrecon.io.interop import as_shape
 from gnrecon.runtime.errors import InputError, OutputError
 from gnrecon.runtime.plugins import Plugin, PluginKind, find, installed
@@ -40,10 +41,9 @@ from gnrecon.runtime.plugins import Plugin, PluginKind, find, installed
 READERS: dict[str, Callable[[Path], Contents]] = {
     ".ply": read_ply,
     ".pcd": read_pcd,
-    ".xyz": read_xyz,
-    ".pts": read_xyz,
-    ".txt": read_xyz,
-    ".csv": read_xyz,
+    **dict.fromkeys(TABLE_SUFFIXES, read_table),
+    ".npy": read_npy,
+    ".npz": read_npy,
     ".obj": read_obj,
     ".off": read_off,
     ".stl": read_stl,
@@ -70,9 +70,9 @@ WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
 
 CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".ply": write_ply,
-    ".xyz": write_xyz,
-    ".txt": write_xyz,
-    ".csv": write_xyz,
+    ".xyz": write_table,
+    ".txt": write_table,
+    ".csv": write_table,
 }
 """Writers of points without faces."""
 
@@ -119,6 +119,7 @@ SIGNATURES: dict[bytes, str] = {
     b"LASF": ".las",
     b"ASTM-E57": ".e57",
     b"# vtk DataFile": ".vtk",
+    b"\x93NUMPY": ".npy",
 }
 """First bytes of files, and the extension or kind that they belong to."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.io.contents import Contents
+from gnrecon.io.contents import Contents, faces_cover
 from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.parse import read_text, sibling_path
@@ -40,6 +40,7 @@ class Reading:
     side : of the cubes in each of which the first point was kept, in file units; None where all points were kept
     unread : descriptions of what else the files hold
     same : pairs of files that hold the same scan, possibly moved
+    notes : sentences on how the files were read, where they can be read in several ways
     """
 
     files: tuple[str, ...]
@@ -50,6 +51,7 @@ class Reading:
     side: float | None = None
     unread: tuple[str, ...] = ()
     same: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields by name, for reports."""
@@ -57,7 +59,7 @@ class Reading:
 
     def remarks(self) -> list[str]:
         """Return a sentence for everything that was dropped or looks wrong."""
-        sentences = [f"Not read: {', '.join(self.unread)}."] if self.unread else []
+        sentences = [*self.notes, *([f"Not read: {', '.join(self.unread)}."] if self.unread else [])]
         for first, second in self.same:
             sentences.append(
                 f"{second} seems to be the same scan as {first}; it adds nothing or, if moved, a second layer."
@@ -78,6 +80,7 @@ def read_scans(
     most: int | None = None,
     region: Region | None = None,
     *,
+    columns: Sequence[str] = (),
     parameters: IOParameters = IOParameters(),
 ) -> tuple[PointCloud, Reading]:
     """Read the points of all files into one cloud, in the files' own units, and report what was read.
@@ -92,6 +95,7 @@ def read_scans(
     format : extension that says how all of them are read; by default each file's own
     most : points to keep, at least 1; by default ``parameters.most_points``
     region : where points are kept, in the common frame; by default everywhere
+    columns : names of the columns of tables, with ``-`` for those to skip; by default, they are found out
     parameters : when files are read by chunks, and how large these are
 
     Raises
@@ -102,14 +106,15 @@ def read_scans(
     thinning = VoxelThinning(parameters.most_points if most is None else most, region)
     moments = [Moments() for _ in paths]
     extensions = [
-        _read_into(thinning, sums, Path(path), format, parameters) for path, sums in zip(paths, moments, strict=True)
+        _read_into(thinning, sums, Path(path), format, columns, parameters)
+        for path, sums in zip(paths, moments, strict=True)
     ]
     found = drop_unused(thinning.result(), extensions)
     cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
     require_points_in_region(cloud, thinning.seen)
     files = tuple(str(path) for path in paths)
     counts = (thinning.seen, len(cloud), thinning.cropped, thinning.non_finite)
-    return cloud, Reading(files, *counts, thinning.side, found.unread, same_scans(files, moments))
+    return cloud, Reading(files, *counts, thinning.side, found.unread, same_scans(files, moments), found.remarks)
 
 
 def cropped(cloud: PointCloud, region: Region) -> tuple[PointCloud, Reading]:
@@ -138,13 +143,18 @@ def require_points_in_region(cloud: PointCloud, before: int) -> None:
 
 
 def _read_into(
-    thinning: VoxelThinning, moments: Moments, path: Path, format: str | None, parameters: IOParameters
+    thinning: VoxelThinning,
+    moments: Moments,
+    path: Path,
+    format: str | None,
+    columns: Sequence[str],
+    parameters: IOParameters,
 ) -> str:
     """Add the points of a file, and return the extension by which it was read."""
     extension, before = reader_extension(path, format), thinning.seen
     with input_errors_for(path), uncompressed_file(path, extension) as file:
         check_file(file, extension)
-        for chunk in read_chunks(file, extension, parameters=parameters):
+        for chunk in read_chunks(file, extension, columns, parameters=parameters):
             moments.add(chunk.points)
             thinning.add(_with_normals(chunk))
         if thinning.seen == before:
@@ -155,7 +165,7 @@ def _read_into(
 
 def _with_normals(contents: Contents) -> Contents:
     """Contents without faces; the vertices of a mesh get the normals of its faces where they have none."""
-    if contents.normals is None and len(contents.faces):
+    if contents.normals is None and faces_cover(contents):
         contents = replace(contents, normals=Mesh(contents.points, contents.faces).vertex_normals())
     return replace(contents, faces=contents.faces[:0])
 

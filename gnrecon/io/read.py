@@ -19,7 +19,7 @@ from pathlib import Path
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io.contents import Contents
+from gnrecon.io.contents import Contents, faces_cover
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import is_standard_input
@@ -47,7 +47,7 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     """
     contents = read_contents(Path(path), format)
     normals = contents.normals
-    if normals is None and len(contents.faces):
+    if normals is None and faces_cover(contents):
         normals = _mesh(contents, Path(path)).vertex_normals()
     return PointCloud(contents.points, normals, contents.attributes, contents.origins)
 
@@ -173,12 +173,12 @@ def check_file(path: Path, extension: str) -> None:
         if extension == ".gnr":
             raise InputError("this is a fitted field, not a scan or a mesh: gnrecon mesh MODEL -o MESH meshes it.")
         supported = ", ".join(suffix[1:] for suffix in readable())
-        raise InputError(f"the extension {extension!r} is not supported; expected one of {supported}.")
+        raise InputError(f"the extension {extension!r} is not supported; expected one of {supported} (see --format).")
     if extension not in READERS:
         return  # the signatures of plugin formats are unknown
     kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
     # LAS and LAZ have the same signature and reader; 3MF files are ZIP archives.
-    if kind == extension or {kind, extension} in ({".las", ".laz"}, {"ZIP archive", ".3mf"}):
+    if kind == extension or {kind, extension} in ({".las", ".laz"}, {"ZIP archive", ".3mf"}, {"ZIP archive", ".npz"}):
         return
     if kind in READERS:
         raise InputError(f"the file holds {kind[1:].upper()} data; rename it or give its format as {kind[1:]!r}.")

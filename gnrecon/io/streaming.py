@@ -8,8 +8,9 @@ or when the side was doubled. The kept points are measured ones, never averages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,12 @@ from gnrecon.geometry.point_cloud import Region
 from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.format_registry import reader_of
 from gnrecon.io.formats.las import drop_unused_attributes, las_chunks
+from gnrecon.io.formats.npy import read_npy
 from gnrecon.io.formats.ply import ply_chunks
 from gnrecon.io.formats.ptx import ptx_chunks
-from gnrecon.io.formats.xyz import xyz_chunks
+from gnrecon.io.formats.table import TABLE_SUFFIXES, read_table, table_chunks
 from gnrecon.io.io_parameters import IOParameters
+from gnrecon.runtime.errors import UsageError
 
 
 class VoxelThinning:
@@ -114,17 +117,27 @@ def _selected(contents: Contents, rows: Int) -> Contents:
     )
 
 
-def read_chunks(path: Path, extension: str, *, parameters: IOParameters = IOParameters()) -> Iterator[Contents]:
+def read_chunks(
+    path: Path, extension: str, columns: Sequence[str] = (), *, parameters: IOParameters = IOParameters()
+) -> Iterator[Contents]:
     """Yield the contents of a file by chunks; small files, and formats that must be read as a whole, in one.
 
     Raises
     ------
     InputError
         As the format's reader does; not before the first chunk is requested.
+    UsageError
+        When columns are named of a file that is no table.
     """
     read_by_chunks = chunk_reader(extension)
+    if columns:
+        if extension not in (*TABLE_SUFFIXES, ".npy", ".npz"):
+            raise UsageError(f"--columns names the columns of tables, but {path.name} is not one.")
+        read_by_chunks = None if read_by_chunks is None else partial(table_chunks, columns=columns)
     if read_by_chunks is not None and path.stat().st_size >= parameters.chunked_file_bytes:
         yield from read_by_chunks(path, parameters.chunk_points)
+    elif columns:
+        yield (read_table if extension in TABLE_SUFFIXES else read_npy)(path, columns)
     elif read := reader_of(extension):
         yield read(path)
 
@@ -141,9 +154,7 @@ def chunk_reader(extension: str) -> Callable[[Path, int], Iterator[Contents]] | 
             return ptx_chunks
         case ".ply":
             return ply_chunks
-        case ".xyz" | ".pts" | ".txt" | ".csv":
-            return xyz_chunks
-    return None
+    return table_chunks if extension in TABLE_SUFFIXES else None
 
 
 def drop_unused(contents: Contents, extensions: Iterable[str]) -> Contents:

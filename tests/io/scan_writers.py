@@ -19,8 +19,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import write_cloud
+from gnrecon.io.formats.table import write_table
 
 Float = npt.NDArray[np.float64]
 
@@ -270,6 +272,23 @@ def _zipped(write: Callable[[PointCloud, Path], None]) -> Callable[[PointCloud, 
     return packed
 
 
+def _table(cloud: PointCloud, path: Path) -> None:
+    write_table(Mesh(cloud.points, np.empty((0, 3), int), cloud.normals, cloud.attributes), path)
+
+
+def _npy(cloud: PointCloud, path: Path) -> None:
+    assert cloud.normals is not None
+    names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "intensity"]
+    blocks = [cloud.points, cloud.normals, cloud.attributes["colors"], cloud.attributes["intensity"][:, None]]
+    rows = [tuple(row) for row in np.hstack(blocks)]
+    kinds = ["f8"] * 6 + ["u1"] * 3 + [cloud.attributes["intensity"].dtype.str]
+    np.save(path, np.array(rows, list(zip(names, kinds, strict=True))))
+
+
+def _npz(cloud: PointCloud, path: Path) -> None:
+    np.savez(path, points=cloud.points, normals=cloud.normals, **cloud.attributes)
+
+
 FORMS = {
     "ply": Form(".ply", _ours),
     "ply-text": Form(".ply", _ascii_ply),
@@ -280,6 +299,9 @@ FORMS = {
     "pts": Form(
         ".pts", lambda cloud, path: path.write_text(f"{len(cloud)}\n" + _lines(cloud.points)) and None, frozenset()
     ),
+    **{suffix: Form(f".{suffix}", _table) for suffix in ("asc", "dat", "xyzn", "xyzrgb")},
+    "npy": Form(".npy", _npy),
+    "npz": Form(".npz", _npz),
     "obj": Form(".obj", _obj, frozenset({"colors"})),
     "off": Form(".off", _off, frozenset({"normals"})),
     "las": Form(".las", _las),

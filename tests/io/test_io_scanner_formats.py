@@ -165,7 +165,7 @@ def test_vtp_polygons(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "sentence"),
     [
-        ("a.vtk", "# vtk DataFile Version 3.0\nt\nASCII\nDATASET UNSTRUCTURED_GRID\n", "POLYDATA was expected"),
+        ("a.vtk", "# vtk DataFile Version 3.0\nt\nASCII\nDATASET IMAGE\n", "but POLYDATA, UNSTRUCTURED_GRID"),
         ("a.vtk", VTK.format("3.0").replace("POINTS 4", "POINTS 5"), "ends after 12 of 15 numbers"),
         ("a.vtk", VTK.format("3.0").replace("POINTS 4", "POINTS 99999999999"), "ends within"),
         ("a.vtk", VTK.format("3.0").replace("float", "quad"), "number type 'quad'"),

@@ -141,6 +141,15 @@ def _require_consistent_header(
         raise InputError("the header's sizes contradict each other or the file's size.")
     held = (size - start) // max(length, 1)
     if kind & 0xC0:  # bits that mark a compressed file
+        with path.open("rb") as file:
+            records = file.read(start)
+        # The record "laszip encoded" (LASzip specification, 22204) begins with the compressor: 1 is the old one.
+        place = records.find(b"laszip encoded")
+        if place >= 0 and records[place + 52 : place + 54] == b"\1\0":
+            raise InputError(
+                "it is compressed point by point, as LASzip did before 2011, which no library reads; "
+                "convert it once with LAStools: laszip -i old.laz -o new.las."
+            )
         _require_chunk_table(path, start, size)
     elif count > held:
         raise InputError(f"the header declares {count} points, but the file ends after {held}.")

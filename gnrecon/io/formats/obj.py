@@ -6,6 +6,7 @@ differs between faces, which opens closed surfaces; here a vertex gets the mean 
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -27,24 +28,35 @@ def read_obj(path: Path) -> Contents:
         When there is no vertex, a word is not a number, or an index is out of range.
     """
     # A backslash at the end of a line continues it.
-    lines = [line.strip() for line in read_text(path).replace("\\\n", " ").splitlines()]
-    vertices = parse_rows([line[2:] for line in lines if line.startswith(("v ", "v\t"))], "the 'v' lines")
+    text = re.sub(r"\\\r?\n", " ", read_text(path))
+    lines = [line.partition("#")[0].strip() for line in text.splitlines()]
+    points, colors, lost = _vertices([line[2:] for line in lines if line.startswith(("v ", "v\t"))])
     normals = parse_rows([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "the 'vn' lines")
-    if not len(vertices):
+    if not len(points):
         raise InputError("the file holds no vertex line ('v x y z').")
-    colors = {"colors": vertices[:, 3:6]} if vertices.shape[1] >= 6 else {}
-    points = np.ascontiguousarray(vertices[:, :3])
     counts, corners = _corners(lines)
     if not len(counts):
         # Without faces nothing links normals to vertices; as many normals as vertices belong to them in order.
         given = normals[:, :3] if len(normals) == len(points) else None
-        return Contents(points, given, no_faces(), colors, _unread(lines))
+        return Contents(points, given, no_faces(), colors, _unread(lines) + lost)
     corner_vertices = _indices([word.partition("/")[0] for word in corners], lines, counts, "v")
     if corner_vertices.max() >= len(points):
         raise InputError(f"a face names vertex {corner_vertices.max() + 1}, but there are {len(points)}.")
     given = _normals(corners, corner_vertices, normals, lines, counts, len(points))
-    unread = _unread(lines) + polygon_remarks(counts)
+    unread = _unread(lines) + lost + polygon_remarks(counts)
     return Contents(points, given, fan_triangles(counts, corner_vertices), colors, unread)
+
+
+def _vertices(lines: list[str]) -> tuple[Float, dict[str, Float], tuple[str, ...]]:
+    """Return positions, colours where every vertex has one (after x y z or x y z w), and what is not read."""
+    widths = {len(line.split()) for line in lines}
+    if len(widths) > 1 and min(widths) >= 3:
+        # Only some vertices have a weight or a colour; a made-up one for the others would look like a measured one.
+        lost = () if max(widths) < 6 else ("colours, which only some of the vertices have",)
+        return parse_rows([" ".join(line.split()[:3]) for line in lines], "the 'v' lines"), {}, lost
+    vertices = parse_rows(lines, "the 'v' lines")
+    colors = {"colors": vertices[:, 3:6]} if vertices.shape[1] in (6, 7) else {}
+    return np.ascontiguousarray(vertices[:, :3]), colors, ()
 
 
 def _unread(lines: list[str]) -> tuple[str, ...]:

@@ -3,17 +3,19 @@
 That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). But on failure it prints a
 warning and returns an empty cloud, and it pads a short file with zeros. The amount of data is therefore compared with
 the header before reading, and the number of points afterwards. A contradictory header would abort the process, so it is
-refused here.
+refused here. Padding (fields named ``_``, also of no bytes), names in upper case and the old COLUMNS, which PCL and
+drivers of scanners write, are put into a header that the reader takes, over the same data.
 """
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Values
-from gnrecon.io.contents import Contents, no_faces
+from gnrecon.io.contents import Contents, decoded_normals, no_faces
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
@@ -31,21 +33,31 @@ def read_pcd(path: Path) -> Contents:
     import open3d
 
     header, body = _split(path.read_bytes())
+    header = _plain(header)
     declared = int(header["POINTS"][0])
     _require_consistent(header)
     _require_complete(header, body, declared)
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.t.io.read_point_cloud(path, format="pcd")
+    with (
+        open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error),
+        tempfile.NamedTemporaryFile(suffix=".pcd") as copy,
+    ):
+        lines = [" ".join([key, *words]) for key, words in header.items()]
+        copy.write("\n".join([*lines, ""]).encode("utf-8") + body)
+        copy.flush()
+        cloud = open3d.t.io.read_point_cloud(Path(copy.name), format="pcd")
     arrays: dict[str, Values] = {name: cloud.point[name].numpy() for name in cloud.point}
     points = arrays.pop("positions", np.empty((0, 3)))
     if len(points) != declared:
         raise InputError(f"the header declares {declared} points, but {len(points)} could be read.")
-    normals = arrays.pop("normals", None)
     columns = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in arrays.items()}
+    columns = {name: values for name, values in columns.items() if not name.startswith("_")}
+    if {"nx", "ny", "nz"} <= columns.keys():
+        arrays["normals"] = np.column_stack([columns.pop(name) for name in ("nx", "ny", "nz")])
     # Damaged bytes may be numbers that warn when they are converted; ingest drops them.
     with np.errstate(invalid="ignore"):
-        directions = None if normals is None else normals.astype(np.float64)
-        return Contents(points.astype(np.float64), directions, no_faces(), columns)
+        normals, unread = decoded_normals(arrays["normals"]) if "normals" in arrays else (None, ())
+        columns.pop("normals", None)
+        return Contents(points.astype(np.float64), normals, no_faces(), columns, unread)
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:
@@ -56,21 +68,49 @@ def _split(data: bytes) -> tuple[Header, bytes]:
         end = data.find(b"\n", start) + 1 or len(data)
         words = data[start:end].decode("ascii", errors="replace").split()
         if words and not words[0].startswith("#"):
+            words[0] = words[0].upper().replace("COLUMNS", "FIELDS")
             if words[0] in header:
                 raise InputError(f"the PCD header has two lines {words[0][:20]}.")
             header[words[0]] = words[1:]
         start = end
+    if "POINTS" not in header and all(header.get(key, ["?"])[0].isdecimal() for key in ("WIDTH", "HEIGHT")):
+        header["POINTS"] = [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
     required = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
     missing = [key for key in required if not header.get(key)]
     if missing:
         raise InputError(f"the PCD header lacks {' and '.join(missing)}.")
-    if not {"x", "y", "z"} <= set(header["FIELDS"]):
+    if not {"x", "y", "z"} <= {name.lower() for name in header["FIELDS"]}:
         raise InputError(f"expected fields named x, y and z, but the header lists {' '.join(header['FIELDS'])}.")
     for key in ("SIZE", "COUNT", "POINTS", "WIDTH", "HEIGHT"):
         for word in header.get(key, []):
             if not word.isdecimal():
                 raise InputError(f"the header's {key} holds {word!r}, but a count was expected.")
     return header, data[start:]
+
+
+def _plain(header: Header) -> Header:
+    """Return the header with the names that the reader knows, each field once, and none that holds nothing."""
+    normal = {f"{prefix}{axis}": f"normal_{axis}" for axis in "xyz" for prefix in ("normal_", "n", "normal")}
+    known = {**{name: name for name in ("x", "y", "z", "rgb", "rgba", "intensity")}, **normal}
+    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
+    columns = (header["FIELDS"], header["SIZE"], header["TYPE"], counts)
+    if len({len(words) for words in columns}) > 1:
+        return header
+    fields = []
+    for place, (name, size, kind, count) in enumerate(zip(*columns, strict=True)):
+        title = known.get(name.lower(), name)
+        if title.startswith("normal_") and kind.upper() != "F":
+            title = f"n{title[-1]}"  # the reader takes integers for directions as they are
+        padding = f"_{place}" if name == "_" else title
+        if count != "0":
+            fields.append((padding, size, kind.upper(), count))
+    if not fields:
+        return header
+    names = ("FIELDS", "SIZE", "TYPE", "COUNT")
+    plain = dict(zip(names, map(list, zip(*fields, strict=True)), strict=True))
+    first = {"VERSION": header.get("VERSION", ["0.7"]), **plain}
+    last = {key: words for key, words in header.items() if key not in first and key != "DATA"}
+    return {**first, **last, "DATA": [word.lower() for word in header["DATA"][:1]]}
 
 
 def _require_consistent(header: Header) -> None:

@@ -19,6 +19,7 @@ from gnrecon.geometry.arrays import Int, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, fan_triangles, from_columns, polygon_remarks
+from gnrecon.io.formats.vtk import triangulate_cells
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
@@ -48,19 +49,38 @@ def read_ply(path: Path) -> Contents:
     offset = 0
     for element in elements:
         rows[element.name], offset = _read_rows(buffer, offset, element, order)
-        if "vertex" in rows and ("face" in rows or not any(later.name == "face" for later in elements)):
+        if {one.name for one in elements} & {"vertex", "face", "tristrips"} <= rows.keys():
             break  # what follows (range grids, edges, materials) is not used
     if "vertex" not in rows:
         raise InputError("the PLY header declares no vertex element.")
-    polygons = rows["face"].lists if "face" in rows else {}
-    corners = polygons.get("vertex_indices", polygons.get("vertex_index"))
-    contents = from_columns(rows["vertex"].scalars, None if corners is None else fan_triangles(*corners))
-    return replace(contents, unread=_unread(elements) + (() if corners is None else polygon_remarks(corners[0])))
+    corners, strips = (_corners(rows[name]) if name in rows else None for name in ("face", "tristrips"))
+    faces = [] if corners is None else [fan_triangles(*corners)]
+    faces += [] if strips is None else [_strip_triangles(strips[1])]
+    contents = from_columns(rows["vertex"].scalars, np.concatenate(faces) if faces else None)
+    unread = _unread(elements) + (() if corners is None else polygon_remarks(corners[0]))
+    return replace(contents, unread=contents.unread + unread)
+
+
+def _corners(rows: _Rows) -> tuple[Int, Int] | None:
+    return rows.lists.get("vertex_indices", rows.lists.get("vertex_index"))
+
+
+def _strip_triangles(corners: Int) -> Int:
+    """The triangles of strips that -1 separates, as Stanford's scans have them; the orientation alternates."""
+    ends = np.flatnonzero(np.append(corners, -1) < 0)
+    counts = np.diff(ends, prepend=-1) - 1
+    triangles = triangulate_cells(counts, corners[corners >= 0], strips=True)
+    # Strips repeat a vertex to turn; such triangles have no area.
+    a, b, c = triangles.T
+    kept: Int = triangles[(a != b) & (b != c) & (c != a)]
+    return kept
 
 
 def _unread(elements: list[Element]) -> tuple[str, ...]:
     """Describe everything that the header declares and this reader drops."""
-    found = [f"the element {one.name}" for one in elements if one.name not in ("vertex", "face") and one.count]
+    found = [
+        f"the element {one.name}" for one in elements if one.name not in ("vertex", "face", "tristrips") and one.count
+    ]
     for element in elements:
         names = {prop.name for prop in element.properties if element.name == "face" or prop.count_type}
         if element.count and element.name in ("vertex", "face"):
@@ -201,6 +221,7 @@ PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
+    **{"bool": "u1"},
 }
 """Names of number types in PLY and in numpy."""
 
@@ -236,7 +257,10 @@ def parse_header(data: bytes) -> tuple[str, list[Element], int]:
     end = data.find(b"end_header")
     if end < 0:
         raise InputError("the PLY header does not end with 'end_header'.")
-    start = data.find(b"\n", end) + 1 or len(data)
+    # Lines end with LF, CR LF, or CR alone.
+    close = re.compile(rb"\r" if data[3:4] == b"\r" and data[4:5] != b"\n" else rb"\n")
+    found = close.search(data, end)
+    start = found.end() if found else len(data)
     orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
     order: str | None = None
     elements: list[Element] = []
@@ -247,7 +271,10 @@ def parse_header(data: bytes) -> tuple[str, list[Element], int]:
             case ["format", encoding, _] if encoding in orders:
                 order = orders[encoding]
             case ["element", name, count] if count.isdecimal():
-                elements.append(Element(name, int(count)))
+                # Some programs name the element of a cloud otherwise.
+                elements.append(
+                    Element("vertex" if name.lower() in ("point", "points", "vertices") else name, int(count))
+                )
             case ["property", "list", count_type, kind, name] if elements and {count_type, kind} <= PLY_TYPES.keys():
                 elements[-1].properties.append(Property(name, PLY_TYPES[kind], PLY_TYPES[count_type]))
             case ["property", kind, name] if elements and kind in PLY_TYPES:
@@ -345,5 +372,5 @@ def _is_cloud(elements: list[Element]) -> bool:
     first = elements[0] if elements else Element("", 0)
     names = [prop.name for prop in first.properties]
     plain = all(prop.count_type is None for prop in first.properties) and len(set(names)) == len(names)
-    faces = any(element.name == "face" and element.count for element in elements)
+    faces = any(element.name in ("face", "tristrips") and element.count for element in elements)
     return first.name == "vertex" and plain and not faces

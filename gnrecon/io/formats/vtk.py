@@ -1,4 +1,4 @@
-"""VTK's legacy format (``# vtk DataFile Version``), data sets of the kind POLYDATA, as text or big-endian binary.
+"""VTK's legacy format (``# vtk DataFile Version``), as text or big-endian binary: polydata, grids and single points.
 
 A file is a sequence of sections: a line that names a section and its size, then its numbers, as in VTK's manual "VTK
 File Formats", up to version 5.1 with its offsets and connectivity. It is parsed here because VTK itself takes 140 MB
@@ -15,7 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, fan_triangles, no_faces
+from gnrecon.io.contents import Contents, decoded_normals, fan_triangles, no_faces
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
@@ -37,6 +37,9 @@ class _PolyData:
     normals: str | None = None
     of_points: bool = False
     count: int = 0
+    kind: str = "POLYDATA"
+    numbers: dict[str, Float] = field(default_factory=dict)
+    cells: tuple[Int, Int] | None = None
     unread: list[str] = field(default_factory=list)
 
 
@@ -52,6 +55,8 @@ def read_vtk(path: Path) -> Contents:
     data = _PolyData()
     while words := source.words():
         _section(source, words, data)
+    if data.kind in ("STRUCTURED_POINTS", "RECTILINEAR_GRID"):
+        data.points = _lattice(data)
     if data.points is None:
         raise InputError("the file declares no points.")
     faces = np.concatenate(data.faces) if data.faces else no_faces()
@@ -108,15 +113,23 @@ def _section(source: _Source, words: list[str], data: _PolyData) -> None:
     name = words[0].upper()
     match name:
         case "DATASET":
-            if words[1:2] != ["POLYDATA"]:
-                raise InputError(f"the data set is {' '.join(words[1:2]) or 'unnamed'}, but POLYDATA was expected.")
+            data.kind = "".join(words[1:2]).upper()
+            known = ("POLYDATA", "UNSTRUCTURED_GRID", "STRUCTURED_GRID", "STRUCTURED_POINTS", "RECTILINEAR_GRID")
+            if data.kind not in known:
+                raise InputError(f"the data set is {data.kind or 'unnamed'}, but {', '.join(known)} are read.")
+        case "DIMENSIONS" | "ORIGIN" | "SPACING" | "ASPECT_RATIO":
+            data.numbers[name] = parse_numbers(words[1:4])
+        case "X_COORDINATES" | "Y_COORDINATES" | "Z_COORDINATES":
+            data.numbers[name[0]] = source.numbers(_count(words, 1), _word(words, 2)).astype(np.float64)
+        case "CELL_TYPES":
+            _faces_of_types(source.numbers(_count(words, 1), "int"), data)
         case "POINTS":
             data.points = source.numbers(3 * _count(words, 1), _word(words, 2)).astype(np.float64).reshape(-1, 3)
         case "POINT_DATA" | "CELL_DATA":
             data.of_points, data.count = name == "POINT_DATA", _count(words, 1)
         case "METADATA":
             _skip_metadata(source)
-        case "VERTICES" | "LINES" | "POLYGONS" | "TRIANGLE_STRIPS":
+        case "CELLS" | "VERTICES" | "LINES" | "POLYGONS" | "TRIANGLE_STRIPS":
             _cells(source, words, data)
         case "FIELD":
             _fields(source, words, data)
@@ -163,8 +176,46 @@ def _cells(source: _Source, words: list[str], data: _PolyData) -> None:
     name = words[0].upper()
     if name in ("POLYGONS", "TRIANGLE_STRIPS"):
         data.faces.append(triangulate_cells(counts, corners, strips=name == "TRIANGLE_STRIPS"))
+    elif name == "CELLS":
+        data.cells = counts, corners
     elif name == "LINES":
         data.unread.append("lines")
+
+
+def _faces_of_types(types: Values, data: _PolyData) -> None:
+    """Keep triangles, polygons and quadrangles (types 5, 7, 9), and strips (6), of an unstructured grid."""
+    if data.cells is None or len(data.cells[0]) != len(types):
+        raise InputError("the types of cells do not match the cells.")
+    counts, corners = data.cells
+    for kinds, strips in (((5, 7, 9), False), ((6,), True)):
+        chosen = np.isin(types, kinds)
+        if chosen.any():
+            data.faces.append(triangulate_cells(counts[chosen], corners[np.repeat(chosen, counts)], strips=strips))
+    if (others := ~np.isin(types, (1, 2, 5, 6, 7, 9))).any():
+        data.unread.append(f"{int(others.sum())} cells that are no polygons")
+
+
+def _lattice(data: _PolyData) -> Float:
+    """The points of a regular or rectilinear grid, of shape (N, 3); x varies fastest."""
+    if data.kind == "STRUCTURED_POINTS":
+        sizes = data.numbers.get("DIMENSIONS", np.zeros(0))
+        spacing = data.numbers.get("SPACING", data.numbers.get("ASPECT_RATIO", np.ones(3)))
+        origin = data.numbers.get("ORIGIN", np.zeros(3))
+        if [len(sizes), len(spacing), len(origin)] != [3, 3, 3] or not (np.isfinite(sizes) & (sizes >= 1)).all():
+            raise InputError("the grid does not have three dimensions, an origin and a spacing.")
+        _require_values(float(np.prod(sizes)), data)
+        axes = [start + step * np.arange(int(size)) for start, step, size in zip(origin, spacing, sizes, strict=True)]
+    else:
+        axes = [data.numbers.get(axis, np.zeros(0)) for axis in "XYZ"]
+        _require_values(float(np.prod([float(len(axis)) for axis in axes])), data)
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+
+
+def _require_values(size: float, data: _PolyData) -> None:
+    """Refuse a grid without a value for each point: a few bytes may declare any number of points."""
+    if size != data.count or not data.arrays:
+        raise InputError(f"the grid has {size:.0f} points, but values of {data.count} points; a surface was expected.")
 
 
 def _counted(values: Int, rows: int) -> tuple[Int, Int]:
@@ -258,17 +309,18 @@ def assemble_contents(
         if len(values) != len(points):
             raise InputError(f"{name!r} has {len(values)} values, but there are {len(points)} points.")
     chosen = next((name for name in (normals, "Normals") if name in attributes), None)
-    directions = None if chosen is None or attributes[chosen].shape[1:] != (3,) else attributes.pop(chosen)
+    stored = None if chosen is None or attributes[chosen].shape[1:] != (3,) else attributes.pop(chosen)
+    directions, more = (None, ()) if stored is None else decoded_normals(stored)
     # VTK displays an array of bytes as colours.
     colors = next((name for name, one in attributes.items() if one.dtype == np.uint8 and _is_color(one)), None)
     if colors is not None:
         attributes = {"colors": attributes.pop(colors), **attributes}
     return Contents(
         points.astype(np.float64),
-        None if directions is None else directions.astype(np.float64),
+        directions,
         faces,
         attributes,
-        tuple(unread),
+        (*unread, *more),
     )
 
 

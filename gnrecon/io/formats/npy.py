@@ -1,0 +1,99 @@
+"""NPY and NPZ, numpy's own files: an array of points with their columns, or arrays by name, as users of Python save."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gnrecon.geometry.arrays import Values
+from gnrecon.io.contents import Contents, from_columns, guard_parser
+from gnrecon.io.formats.table_columns import guessed, named_by_user
+from gnrecon.runtime.errors import InputError
+
+
+def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
+    """Read an array of shape (N, C) with C of at least 3, a structured array, or an archive of arrays.
+
+    Of an archive, the only array is read, or the one named points, xyz, positions, coords, vertices, pc, pos or data,
+    with those named normals and colors, and all other numbers of one row for each point. Pickled objects are never
+    loaded. `columns` are the names of the columns where the user gives them.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged, or does not hold such arrays.
+    """
+    with guard_parser("NPY or NPZ"):
+        arrays = _arrays(path)
+    found = {name.lower(): name for name in arrays}
+    usual = ("points", "xyz", "positions", "coords", "vertices", "pc", "pos", "data")
+    chosen = next((found[name] for name in usual if name in found), next(iter(arrays)) if len(arrays) == 1 else None)
+    if chosen is None:
+        if {"x", "y", "z"} <= found.keys():
+            return from_columns({name: values for name, values in arrays.items() if values.ndim == 1})
+        raise InputError(f"the archive holds the arrays {', '.join(arrays)[:200]}, but none named points.")
+    contents = _cloud(arrays[chosen], columns)
+    rest = {name: one for name, one in arrays.items() if name != chosen and _fits(one, len(contents.points))}
+    normals = next((rest.pop(name) for name in list(rest) if name.lower() in ("normals", "normal")), None)
+    if normals is not None and normals.shape[1:] == (3,):
+        named = {
+            **dict(zip("xyz", contents.points.T, strict=True)),
+            **dict(zip(("nx", "ny", "nz"), normals.T, strict=True)),
+        }
+        given = from_columns(named)
+        contents = Contents(given.points, given.normals, attributes=contents.attributes, remarks=contents.remarks)
+    unread = tuple(
+        f"the array {name}" for name in arrays if name != chosen and name not in rest and arrays[name] is not normals
+    )
+    renamed = {"colors" if name.lower() in ("colours", "rgb") else name: values for name, values in rest.items()}
+    return Contents(
+        contents.points,
+        contents.normals,
+        contents.faces,
+        {**contents.attributes, **renamed},
+        unread,
+        remarks=contents.remarks,
+    )
+
+
+def _arrays(path: Path, *, largest_ratio: int = 1032) -> Mapping[str, Values]:
+    """Return the arrays by name; what deflates by more than `largest_ratio`, its limit, is damaged."""
+    with path.open("rb") as file:
+        if file.read(2) == b"PK":
+            with zipfile.ZipFile(file) as archive:
+                if sum(entry.file_size for entry in archive.infolist()) > largest_ratio * path.stat().st_size:
+                    raise InputError("the archive declares more than it can hold.")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as loaded:
+                return {name: loaded[name] for name in loaded.files}
+    # Mapped, so that a damaged header cannot ask for more than the file holds.
+    return {"points": np.array(np.load(path, mmap_mode="r", allow_pickle=False))}
+
+
+def _fits(values: Values, count: int) -> bool:
+    return values.dtype.kind in "biuf" and values.ndim in (1, 2) and len(values) == count
+
+
+def _cloud(values: Values, columns: Sequence[str]) -> Contents:
+    if values.dtype.names:
+        records: Any = values
+        return from_columns({name: records[name].ravel() for name in values.dtype.names})
+    if values.dtype.kind not in "iuf" or values.ndim < 2:
+        raise InputError(
+            f"expected numbers of shape (N, 3) or more columns, but found {values.dtype} of {values.shape}."
+        )
+    table = values.reshape(-1, values.shape[-1])
+    if table.shape[1] > 64 or (values.ndim == 2 and values.shape[0] == 3 < values.shape[1]):
+        raise InputError(f"expected rows of points, but found an array of shape {values.shape}; transpose it.")
+    numbers, remarks = table.astype(np.float64), tuple[str, ...]()
+    if columns:
+        names = named_by_user(columns, table.shape[1])
+    else:
+        names, remarks = guessed(numbers, range(table.shape[1]))
+    named = {name: numbers[:, place] for place, name in enumerate(names) if name not in ("", "index")}
+    found = from_columns(named)
+    return Contents(found.points, found.normals, found.faces, found.attributes, found.unread, None, remarks)

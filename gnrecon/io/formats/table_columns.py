@@ -1,0 +1,114 @@
+"""Which columns of a table hold what: by the user's names, by its header, or by what the numbers look like."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gnrecon.geometry.arrays import Float, Values
+from gnrecon.io.column_names import COLOR, NORMAL, POSITION, require_position
+from gnrecon.runtime.errors import InputError
+
+
+def named_by_user(columns: Sequence[str], width: int) -> list[str]:
+    """Return the names of `width` columns after those that the user gave; ``-`` and missing ones are not read.
+
+    Raises
+    ------
+    InputError
+        When there are more names than columns, or x, y or z is missing.
+    """
+    if len(columns) > width:
+        raise InputError(f"--columns names {len(columns)} columns, but the rows hold {width}.")
+    names = ["" if name.strip() == "-" else name.strip() for name in columns]
+    require_position([name for name in names if name], " Name each column in order, with - for those to skip.")
+    return names + [""] * (width - len(names))
+
+
+def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[str], tuple[str, ...]]:
+    """Return names for the columns of a table without a header, and sentences on what was guessed.
+
+    Parameters
+    ----------
+    rows : array of shape (N, C), the columns that hold numbers
+    places : of these columns among all of the file's, from 0
+    suffix : extension of the file; points of ``.pts`` have their intensity before their colour
+
+    Raises
+    ------
+    InputError
+        When there are fewer than 3 columns.
+    """
+    names: list[str] = ["index"] if _is_index(rows) else []
+    reasons = {"index": "a running number"} if names else {}
+    if rows.shape[1] - len(names) < 3:
+        raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1] - len(names)}.")
+    names += POSITION
+    while (at := len(names)) < rows.shape[1]:
+        group, reason = _group(rows[:, at:], names, suffix)
+        names += group
+        reasons |= {group[0]: reason}
+    singles = [at for at, name in enumerate(names) if not name]
+    names = [name or f"column_{places[at] + 1}" for at, name in enumerate(names)]
+    if len(singles) == 1:
+        names[singles[0]] = "intensity"
+    return names, _sentences(names, reasons, places)
+
+
+def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int]) -> tuple[str, ...]:
+    """One sentence on what was guessed; none where the first three columns are all that there is."""
+    spoken = {"index": "a running number", "x": "x, y, z", "nx": "normals", "red": "colours", "intensity": "intensity"}
+    lengths = {"x": 3, "nx": 3, "red": 3}
+    found = []
+    for at, name in enumerate(names):
+        if name in spoken and (name != "x" or places[at]):
+            first, last = places[at] + 1, places[min(at + lengths.get(name, 1), len(names)) - 1] + 1
+            which = f"column {first} is" if first == last else f"columns {first} to {last} are"
+            reason = reasons.get(name, "") if name in ("nx", "red") else ""
+            found.append(f"{which} taken for {spoken[name]}{f' ({reason})' if reason else ''}")
+    if not found:
+        return ()
+    text = ", ".join(found)
+    return (f"The table has no header: {text}; --columns says otherwise.",)
+
+
+def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
+    """Return the names of the next columns, and why: three of a normal or a colour, or one without a name."""
+    if "nx" not in names and rest.shape[1] >= 3 and _are_normals(rest[:, :3]):
+        return list(NORMAL), "unit length"
+    if "red" in names or rest.shape[1] < 3 or not _are_colors(rest[:, :3]):
+        return [""], ""
+    four = rest.shape[1] >= 4 and _are_colors(rest[:, 1:4])
+    # Four columns that all may be bytes: scanners write the intensity first in PTS, and after the colour elsewhere. One
+    # that never changes is no colour channel.
+    constant = [bool(np.ptp(rest[:, place]) == 0) for place in (0, 3)] if four and len(rest) else [False, False]
+    if four and (constant[0] > constant[1] or (constant[0] == constant[1] and suffix == ".pts")):
+        return [""], ""
+    return list(COLOR), "0 to 255" if rest[:, :3].max(initial=0) > 1 else "0 to 1"
+
+
+def _is_index(rows: Float, *, least_rows: int = 10) -> bool:
+    """Whether the first of at least four columns counts the rows, while others hold fractions."""
+    if rows.shape[1] < 4 or len(rows) < least_rows:
+        return False
+    fractions = bool((rows[:, 1:4] % 1 != 0).any())
+    return fractions and bool((np.diff(rows[:, 0]) == 1).all()) and float(rows[0, 0]).is_integer()
+
+
+def _are_normals(vectors: Float, *, least_share: float = 0.9, tolerance: float = 0.05) -> bool:
+    """Whether at least a share of the finite non-zero rows, of shape (N, 3), have unit length.
+
+    The tolerance of the length is wide because some scanners store normals with two digits.
+    """
+    lengths = np.linalg.norm(vectors, axis=1)
+    lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
+    return len(lengths) > 0 and bool((np.abs(lengths - 1) < tolerance).mean() >= least_share)
+
+
+def _are_colors(values: Values) -> bool:
+    """Whether all numbers, of shape (N, 3), are whole ones from 0 to 255 or 65535, or shares from 0 to 1."""
+    finite = values[np.isfinite(values)]
+    if not len(finite) or finite.min() < 0:
+        return False
+    return bool(finite.max() <= 1) or bool(finite.max() <= 65535 and (finite == np.rint(finite)).all())

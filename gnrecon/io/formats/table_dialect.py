@@ -1,0 +1,275 @@
+"""How a table in text is written: its encoding, separator, decimal mark, quotes, head and columns.
+
+Each pair of separator and decimal mark is tried on the first lines. The right one is that in which most lines hold at
+least three numbers, and in which no cell holds several: in ``1,5 2,5 3,5``, commas cannot separate, because ``5 2`` is
+no number. What precedes the first row is searched for the names of the columns; all else there is metadata.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gnrecon.io.column_names import COLOR, NORMAL, POSITION, columns_of_role, simple_name
+from gnrecon.runtime.errors import InputError
+
+BLANKS = r"\s+"
+MISSING = (
+    *("", "nan", "+nan", "na", "n/a", "#n/a", "null", "none", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan"),
+    *("1.#ind", "-1.#ind", "-", "--", "nil", "<na>", "#value!", "missing"),
+)
+"""Cells without a number, in lower case."""
+
+COMMENT = re.compile(r"^\s*(?:#|//|%|!|;(?!\s*[-+\d])).*$|(?<=[\s\d])(?:#(?!N/A)|//).*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How the rows of a table are read.
+
+    Parameters
+    ----------
+    separator : of columns: one character, or `BLANKS`
+    decimal : the decimal mark
+    thousands : the mark between groups of digits, or None
+    replaced : pairs of text and what replaces it in rows before they are parsed
+    skipped : number of lines before the first row
+    width : number of columns; of rows that differ in length, those that are read
+    names : of the columns, or None without a header
+    numeric : whether each column holds numbers
+    count : number of points that a line before the rows declares, or None
+    ragged : whether rows may be longer than `width`
+    remarks : sentences on how the table is read
+    """
+
+    separator: str
+    decimal: str = "."
+    thousands: str | None = None
+    replaced: tuple[tuple[str, str], ...] = ()
+    skipped: int = 0
+    width: int = 0
+    names: tuple[str, ...] | None = None
+    numeric: tuple[bool, ...] = ()
+    count: int | None = None
+    ragged: bool = False
+    remarks: tuple[str, ...] = ()
+
+    def cells(self, line: str) -> list[str]:
+        """Return the cells of a line, without quotes and blanks around them."""
+        for old, new in self.replaced:
+            line = line.replace(old, new)
+        line = line.strip() if self.separator == BLANKS else line.strip("\r\n\ufeff")
+        if self.separator == BLANKS:
+            return [word.strip("\"'") for word in re.findall(r'"[^"]*"|\S+', line)]
+        try:
+            cells = next(csv.reader([line], delimiter=self.separator, skipinitialspace=True), [])
+        except csv.Error:
+            cells = line.split(self.separator)
+        return [cell.strip().strip("\"'").strip() for cell in cells]
+
+    def is_number(self, cell: str) -> bool:
+        """Whether a cell holds a number in this dialect."""
+        mark = re.escape(self.decimal)
+        if self.thousands and re.fullmatch(rf"[+-]?\d{{1,3}}({re.escape(self.thousands)}\d{{3}})+({mark}\d*)?", cell):
+            return True
+        if re.fullmatch(rf"[+-]?(\d+({mark}\d*)?|{mark}\d+)(e[+-]?\d+)?", cell, re.IGNORECASE | re.ASCII):
+            return True
+        return re.fullmatch("[+-]?(inf(inity)?|nan)", cell.lower()) is not None
+
+    def is_value(self, cell: str) -> bool:
+        """Whether a cell holds a number, or is one of those that stand for none."""
+        return cell.lower() in MISSING or self.is_number(cell)
+
+
+def encoding_of(path: Path) -> str:
+    """Return the encoding of a text, by its byte-order mark, its zero bytes, or what decodes.
+
+    Raises
+    ------
+    InputError
+        When it is no text.
+    """
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    marks = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe\0\0": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+    if found := next((name for mark, name in marks.items() if head.startswith(mark)), None):
+        return found
+    for start, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        # ASCII in UTF-16 has a zero in every other byte, and nowhere else.
+        if (
+            len(head) > 1
+            and not head[start : len(head) // 2 * 2 : 2].strip(b"\0")
+            and head[1 - start :: 2].count(0) == 0
+        ):
+            return name
+    if b"\0" in head:
+        raise InputError("expected text, but the file holds binary data.")
+    try:
+        head[:-4].decode("utf-8")
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
+def find_dialect(lines: list[str]) -> Dialect:
+    """Return the dialect of a table whose first lines these are.
+
+    Raises
+    ------
+    InputError
+        When there are no rows, no columns x, y, z, or ambiguous columns.
+    """
+    texts = [COMMENT.sub("", line.replace("\ufeff", "")) for line in lines]
+    dialect, rows = _best(texts)
+    # The last line read may be cut off; all others count.
+    widths = Counter(len(cells) for _, cells in rows[:-1] or rows)
+    dialect = replace(dialect, width=widths.most_common(1)[0][0])
+    end = next(number for number, cells in rows if len(cells) == dialect.width)
+    title, names = _header(dialect, lines[:end])
+    rows = [(number, cells) for number, cells in rows if number > title]
+    first = rows[0][0]
+    _require_unambiguous(dialect, [cells for _, cells in rows])
+    dialect = replace(dialect, skipped=first, count=_count(lines[:first]))
+    if names is not None:
+        dialect = _fitted(dialect, names)
+    else:
+        _require_no_header(dialect, texts[:first], ragged=len(widths) > 2)
+    columns = list(zip(*[cells[: dialect.width] for _, cells in rows if len(cells) >= dialect.width], strict=True))
+    numeric = tuple(2 * sum(map(dialect.is_number, column)) >= sum(map(bool, column)) > 0 for column in columns)
+    marks = dialect.decimal == "," and any("," in cell for _, cells in rows for cell in cells)
+    return replace(dialect, numeric=numeric, remarks=("Commas are taken for decimal marks.",) if marks else ())
+
+
+def _best(texts: list[str]) -> tuple[Dialect, list[tuple[int, list[str]]]]:
+    """Return the dialect in which most lines are rows, with those rows and their places."""
+    exponents = (("D", "E"), ("d", "e")) if any(re.search(r"\d[Dd][+-]?\d", text) for text in texts) else ()
+    blanks = ((",", " "), (";", " "))
+    candidates = [Dialect(separator, decimal) for separator in "\t;|" for decimal in ".,"]
+    candidates += [Dialect("\t", ",", replaced=((", ", "\t"),)), Dialect(","), Dialect(",", ",")]
+    candidates += [Dialect(BLANKS), Dialect(BLANKS, ","), Dialect(BLANKS, replaced=blanks)]
+    best, most, found = candidates[0], (0, 0), []
+    for candidate in candidates:
+        tried = replace(candidate, replaced=candidate.replaced + exponents)
+        quoted = '"[^"]*' if tried.separator not in "\t;|" else ""
+        if re.search(r"\d\.\d{3},\d" if tried.decimal == "," else quoted + r"\d,\d{3}\.\d", "\n".join(texts)):
+            tried = replace(tried, thousands="." if tried.decimal == "," else ",")
+        rows = [(number, cells) for number, text in enumerate(texts) if _is_row(cells := tried.cells(text), tried)]
+        if (
+            candidate.replaced
+            and tried.separator == "\t"
+            and not all("," in cell for _, cells in rows for cell in cells)
+        ):
+            continue  # commas and blanks may separate decimal commas only
+        score = (len(rows), sum(tried.is_number(cell) for _, cells in rows for cell in cells))
+        # Another separator must explain more lines; another decimal mark, more cells.
+        if score[0] > most[0] or (score > most and tried.separator == best.separator and not candidate.replaced):
+            best, most, found = tried, score, rows
+    if most[0]:
+        return best, found
+    body = [text.strip() for text in texts if text.strip()]
+    words = [re.split(r"[\s,;]+", text) for text in body]
+    header = len(words) == 1 and columns_of_role(words[0], POSITION)
+    if header or all(len(row) == 1 and row[0].isdecimal() for row in words):
+        raise InputError("the file holds no points.")
+    if any(all(map(best.is_value, row)) for row in words):
+        raise InputError(f"expected at least 3 columns (x, y, z), but found {max(map(len, words))}.")
+    raise InputError(f"the first line {body[0][:60]!r} holds neither numbers nor columns named x, y and z.")
+
+
+def _is_row(cells: list[str], dialect: Dialect) -> bool:
+    """Whether at least three cells are numbers, and none holds several."""
+    if sum(map(dialect.is_number, cells)) < 3:
+        return False
+    parts = [re.split(r"[\s,;]+", cell) for cell in cells if not dialect.is_number(cell)]
+    return not any(len(words) > 1 and all(map(Dialect(",").is_number, words)) for words in parts)
+
+
+def _require_unambiguous(dialect: Dialect, rows: list[list[str]]) -> None:
+    """Refuse commas that both separate columns and mark decimals, as in ``10,8158,-30,6569,-9,6008``."""
+    if dialect.separator != "," or dialect.decimal == ",":
+        return
+    whole = [list(column) for column in zip(*rows, strict=False)]
+    digits = [all(map(str.isdecimal, column)) for column in whole]
+    # Digits after a decimal mark begin with zeros in places; numbers of their own do not.
+    padded = [
+        all_digits and any(cell[0] == "0" < cell[1:] for cell in column)
+        for all_digits, column in zip(digits, whole, strict=True)
+    ]
+    if sum(padded) >= 2:
+        raise InputError(
+            "commas seem to separate the columns and to mark decimals as well; save the table with semicolons or tabs."
+        )
+
+
+def _count(head: list[str]) -> int | None:
+    counts = [int(line) for line in map(str.strip, head) if re.fullmatch("[0-9]{1,18}", line)]
+    return counts[-1] if counts else None
+
+
+def _header(dialect: Dialect, head: list[str]) -> tuple[int, list[str] | None]:
+    """Return the place and the names of the last line of the head that names x, y and z; -1 and None without one."""
+    for place, line in reversed(list(enumerate(head))):
+        # A separator at the start stays: pandas leaves the name of its index empty.
+        text = line.replace("\ufeff", "").strip(" \r\n").lstrip("#/%!").strip(" ")
+        text = text.lstrip("; ") if dialect.separator != ";" else text
+        if dialect.separator == BLANKS:
+            text = re.sub(r"\s+(?=\[\w+\]|\(\w+\))", "", text)  # a unit belongs to its name
+        splits = [dialect.cells(text), [word.strip("\"'") for word in re.split(r"[\s,;]+", text)]]
+        for names in sorted(splits, key=lambda words: len(words) != dialect.width):
+            names = [name.rstrip(",;") for name in names]
+            if columns_of_role(names, POSITION) and not any(map(dialect.is_number, names)):
+                return place, names
+    return -1, None
+
+
+def _require_no_header(dialect: Dialect, head: list[str], *, ragged: bool) -> None:
+    """Refuse a head that holds damaged rows or unknown names, and rows of many lengths."""
+    head = [text for text in head if text.strip()]
+    for text in head:
+        cells = dialect.cells(text)
+        if len(cells) == dialect.width and 2 * sum(map(dialect.is_number, cells)) >= len(cells):
+            wrong = next((cell for cell in cells if not dialect.is_value(cell)), cells[0])
+            raise InputError(f"{wrong[:40]!r} in the line {text.strip()[:60]!r} is not a number.")
+    names = dialect.cells(head[-1]) if head else []
+    if len(names) == dialect.width and not any(map(dialect.is_number, names)):
+        found = ", ".join(names)[:200]
+        if any(re.match("lat|lon", simple_name(name)) for name in names):
+            raise InputError(f"the columns {found} hold angles; project latitude and longitude to metres first.")
+        raise InputError(f"expected columns named x, y and z, but found {found}; name them with --columns.")
+    if ragged:
+        raise InputError("rows differ in length, and no header names their columns; name those to read with --columns.")
+
+
+def _fitted(dialect: Dialect, names: list[str]) -> Dialect:
+    """Return the dialect with as many names as columns."""
+    width = dialect.width
+    lists = next((place for place, name in enumerate(names) if "[]" in name), None)
+    if lists is not None:
+        # A list ends the row, as the track of a point of COLMAP does.
+        return replace(dialect, names=tuple(names[:lists]), width=lists, ragged=True)
+    while len(names) > width and not names[-1]:
+        names = names[:-1]
+    if len(names) > width and dialect.separator == BLANKS:
+        names = _joined(names, width)
+    elif len(names) == width - 1 and tuple(name.lower() for name in names[:3]) == POSITION:
+        raise InputError(_unequal(names, width) + " The first column seems to be a row's number; see --columns.")
+    if len(names) != width:
+        raise InputError(_unequal(names, width))
+    return replace(dialect, names=tuple(names))
+
+
+def _unequal(names: list[str], width: int) -> str:
+    return f"the header names {len(names)} columns, but the rows hold {width}."
+
+
+def _joined(names: list[str], width: int) -> list[str]:
+    """Join words of one name that holds blanks, where only one place is left for them."""
+    known = {name for role in (POSITION, NORMAL, COLOR) for name in columns_of_role(names, role) or []}
+    others = [place for place, name in enumerate(names) if name not in known]
+    spare = len(names) - width
+    if not others or others != list(range(others[0], others[-1] + 1)) or len(others) != spare + 1:
+        return names
+    return [*names[: others[0]], " ".join(names[others[0] : others[-1] + 1]), *names[others[-1] + 1 :]]

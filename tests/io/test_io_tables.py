@@ -1,0 +1,79 @@
+"""Tables in text as programs write them, and normals stored as integers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnrecon.io import parse_columns, read_cloud, read_scans
+from gnrecon.io.contents import decoded_normals
+from gnrecon.runtime.errors import InputError, UsageError
+
+POINTS = np.random.default_rng(0).normal(size=(20, 3)).round(4)
+
+
+def lines(separator: str = ",", decimal: str = ".", before: str = "", after: str = "") -> str:
+    cells = [[f"{value:.4f}".replace(".", decimal) for value in row] for row in POINTS]
+    return "".join(before + separator.join(row) + after + "\n" for row in cells)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        lines("\t", ","),
+        lines(" ", ","),
+        lines(";", ","),
+        "x [mm],y [mm],z [mm]\n" + lines(),
+        "Easting,Northing,Height\n" + lines(),
+        "Points:0,Points:1,Points:2\n" + lines(),
+        "Scanner: ACME 3000\nUnit: mm\nX,Y,Z\n" + lines(),
+        "x,y,z,class\n" + lines(after=",ground"),
+        "x,y,z,i\n" + lines(after=","),
+        lines().replace(",", '","').replace("\n", '"\n"').join(['"', ""])[:-1],
+        lines(" ").replace(" ", "D+00 "),
+        "//X Y Z Scalar field\n" + lines(" ", after=" 7"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_dialects(tmp_path: Path, text: str, encoding: str) -> None:
+    (tmp_path / "a.txt").write_bytes(text.encode(encoding))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.txt").points, POINTS)
+
+
+def test_what_is_guessed_is_said_and_columns_decide(tmp_path: Path) -> None:
+    rows = [f"{number},{line}" for number, line in enumerate(lines().splitlines(), 1)]
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    cloud, reading = read_scans([tmp_path / "a.csv"])
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert "column 1 is taken for a running number" in reading.remarks()[0]
+    cloud, reading = read_scans([tmp_path / "a.csv"], columns=parse_columns("-,z,y,x"))
+    np.testing.assert_array_equal(cloud.points, POINTS[:, ::-1])
+    assert reading.remarks() == []
+    with pytest.raises(UsageError, match="x, y and z"):
+        parse_columns("x,y,-")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("lat,lon,h\n" + lines(), "angles"),
+        ("x [m],y [m],z [mm]\n" + lines(), "differ in their units"),
+        ("1,01,2,02,3,03\n4,05,5,06,6,07\n", "mark decimals as well"),
+    ],
+)
+def test_what_cannot_be_read_rightly_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_cloud(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(("kind", "top"), [("u1", 255), ("u2", 65535), ("i1", 127), ("i2", 32767)])
+def test_normals_of_integers_are_decoded(kind: str, top: int) -> None:
+    normals = POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)
+    shares = normals * top if kind[0] == "i" else (normals + 1) / 2 * top
+    found, unread = decoded_normals(np.rint(shares).astype(kind))
+    assert found is not None
+    assert not unread
+    np.testing.assert_allclose(found, normals, atol=1.5 / 127)
