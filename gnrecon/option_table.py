@@ -302,7 +302,7 @@ class OptionTable:
     quality: str = _row(
         "normal",
         Panel.FIT,
-        "Time against accuracy: draft, normal or high set the number of local features.",
+        "Time against accuracy: draft, normal or high set the number of local features; draft fits no network.",
         choices=("draft", "normal", "high"),
     )
     normal_residual: str = _row(

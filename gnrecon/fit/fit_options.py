@@ -33,8 +33,8 @@ class FitOptions:
     Parameters
     ----------
     widths : tuple of int, optional
-        Hidden layers of one network for the whole shape. By default there is a smooth global layer and local fields
-        whose length scale the data determines; see `gnrecon.fit.two_level`. One wide layer starts from random sine
+        Hidden layers of one network for the whole shape. By default there is a global network of a width that the data
+        determines, and local fields; see `gnrecon.fit.two_level`. One wide layer starts from random sine
         features and an exact linear solve; several layers from random frequencies.
     steps : int, optional
         Steps after the start of one network; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or
@@ -42,7 +42,7 @@ class FitOptions:
         Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
         point from 1,000 to 2,000, and of one for four points from there to 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
-        Features of each local field: 300, 600 or 1,000. In high quality, the global field is a network by Gauss-Newton.
+        Features of each local field: 300, 600 or 1,000. In draft quality, the global field is linear.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
         Residual of the given normals; see `gnrecon.residuals.constraints`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``

@@ -1,10 +1,10 @@
-"""The smooth global field: one linear layer of sine features or, in high quality, a sine network by Gauss-Newton.
+"""The smooth global field: a sine network by Gauss-Newton, or one linear layer of sine features.
 
-A linear field is solved first (`linear_field`). In high quality a network of several layers is then fitted
-(`global_network`) with eikonal regularisation. The one that predicts the validation
-points and the sign of free space better is the global field: on organic scans the network. A thin wall that sparse
-points hardly show may be lost on its way, and then the linear field remains. With curvature penalties the global field
-is the linear one, on which they are then minimised.
+A linear field is solved first (`linear_field`). A network of several layers is then fitted with eikonal regularisation
+(`global_network`). It is the global field where it predicts the validation points and the sign of free space better, by
+more than chance: on organic scans nearly always. A thin wall that sparse points hardly show may be lost on its way, and
+noise may hide that it is better; then the linear field remains, as it does in draft quality. With curvature penalties
+the global field is the linear one, on which they are then minimised.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
 """The default fit: a smooth global field, and local fields that correct it near the data.
 
-Both are sums of sine features whose output weights solve linear least-squares problems. In high quality the global
-field is a sine network that Gauss-Newton fits with an eikonal term. The steps, in the order of `fit_two_level`:
+The global field is a sine network that Gauss-Newton fits with an eikonal term, or a linear field. The local fields are
+sums of sine features whose output weights solve linear least-squares problems. The steps, in the order of
+`fit_two_level`:
 
 1. Prepare the data: snap a ball, turn contradicted normals around, extend faces to sharp edges and across holes.
 2. Fit the global field (`global_field`), without validation points; leave out outliers.
 3. Apply the curvature penalties, if any, to the global field (`penalties`).
 4. Choose length scale and noise on the validation points (`denoising`, `model_selection`).
-5. In high quality, take the network's last steps on all points, if they are few. Then fit the local fields
+5. Take the network's last steps on all points, if they are few. Then fit the local fields
    (`local_fields`), or those of a large scan by blocks (`blocks.solve`).
 """
 
