@@ -328,14 +328,14 @@ def test_an_interrupt_before_the_fit_writes_nothing(out: Path, scan: Path, stage
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_polite_end_while_writing_leaves_nothing(out: Path, scan: Path, signal_number: signal.Signals) -> None:
     files = ("-o", out / "mesh.obj", "--report", out / "report.json")
-    with started(scan, *files, *FAST_WORDS, before=pause_at("gnrecon.pipeline._verify")) as process:
+    with started(scan, *files, *FAST_WORDS, before=pause_at("gnrecon.pipeline.verify_file")) as process:
         wait_for(process, "paused")
         process.send_signal(signal_number)
         assert end(process)[0] == ExitCode.INTERRUPTED
     assert names(out) == []
 
 
-@pytest.mark.parametrize("place", ["fit", "_verify"])
+@pytest.mark.parametrize("place", ["fit", "verify_file"])
 def test_a_kill_leaves_nothing_under_the_targets_name(out: Path, scan: Path, place: str) -> None:
     with started(scan, "-o", out / "mesh.obj", *FAST_WORDS, before=pause_at(f"gnrecon.pipeline.{place}")) as process:
         wait_for(process, "paused")

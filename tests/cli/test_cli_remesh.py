@@ -245,7 +245,7 @@ def test_a_mesh_that_fails_leaves_no_model(
         del bordered
         raise RuntimeError(f"cannot read {path.suffix} back")
 
-    monkeypatch.setattr("gnrecon.pipeline._verify", refuse)
+    monkeypatch.setattr("gnrecon.pipeline.verify_file", refuse)
     files = ("-o", tmp_path / "mesh.obj", "--save", tmp_path / "model.gnr")
     command.refuses(ExitCode.UNFORESEEN, "cannot read .obj back", folder / "ring.ply", *files, *FAST_WORDS, "--quiet")
     assert names(tmp_path) == []
