@@ -21,6 +21,7 @@ from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import FitParameters, SingleNetworkParameters
 from gnrecon.fit.shape_priors.ball_fit import BallFit
 from gnrecon.fit.shape_priors.convex_completion import completed_convex
+from gnrecon.fit.shape_priors.sharp_shape import SharpShape
 from gnrecon.fit.single_network import fit_deep, fit_wide
 from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.point_cloud import Samples
@@ -62,7 +63,7 @@ def fit(
     """
     options = options or FitOptions()
     rng = np.random.default_rng(options.seed)
-    convex = None if BallFit.of(samples, parameters.ball) is not None else completed_convex(samples)
+    convex = _completed(samples, parameters) if options.adaptive else None
     given, samples = samples, convex or samples
     if options.adaptive:
         sdf, fitted = fit_two_level(samples, options, rng, advance, folder, scheduler, callback, parameters=parameters)
@@ -79,6 +80,15 @@ def fit(
         )
         fitted = replace(fitted, status=status)
     return replace(sdf, support=_support(given)), fitted
+
+
+def _completed(samples: Samples, parameters: FitParameters) -> Samples | None:
+    """Return few points on a convex surface with more between them; a ball and sharp faces have better priors."""
+    found = completed_convex(samples)
+    ball = found is not None and BallFit.of(samples, parameters.ball) is not None
+    if found is None or ball or SharpShape.of(samples, parameters.shape_priors) is not None:
+        return None
+    return found
 
 
 def _fit_network(
