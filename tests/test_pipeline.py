@@ -293,7 +293,7 @@ def test_failed_allocations_end_in_one_sentence(scan: Cloud, monkeypatch: pytest
 
 
 def test_a_limit_that_a_stage_names_itself_is_left_in_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    def exhausted(*_: object) -> None:
+    def exhausted(*_: object, **__: object) -> None:
         raise MemoryLimitError("The file holds too much.")
 
     monkeypatch.setattr("gnrecon.pipeline.read_scans", exhausted)

@@ -231,7 +231,7 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
     Raises
     ------
     InputError
-        When there is no such file or it holds no field.
+        When there is no such file, or it holds no field, or one with a part that no fit makes.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -244,89 +244,97 @@ def load_sdf(path: str | Path, device: str = "cpu") -> NeuralSDF:
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a mapping)
         if not isinstance(facts, dict) or facts.get("format") != FORMAT:
             raise InputError(f"{path} is not a gnrecon model of the format {FORMAT!r}.")
-        field = Siren(_require_widths(path, facts["widths"]))
-        if tensors["theta"].shape != (field.layout.count,):
+        field = Siren(_widths(path, facts["widths"]))
+        _require_plain_options(path, facts["options"])
+        if tensors["theta"].shape != (field.layout.count,) or not tensors["theta"].is_floating_point():
             raise InputError(f"{path} holds {tuple(tensors['theta'].shape)} parameters for widths {field.widths}.")
         _require_sense(path, tensors)
         frame = Frame(tensors["frame.center"].cpu().numpy(), float(tensors["frame.scale"]))
         lower, upper = tensors["box"].cpu().numpy()
         support = tensors["support"].cpu().numpy() if "support" in tensors else None
         detail = detail_of(path, tensors)
-        return NeuralSDF(field, tensors["theta"], frame, Box(lower, upper), dict(facts["options"]), support, detail)
+        sdf = NeuralSDF(field, tensors["theta"], frame, Box(lower, upper), dict(facts["options"]), support, detail)
+        _require_distances(path, sdf)
+        return sdf
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    # JSON that is nested too deeply, and numbers that are too large for their use, are damage as well.
-    except (SafetensorError, KeyError, ValueError, TypeError, RecursionError, OverflowError) as error:
+    # RecursionError comes from lists in lists, OverflowError from whole numbers without bounds.
+    except (SafetensorError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} is not a gnrecon model ({error}).") from error
-
-
-def _require_widths(path: str | Path, widths: Any, *, most_layers: int = 64) -> tuple[int, ...]:
-    """Return the widths of a network, or raise an error where they are no list of positive whole numbers."""
-    if not isinstance(widths, list) or not 1 <= len(widths) <= most_layers:
-        raise InputError(f"{path} holds no list of 1 to {most_layers} network widths.")
-    if not all(type(width) is int and width >= 1 for width in widths):
-        raise InputError(f"{path} holds network widths that are not positive whole numbers.")
-    return tuple(widths)
 
 
 def _require_sense(
     path: str | Path,
     tensors: Mapping[str, torch.Tensor],
     *,
-    most_unit: float = 100.0,
-    most_number: float = 1e15,
-    scales: tuple[float, float] = (1e-16, 1e25),
-    least_length: float = 1e-9,
-    least_overlap: float = 1e-3,
+    least_scale: float = 1e-16,
+    most_scale: float = 1e16,
+    most_reach: float = 1e3,
 ) -> None:
-    """Raise an error for types, shapes and numbers that no fit makes.
-
-    Parameters
-    ----------
-    path : named in the error
-    tensors : of the file, by name
-    most_unit : largest coordinate in units of the frame, where all data lies in the unit ball
-    most_number : largest other number; sums of squares of larger ones leave no digits
-    scales : range of the frame's scale, in file units, which includes every scan that ingest accepts
-    least_length : of the cubes and correlation lengths of local fields, in units of the frame
-    least_overlap : of the cubes, as a share of their edge
-    """
-    for name, tensor in tensors.items():
-        whole = name == "detail.keys"
-        if tensor.dtype not in ((torch.int64, torch.int32) if whole else (torch.float32, torch.float64)):
-            kind = str(tensor.dtype).removeprefix("torch.")
-            raise InputError(f"{path} holds {name!r} as {kind}, not as {'whole' if whole else 'real'} numbers.")
-    for name in ("frame.center", "frame.scale", "box"):
-        if tensors[name].dtype != torch.float64:
-            raise InputError(f"{path} holds {name!r} in single precision, not in double.")
+    """Raise an error for types, shapes and numbers that no fit makes."""
     shapes = {"frame.center": (3,), "frame.scale": (), "box": (2, 3)}
+    kinds = {"support": (torch.float32,), "detail.keys": (torch.int64,), "theta": (torch.float64, torch.float32)}
+    kinds |= dict.fromkeys(("detail.frequencies", "detail.phases", "detail.amplitudes"), kinds["theta"])
+    lengths = ("frame.center", "frame.scale", "box", "detail.lattice", "detail.noise", "detail.lengths")
+    kinds |= dict.fromkeys(lengths, (torch.float64,))
     for name, tensor in tensors.items():
+        if name not in kinds:
+            raise InputError(f"{path} holds {name!r}, which is no part of a gnrecon model.")
+        if tensor.dtype not in kinds[name]:
+            raise InputError(f"{path} holds {name!r} as {str(tensor.dtype).removeprefix('torch.')}.")
         if name in shapes and tensor.shape != shapes[name]:
             raise InputError(f"{path} holds {name!r} of shape {tuple(tensor.shape)}, not {shapes[name]}.")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise InputError(f"{path} holds numbers in {name!r} that are not finite.")
-        unit = name in ("box", "support", "detail.lattice")
-        world, most = name in ("frame.center", "frame.scale"), most_unit if unit else most_number
-        if not world and tensor.numel() and float(tensor.double().abs().max()) > most:
-            raise InputError(f"{path} holds numbers in {name!r} that are too large.")
-    box, support, scale = tensors["box"], tensors.get("support"), float(tensors["frame.scale"])
-    if not (scale > 0 and bool((box[1] - box[0] > least_length).all())):
+    box, support = tensors["box"], tensors.get("support")
+    if not (float(tensors["frame.scale"]) > 0 and bool((box[1] > box[0]).all())):
         raise InputError(f"{path} holds a frame or a box without extent.")
-    if not scales[0] < scale < scales[1]:
-        raise InputError(f"{path} holds a frame of the scale {scale:g}, which cannot be computed with.")
-    # Farther from the origin, float64 does not tell the corners of the box apart.
-    if float(tensors["frame.center"].abs().max()) > most_number * scale:
-        raise InputError(f"{path} holds a frame that lies too far from the origin for its scale.")
-    if "detail.lattice" in tensors:
-        lattice, lengths = tensors["detail.lattice"], tensors["detail.lengths"]
-        if lattice.shape != (5,) or not (float(lattice[3]) >= least_length and bool((lengths >= least_length).all())):
-            raise InputError(f"{path} holds local fields whose lengths are not positive.")
-        if float(lattice[4]) < least_overlap:
-            raise InputError(f"{path} holds local fields that do not overlap.")
-    if support is not None and (support.dtype != torch.float32 or support.shape[1:] != (3,) or not len(support)):
+    scale, far = float(tensors["frame.scale"]), float(tensors["frame.center"].abs().max())
+    if not (least_scale <= scale <= most_scale and far <= most_scale):
+        raise InputError(f"{path} holds a frame of radius {scale:.3g} at {far:.3g}, which is out of range.")
+    reach = max(float(box.abs().max()), 0.0 if support is None or not len(support) else float(support.abs().max()))
+    if reach > most_reach or not float((box[1] - box[0]).min()) >= 1 / most_reach:
+        raise InputError(f"{path} holds a box or points that are not those of a unit ball: they reach {reach:.3g}.")
+    if support is not None and (support.dtype != torch.float32 or support.ndim != 2 or support.shape[1:] != (3,)):
         raise InputError(f"{path} holds {tuple(support.shape)} numbers as the data's points, not rows of three.")
+    if support is not None and not (len(support) and float((support.amax(dim=0) - support.amin(dim=0)).max()) > 1e-6):
+        raise InputError(f"{path} holds no points of the data, or points that all coincide.")
+
+
+def _widths(path: str | Path, widths: Any, *, most_layers: int = 64, most: int = 10**9) -> tuple[int, ...]:
+    """Return the sizes of the hidden layers, if they are some."""
+    if not isinstance(widths, list) or not 1 <= len(widths) <= most_layers:
+        raise InputError(f"{path} holds no list of 1 to {most_layers} widths.")
+    if not all(type(width) is int and 1 <= width <= most for width in widths):
+        raise InputError(f"{path} holds widths that are not whole numbers from 1 on.")
+    return tuple(widths)
+
+
+def _require_plain_options(path: str | Path, options: Any) -> None:
+    """Refuse options that are not names with values, or of other types than those of a fit."""
+    if not isinstance(options, dict):
+        raise InputError(f"{path} holds options that are not names with values.")
+    for name, value in options.items():
+        items = value if isinstance(value, list) else [value]
+        if not all(item is None or isinstance(item, bool | int | float | str) for item in items):
+            raise InputError(f"{path} holds an option {name[:40]!r} that is neither a value nor a list of values.")
+    seed = options.get("seed", 0)
+    if type(seed) is not int or not 0 <= seed < 2**63:
+        raise InputError(f"{path} holds a seed that is not a whole number from 0 on.")
+
+
+def _require_distances(path: str | Path, sdf: NeuralSDF, *, each: int = 6, most_boxes: float = 1e6) -> None:
+    """Refuse a field that is not finite, or larger than `most_boxes` boxes, on a grid of `each` points cubed."""
+    low, high = sdf.box.lower, sdf.box.upper
+    steps = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, each)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    x = low + steps * (high - low)
+    with np.errstate(all="ignore"):
+        values, gradients = sdf.sdf_and_gradient(sdf.frame.to_world(x))
+        size = np.abs(values).max() / sdf.frame.scale + np.abs(gradients).max()
+    if not size <= most_boxes * max(1.0, float(np.linalg.norm(high - low))):
+        raise InputError(f"{path} holds a field whose values are no distances: they reach {size:.3g} radii.")
 
 
 # The local fields as tensors of a model file, and back.
@@ -347,7 +355,9 @@ def detail_tensors(detail: Detail) -> dict[str, Tensor]:
     return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
 
 
-def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
+def detail_of(
+    path: str | Path, tensors: Mapping[str, Tensor], *, most_cells: int = 1 << 20, least_noise: float = 1e-9
+) -> Detail | None:
     """Return the detail among a file's tensors, or None where there is none.
 
     Raises
@@ -355,7 +365,7 @@ def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
     InputError
         When tensors are missing or do not fit together.
     """
-    if "detail.lattice" not in tensors:
+    if not any(name.startswith("detail.") for name in tensors):
         return None
     lattice, noise, keys, lengths = (
         tensors[f"detail.{name}"].cpu().numpy() for name in ("lattice", "noise", "keys", "lengths")
@@ -367,6 +377,13 @@ def detail_of(path: str | Path, tensors: Mapping[str, Tensor]) -> Detail | None:
         raise InputError(f"{path} holds local fields whose parts do not fit together: {shapes}.")
     if not ((lengths > 0).all() and (noise > 0).all() and lattice[3] > 0 and 0 < lattice[4] <= 1):
         raise InputError(f"{path} holds local fields whose lengths or noise are not positive.")
+    if len({frequencies.dtype, phases.dtype, amplitudes.dtype}) > 1 or not cubes or not features:
+        raise InputError(f"{path} holds local fields of different types, or none.")
+    if not (np.abs(keys) < most_cells).all() or len(np.unique(keys, axis=0)) != cubes:
+        raise InputError(f"{path} holds local fields in cubes that repeat or are too far off.")
+    numbers = np.concatenate([np.abs(lattice), 1 / lattice[3:], noise, least_noise / noise, lengths, 1 / lengths])
+    if not (numbers < most_cells).all() or float(frequencies.abs().max()) > most_cells:
+        raise InputError(f"{path} holds local fields whose lengths are out of range.")
     partition = Partition(lattice[:3], float(lattice[3]), float(lattice[4]))
     of_all = Features(frequencies, phases)
     return Detail(partition, keys, lengths, of_all, amplitudes, float(noise[0]), float(noise[1]))

@@ -263,7 +263,9 @@ def _require_bounded(
         """Instances and vertices of an object with all that it contains."""
         if key not in known:
             if key not in model.objects or depth > most_depth:
-                raise InputError(f"the 3MF model builds the object {key[1]!r}, which does not exist or contains itself.")
+                raise InputError(
+                    f"the 3MF model builds the object {key[1]!r}, which does not exist or contains itself."
+                )
             current = model.objects[key]
             inner = [counted(part, depth + 1) for part, _ in current.parts]
             own = len(current.vertices) // 3 + len(current.corners) // 3
