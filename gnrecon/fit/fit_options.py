@@ -193,7 +193,13 @@ def network_count(points: int, *, parameters: NetworkLadderParameters = NetworkL
     return min(max(round(parameters.points_per_member / max(points, 1)), 1), parameters.most_members)
 
 
+def network_starts(points: int, *, parameters: NetworkLadderParameters = NetworkLadderParameters()) -> int:
+    """Return from how many starts the first width of a network is fitted; several networks have one each."""
+    return parameters.starts if network_count(points, parameters=parameters) == 1 else 1
+
+
 def network_steps(points: int, *, parameters: NetworkLadderParameters = NetworkLadderParameters()) -> int:
     """Return the most steps of all global networks of so many seen points."""
-    each = parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
+    starts = network_starts(points, parameters=parameters)
+    each = starts * parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
     return network_count(points, parameters=parameters) * each

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.field.widening import mean_of, widened
-from gnrecon.fit.fit_options import FitOptions, network_count
+from gnrecon.fit.fit_options import FitOptions, network_count, network_starts
 from gnrecon.fit.initialisation import WrongSignSearch, spectral_start
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, start_terms
 from gnrecon.fit.parameters import InitialisationParameters, NetworkLadderParameters, NetworkTermParameters
@@ -51,8 +52,6 @@ class Deviations:
 class Prediction:
     """How a field predicts the validation points and the sign of free space.
 
-    Parameters
-    ----------
     misfits : of shape (V,), distance of each validation point from the surface, in disk radii, plus |grad f - n|
     wrong : mask of shape (Q,), of the samples of free space whose sign is wrong
     wrong_sign_score : what a field costs that is wrong in all of free space
@@ -70,8 +69,7 @@ class Prediction:
     def is_better_than(self, other: Prediction, *, standard_errors: float) -> bool:
         """Whether it gains so many standard errors over another prediction of the same points and samples.
 
-        The noise of a validation point is the same for both, so that their differences, point by point, have little
-        of it.
+        The noise of a validation point is in both, so that differences, point by point, have little of it.
         """
         points = other.misfits - self.misfits
         signs = self.wrong_sign_score * (other.wrong.double() - self.wrong.double())
@@ -125,11 +123,8 @@ class NetworkTerms:
         trial = scene.places(self.parameters.trial_samples, rng)
         wrong, _ = known.wrong_signs(trial, lambda x: field.value(theta, scene.tensor(x)).cpu().numpy())
         x, distance = _certain(scene, wrong)
-        volume, distances = (
-            torch.cat([self.volume, scene.tensor(x)]),
-            torch.cat([self.distances, scene.tensor(distance)]),
-        )
-        return replace(self, volume=volume, distances=distances)
+        volume = torch.cat([self.volume, scene.tensor(x)])
+        return replace(self, volume=volume, distances=torch.cat([self.distances, scene.tensor(distance)]))
 
     def noise(self, field: Siren, theta: Tensor) -> Deviations:
         """Return robust deviations of the validation points from the field."""
@@ -143,13 +138,13 @@ class NetworkTerms:
         return Deviations(max(values, least * radius), max(normals, least_angle))
 
     def prediction(self, field: Siren, theta: Tensor) -> Prediction:
-        """Return how the field predicts the validation points and the sign of free space."""
+        """Return how the field predicts."""
         distance, angle = self._misfits(field, theta)
         wrong = self.distances.sign() * field.value(theta, self.volume) < 0.0
         return Prediction(distance / self.radius + angle, wrong, self.parameters.wrong_sign_score)
 
     def score(self, field: Siren, theta: Tensor) -> float:
-        """Return how badly the field predicts, in disk radii."""
+        """Return how badly it predicts, in disk radii."""
         return self.prediction(field, theta).score
 
     def eikonal_rms(self, field: Siren, theta: Tensor) -> float:
@@ -182,9 +177,11 @@ class NetworkTerms:
         self, field: Siren, theta: Tensor, noise: Deviations, rng: np.random.Generator
     ) -> tuple[ObjectiveTerm, ObjectiveTerm]:
         """Return values and normals at a random part of the points, with robust weights."""
-        scene, freedom = self.scene, self.parameters.robust_degrees_of_freedom
-        rows = self._part(len(scene.points), self.parameters.data_rows, rng)
-        points, normals = scene.points[rows], scene.normals[rows]
+        freedom, rows = (
+            self.parameters.robust_degrees_of_freedom,
+            self._part(len(self.scene.points), self.parameters.data_rows, rng),
+        )
+        points, normals = self.scene.points[rows], self.scene.normals[rows]
         value, gradient = field.value_and_gradient(theta, points)
         off = (value / noise.values).square()
         turned = ((gradient - normals) / noise.normals).square().sum(1)
@@ -234,13 +231,10 @@ def _certain(scene: Scene, x: Float) -> tuple[Float, Float]:
 
 # A ladder of widths, climbed while validation points gain by it.
 #
-# A small network is fast and smooth, and finds the shape as a whole. When its score stops falling, it is widened with
-# its function kept (`field.widening`), and fitted further. The ladder ends at the width that no longer improves the
-# score. A step costs a multiple of the fourth power of the width, so that the small networks take most of the steps.
-#
-# Sparse points leave a network much freedom, so that each start ends in another field. Several networks are then fitted
-# from different starts, and the mean of those is used that score best together: it is nearer to the surface than its
-# members, as their deviations between the points are independent.
+# A small network is fast and smooth, and finds the shape as a whole. The best of some starts is widened with its
+# function kept (`field.widening`) and fitted further, until a width gains no more. A step costs a multiple of the
+# fourth power of the width. Sparse points leave much freedom, so that each start ends in another field: the mean of
+# those networks that score best together is nearer to the surface, as their deviations between points are independent.
 # Source: Caruana et al., *Ensemble Selection from Libraries of Models* (2004), for the choice of members.
 
 
@@ -265,7 +259,6 @@ class NetworkLadder:
     parameters: NetworkLadderParameters = NetworkLadderParameters()
 
     def __post_init__(self) -> None:
-        """Begin without records."""
         self.history: list[Record] = []
         self.members: list[tuple[Siren, Tensor]] = []
 
@@ -336,19 +329,14 @@ class NetworkLadder:
             When the linear start cannot be solved.
         """
         widths = self._widths()
-        field = Siren((widths[0],) * self.parameters.depth)
-        scene, rng = self.terms.scene, self.rng
-        share = InitialisationParameters.hidden_weight_share
-        theta = spectral_start(field, scene, lambda x, d, n: start_terms(scene, self.options, rng, x, d, n), rng, share)
-        solution = self._fitted(field, theta, self.parameters.first_steps)
-        score = self.terms.score(field, solution.theta)
-        best = field, solution.theta, score
+        field, solution = self._started(widths[0])
+        best = field, solution.theta, self.terms.score(field, solution.theta)
         for width in widths[1:]:
             if solution.interrupted or best[2] > self.parameters.hopeless_ratio * self.rival:
                 break
-            self.terms = self.terms.with_wrong_signs(field, solution.theta, rng)
+            self.terms = self.terms.with_wrong_signs(field, solution.theta, self.rng)
             frequency = InitialisationParameters.first_layer_frequency
-            field, theta = widened(field, solution.theta, width, rng, frequency)
+            field, theta = widened(field, solution.theta, width, self.rng, frequency)
             solution = self._fitted(field, theta, self.parameters.steps)
             found, before = self.terms.prediction(field, solution.theta), self.terms.prediction(*best[:2])
             # On noisy points a wider network follows the noise, and seems better on the validation points by chance.
@@ -359,6 +347,18 @@ class NetworkLadder:
         _log.info("A network has widths %s, after %d steps.", field.widths, len(self.history))
         # Whether and why the steps ended is what the last width's say, whichever width is the best.
         return field, replace(solution, theta=theta), score
+
+    def _started(self, width: int) -> tuple[Siren, Solution]:
+        """Return the best network of one width from random starts, after the first steps."""
+        field, found = Siren((width,) * self.parameters.depth), list[Solution]()
+        scene, rng, share = self.terms.scene, self.rng, InitialisationParameters.hidden_weight_share
+        for _ in range(network_starts(len(scene.points), parameters=self.parameters)):
+            theta = spectral_start(field, scene, partial(start_terms, scene, self.options, rng), rng, share)
+            found.append(self._fitted(field, theta, self.parameters.first_steps))
+            if found[-1].interrupted:
+                break
+        best = min(found, key=lambda one: self.terms.score(field, one.theta))
+        return field, replace(found[-1], theta=best.theta)
 
     def _widths(self) -> list[int]:
         """Return the first width, and those of networks with no more parameters than the data has rows."""

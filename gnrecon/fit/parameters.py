@@ -97,7 +97,8 @@ class NetworkLadderParameters:
 
     depth: int = 3  # hidden layers
     widths: tuple[int, ...] = (16, 24, 32)
-    first_steps: int = 30  # most Gauss-Newton steps of the first width
+    starts: int = 3  # of the first width, of which the best is widened
+    first_steps: int = 30  # most Gauss-Newton steps of each
     steps: int = 15  # of each further width
     patience_steps: int = 8  # without a better score
     least_gain: float = 0.01  # share of the score whose loss ends the steps

@@ -30,7 +30,8 @@ from gnrecon.runtime.progress import ignore_progress
 FRAME = Frame(np.array([1.0, 2.0, 3.0]), 2.0)
 # A network in any case: the linear field predicts the clean capsule of these tests well enough.
 TWO_WIDTHS = GlobalFieldParameters(
-    ladder=NetworkLadderParameters(widths=(12, 16), most_members=1, gain_standard_errors=-1e9), exact_score=0.0
+    ladder=NetworkLadderParameters(widths=(12, 16), starts=1, most_members=1, gain_standard_errors=-1e9),
+    exact_score=0.0,
 )
 
 
@@ -175,13 +176,14 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
         return networks.Solution(theta, "", ())
 
     monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
+    monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0)
     monkeypatch.setattr(Prediction, "is_better_than", lambda *_, **__: True)
     parameters = NetworkLadderParameters(widths=(4, 24, 32), points_per_member=600, most_members=4)
     NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, parameters=parameters).fit()
     assert made == [(4,) * 3] * 2, "1,321 parameters are more than the 1,200 rows of 300 points"
     made.clear()
     NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, parameters=parameters).fit()
-    assert made == [(4,) * 3, (24,) * 3, (32,) * 3]
+    assert made == [(4,) * 3] * 3 + [(24,) * 3, (32,) * 3], "one network has three starts"
 
 
 def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
@@ -261,3 +263,25 @@ def test_an_outlier_is_a_point_that_no_field_explains(network: tuple[GlobalField
     of_network, of_linear = network[0].values(samples)
     assert np.abs(of_network - of_linear).max() > 0
     assert np.abs(of_linear).mean() / FRAME.scale < 0.01
+
+
+def test_the_best_of_the_starts_is_the_network(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+    starts: list[torch.Tensor] = []
+
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> networks.Solution:
+        del self, field, steps
+        starts.append(theta)
+        return networks.Solution(theta, "", ())
+
+    def score(self: NetworkTerms, field: Siren, theta: torch.Tensor) -> float:
+        del self, field
+        return [3.0, 1.0, 2.0][next(i for i, start in enumerate(starts) if start is theta)]
+
+    monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
+    monkeypatch.setattr(NetworkTerms, "score", score)
+    parameters = NetworkLadderParameters(widths=(4,), most_members=1)
+    ladder = NetworkLadder(terms_of(capsule(300, 0), rng), FitOptions(), rng, parameters=parameters)
+    _, solution, least = ladder.climb()
+    assert least == 1.0
+    assert solution.theta is starts[1]
+    assert not torch.equal(starts[0], starts[1])
