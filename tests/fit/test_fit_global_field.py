@@ -114,8 +114,8 @@ def test_steps_on_all_points_come_nearer_to_those_left_out(network: tuple[Global
 
 
 def test_outliers_and_contradicting_normals_lose_their_weight() -> None:
-    clean, rng = capsule(900, 0), np.random.default_rng(2)
-    wrong = rng.permutation(900)[:45]
+    clean, rng = capsule(500, 0), np.random.default_rng(2)
+    wrong = rng.permutation(500)[:25]
     points, normals = clean.points.copy(), clean.normals.copy()
     points[wrong] += 0.1 * normals[wrong]
     normals[wrong] *= -1
@@ -157,8 +157,8 @@ def test_free_space_is_drawn_where_the_field_is_wrong(rng: np.random.Generator) 
 
 
 def test_the_noise_of_the_data_is_that_of_the_validation_points(rng: np.random.Generator) -> None:
-    exact = capsule(3000, 0)
-    noisy = replace(exact, points=exact.points + 0.02 * rng.standard_normal((3000, 1)) * exact.normals)
+    exact = capsule(1500, 0)
+    noisy = replace(exact, points=exact.points + 0.02 * rng.standard_normal((1500, 1)) * exact.normals)
     terms = replace(terms_of(noisy, rng), points=torch.as_tensor(noisy.points), normals=torch.as_tensor(noisy.normals))
     terms = replace(terms, parameters=NetworkTermParameters(least_deviation=1e-9))
     field = fitted(exact, TWO_WIDTHS).sdf
