@@ -78,10 +78,10 @@ def _run(words: list[str]) -> int:
         print(f"gnrecon {__version__}")
         return ExitCode.OK
     command = shlex.join(["gnrecon", *words])
-    # On a busy machine, threads that spin while they wait slow the run down several times.
     # Warnings of libraries are for programmers; -W and PYTHONWARNINGS show them.
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
+    # On a busy machine, threads that spin while they wait slow the run down several times.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         if words or "_GNRECON_COMPLETE" in os.environ:  # a shell that completes a line gives no words
