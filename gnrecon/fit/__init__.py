@@ -11,8 +11,8 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_field import fit
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.objective import bounds_of
+from gnrecon.fit.posterior.residual_stats import Misfit
 from gnrecon.fit.posterior.uncertainty import Uncertainty
-from gnrecon.fit.residual_stats import Misfit
 from gnrecon.optim import Solution
 
 __all__ = ["FitOptions", "Misfit", "NeuralSDF", "Uncertainty", "bounds_of", "fit"]

@@ -157,7 +157,7 @@ def field_smoothness(
     points, normals = scene.points[seen], scene.normals[seen]
     signed = scene.tensor(distance)
     center = torch.zeros(3).to(points)
-    volume = scene.tensor(x), signed, signed, signed, signed.abs()
+    volume = scene.tensor(x), signed, signed, signed, torch.zeros_like(signed), signed.abs()
     patch = Patch(points, torch.zeros(len(points)).to(points), normals, *volume, center)
     features = Features.draw(parameters.selection_features, rng, points)
     out = np.flatnonzero(held_out)[: parameters.selection_points]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -20,12 +21,13 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.field_model import NeuralSDF
+from gnrecon.fit.free_space import CubeSpace
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
-from gnrecon.fit.model_selection import FieldResiduals, Volume
+from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import CoarseDistance
+from gnrecon.geometry.octree import DipoleTree
 from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
@@ -58,7 +60,7 @@ def fit_detail(
     advance : called with the share that is done
     shape : gives the curvature penalties for the length scale of the local fields
     """
-    samples, residuals, hyperparameters = data.samples, data.residuals, data.hyperparameters
+    residuals, hyperparameters = data.residuals, data.hyperparameters
     _log.info(
         "Local fields: length scale %.3g radii, noise %.2g radii and %.2g radians; %d features each.",
         hyperparameters.length,
@@ -66,10 +68,9 @@ def fit_detail(
         hyperparameters.angle,
         features,
     )
-    coarse = CoarseDistance(samples.points, samples.normals, rng, residuals.density)
     penalties = None if shape is None else shape(hyperparameters.length)
-    cubes = _Cubes.of(residuals, hyperparameters, features, rng, device, penalties, parameters)
-    return cubes.detail(sdf, coarse, rng, subrange(advance, parameters.selection_time_share, 1.0))
+    cubes = _Cubes.of(sdf, residuals, hyperparameters, features, rng, device, penalties, parameters)
+    return cubes.detail(subrange(advance, parameters.selection_time_share, 1.0))
 
 
 def cube_length(
@@ -91,14 +92,53 @@ def cube_length(
     return hyperparameters.length * min(max(float(np.median(disks) / radius), 1.0), most_length_stretch)
 
 
+def cube_generator(seed: int, key: Int) -> np.random.Generator:
+    """Return the generator of a cube's own random numbers, the same in whichever order cubes are solved."""
+    # The 3 separates them from others of the fit with the same seed.
+    return np.random.default_rng([seed, 3, *(int(number) + 1 for number in key)])
+
+
+def solve_cube(
+    residuals: FieldResiduals,
+    rows: Int,
+    length: float,
+    space: CubeSpace,
+    features: Features,
+    hyperparameters: Hyperparameters,
+    device: str,
+    penalties: SurfacePenalties | None = None,
+) -> Tensor:
+    """Return the amplitudes of a cube, of shape (m,).
+
+    Parameters
+    ----------
+    residuals, rows : of the global field at all points, and the rows of those that the cube is fitted to
+    length : of its features
+    space : around it
+    features : of all cubes
+    hyperparameters : of the whole scan
+    device : a torch device
+    penalties : of the surface's curvature
+    """
+    patch = residuals.patch(rows, space.center, space.far(), device)
+    system = PatchSystem(patch, features, length, patch.size)
+    draw = partial(space.near, length, hyperparameters.position)
+    if penalties is None:
+        return system.solve_with_bounds(hyperparameters.position, hyperparameters.angle, draw)
+    return penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
+
+
 @dataclass(frozen=True)
 class _Cubes:
     """The cubes of a detail with the data that they are fitted to."""
 
+    sdf: NeuralSDF
     residuals: FieldResiduals
+    dipoles: DipoleTree
     hyperparameters: Hyperparameters
     features: Features
     partition: Partition
+    seed: int
     device: str
     penalties: SurfacePenalties | None
     parameters: LocalFieldParameters
@@ -106,6 +146,7 @@ class _Cubes:
     @classmethod
     def of(
         cls,
+        sdf: NeuralSDF,
         residuals: FieldResiduals,
         hyperparameters: Hyperparameters,
         count: int,
@@ -119,57 +160,47 @@ class _Cubes:
         cell = parameters.cube_edge_lengths * hyperparameters.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
-        features = Features.draw(count, rng, like)
-        return cls(residuals, hyperparameters, features, partition, device, penalties, parameters)
+        features, seed = Features.draw(count, rng, like), int(rng.integers(2**32))
+        dipoles = DipoleTree.of(residuals.points, residuals.normals, residuals.density.disks)
+        return cls(sdf, residuals, dipoles, hyperparameters, features, partition, seed, device, penalties, parameters)
 
-    def detail(
-        self, sdf: NeuralSDF, coarse: CoarseDistance, rng: np.random.Generator, advance: ProgressCallback
-    ) -> Detail:
+    def detail(self, advance: ProgressCallback) -> Detail:
         """Fit all cubes that hold data."""
         keys, _ = self.partition.members(self.residuals.points)
-        volumes = self._volumes(sdf, coarse, keys, rng)
-        reach = self.partition.reach + self.parameters.data_margin_disk_radii * self.residuals.density.radius
-        radius, disks = self.residuals.density.radius, self.residuals.density.disks
+        density, hyperparameters, limits = self.residuals.density, self.hyperparameters, self.parameters
+        reach = self.partition.reach + limits.data_margin_disk_radii * density.radius
 
         def solved(number: int) -> tuple[float, Tensor] | None:
             """Return the length and amplitudes of a cube, or None where it holds too few points."""
             center = self.partition.center(keys[number])
             rows = self.residuals.within(center, reach)
-            if len(rows) < self.parameters.least_points:
+            if len(rows) < limits.least_points:
                 return None
-            stretch = self.parameters.most_length_stretch
-            length = cube_length(self.hyperparameters, disks[rows], radius, most_length_stretch=stretch)
-            patch = self.residuals.patch(rows, center, volumes[number], self.device)
-            return length, self._solved(PatchSystem(patch, self.features, length, patch.size), length, center)
+            disks, stretch = density.disks[rows], limits.most_length_stretch
+            length = cube_length(hyperparameters, disks, density.radius, most_length_stretch=stretch)
+            space = self._space(keys[number], center, rows)
+            cube = self.residuals, rows, length, space, self.features, hyperparameters, self.device
+            return length, solve_cube(*cube, self.penalties)
 
         cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Fitted %d local fields; %d cubes had too few points.", len(kept), len(keys) - len(kept))
-        noise = self.hyperparameters.position, self.hyperparameters.angle
+        noise = hyperparameters.position, hyperparameters.angle
         return Detail(self.partition, keys[kept], np.array(lengths), self.features, torch.stack(amplitudes), *noise)
 
-    def _solved(self, system: PatchSystem, length: float, center: Float) -> Tensor:
-        """Return the amplitudes of the cube about a centre, of shape (m,)."""
-        if self.penalties is None:
-            return system.solve_with_bounds(self.hyperparameters.position, self.hyperparameters.angle)
-        return self.penalties.penalise_cube(
-            self.features, length, center, self.partition.reach, self.hyperparameters, system
+    def _space(self, key: Int, center: Float, rows: Int) -> CubeSpace:
+        """Return the space of a cube, the points of which have these rows."""
+        sdf, density = self.sdf, self.residuals.density
+        return CubeSpace(
+            center,
+            self.partition.reach,
+            sdf.box,
+            self.residuals.points[rows],
+            density.tree,
+            density.disks,
+            self.dipoles,
+            lambda x: sdf.field.value(sdf.theta, torch.as_tensor(x).to(sdf.theta)).double().cpu().numpy(),
+            cube_generator(self.seed, key),
+            signed_by=None if self.penalties is None else self.penalties.volume_distances,
         )
-
-    def _volumes(self, sdf: NeuralSDF, coarse: CoarseDistance, keys: Int, rng: np.random.Generator) -> list[Volume]:
-        """Return samples of each cube that lie clear of the data, with bounds that the coarse distance sets."""
-        centers, count = self.partition.center(keys), self.parameters.volume_samples
-        x = centers[:, None, :] + self.partition.reach * rng.uniform(-1.0, 1.0, (len(keys), count, 3))
-        cube = np.repeat(np.arange(len(keys)), count)
-        x = x.reshape(-1, 3)
-        inside = ((x > sdf.box.lower) & (x < sdf.box.upper)).all(axis=1)
-        x, cube = x[inside], cube[inside]
-        clear, signed, distance, certain = coarse.at(x, self.parameters.clearance_disk_radii)
-        x, cube = x[clear], cube[clear]
-        if self.penalties is not None:
-            signed = self.penalties.volume_distances(x, signed)
-        own = sdf.sdf(sdf.frame.to_world(x)) / sdf.frame.scale
-        ends = np.searchsorted(cube, np.arange(1, len(keys)))
-        parts = (np.split(values, ends) for values in (x, own, signed, certain, distance))
-        return [Volume.around(*of_cube) for of_cube in zip(*parts, strict=True)]

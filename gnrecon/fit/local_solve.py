@@ -4,7 +4,7 @@ A correction c = sum_j a_j sin(F_j . (x - c_0) / l + p_j) with independent norma
 features, a Gaussian process of standard deviation s and length scale l. The data are f + c = 0 and grad(f + c) = n at
 the points, with noise in position and in normals, and f + c near the coarse distance at samples of free space, within a
 share of it. The most probable amplitudes solve one linear system (`PatchSystem`, or `LocalRowSystem` for few points).
-Free space keeps its sign: samples where the correction violates its bounds are added again with more weight
+Free space keeps its sign: where the correction is beyond its bounds, samples are added with the bound as their target
 (`PatchSystem.solve_with_bounds`).
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 2.1, with the features of Rahimi
 and Recht (2007) and observations of the gradient.
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
+from gnrecon.fit.free_space import Volume
 from gnrecon.fit.parameters import LocalSolveParameters
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram
@@ -52,6 +53,7 @@ class Patch:
     volume : samples of shape (Q, 3)
     wanted, distance : target of c there, and the distance from the data, both of shape (Q,)
     lower, upper : of shape (Q,), what c must be at least and at most at the samples
+    zero : of shape (Q,), the c at which the corrected field vanishes there
     center : of shape (3,), origin of the features' coordinates
     """
 
@@ -62,6 +64,7 @@ class Patch:
     wanted: Tensor
     lower: Tensor
     upper: Tensor
+    zero: Tensor
     distance: Tensor
     center: Tensor
 
@@ -95,9 +98,10 @@ class PatchSystem:
         ]
         positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
         self._positions, self._angles = (positions, of_positions), (angles, of_angles)
-        self._patch = patch
-        self._free, wanted = _volume_rows(patch, features, length)
-        self._volume = gram([self._free], count, like), self._free.T @ wanted
+        self._patch, self._features, self._length = patch, features, length
+        self._sines = features.phase(patch.volume, patch.center, length).sin()
+        free = self._sines / patch.deviation[:, None]
+        self._volume = gram([free], count, like), free.T @ (patch.wanted / patch.deviation)
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
@@ -111,23 +115,40 @@ class PatchSystem:
         return amplitudes
 
     def solve_with_bounds(
-        self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
+        self,
+        position: float,
+        angle: float,
+        draw: Callable[[], Volume] = Volume.none,
+        *,
+        parameters: LocalSolveParameters = LocalSolveParameters(),
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
-        A one-sided penalty by an active set: where c violates a bound, a row with the bound as target is added, with
-        more weight. The other rows stay in the system.
+        A one-sided penalty by an active set: where the corrected field is below half of its bound, or has the wrong
+        sign, a row with the bound as target is added. The other rows stay in the system.
+
+        Parameters
+        ----------
+        position, angle : standard deviations of the noise
+        draw : returns more samples for each pass, of which the bounds alone are used
         """
         amplitudes, patch = self.solve(position, angle), self._patch
-        deviation = patch.deviation
-        weight = parameters.volume_deviation_share / parameters.bound_deviation_share
+        sines, lower, upper, zero, distance = self._sines, patch.lower, patch.upper, patch.zero, patch.distance
         for _ in range(parameters.bound_passes):
-            value = deviation * (self._free @ amplitudes)
-            bound = value.clamp(patch.lower, patch.upper)
-            beyond = bound != value
+            more = draw()
+            points, _, *others = (torch.as_tensor(values).to(patch.value) for values in more.rows())
+            sines = torch.cat([sines, self._features.phase(points, patch.center, self._length).sin()])
+            lower, upper, zero, distance = (
+                torch.cat(pair) for pair in zip((lower, upper, zero, distance), others, strict=True)
+            )
+            value = sines @ amplitudes
+            low, high = value < (lower + zero) / 2, value > (upper + zero) / 2
+            beyond = low | high
             if not beyond.any():
                 break
-            rows, wanted = (weight * rows[beyond] for rows in (self._free, bound / deviation))
+            deviation = parameters.bound_deviation_share * distance[beyond]
+            rows = sines[beyond] / deviation[:, None]
+            wanted = torch.where(low, lower, upper)[beyond] / deviation
             product, right = self._volume
             self._volume = product.addmm_(rows.T, rows), right + rows.T @ wanted
             amplitudes = self.solve(position, angle)

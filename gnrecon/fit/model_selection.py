@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
+from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
 from gnrecon.fit.marginal_likelihood import MarginalLikelihood, clean_noise
 from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionParameters
@@ -75,65 +76,6 @@ class FieldResiduals:
         turn = self.normals[rows] - self.gradient[rows]
         arrays = (self.points[rows], -self.value[rows], turn, *volume.rows(), center)
         return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
-
-
-@dataclass(frozen=True)
-class Volume:
-    """Samples of space, of shape (Q, 3), where a correction is known roughly; the rest of shape (Q,).
-
-    Parameters
-    ----------
-    wanted : target of the correction
-    lower, upper : what it must be at least, and at most
-    distance : how far the data is
-    """
-
-    points: Float
-    wanted: Float
-    lower: Float
-    upper: Float
-    distance: Float
-
-    @classmethod
-    def around(
-        cls,
-        points: Float,
-        own: Float,
-        signed: Float,
-        certain: Mask,
-        distance: Float,
-        *,
-        parameters: ModelSelectionParameters = ModelSelectionParameters(),
-    ) -> Volume:
-        """Return samples at which a field is to be about the coarse distance, and of its sign where that is certain.
-
-        A field that is somewhat steeper or flatter than a distance needs no correction; forcing it to the distance
-        would overshoot between samples. Nor does one of the other sign where the sign is uncertain, as in a cavity of
-        which little was scanned: the smooth field closes it no worse.
-
-        Parameters
-        ----------
-        points : array of shape (Q, 3)
-        own, signed : arrays of shape (Q,), the field, and the coarse distance
-        certain : mask of shape (Q,), where the sign of that is certain
-        distance : array of shape (Q,), of the data
-        """
-        near, far = parameters.least_field_share * signed, parameters.most_field_share * signed
-        agreed = certain | (own * signed > 0)
-        wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
-        bound = parameters.sign_bound_share * signed - own
-        lower = np.where(certain & (signed > 0), bound, -np.inf)
-        upper = np.where(certain & (signed < 0), bound, np.inf)
-        return cls(points, wanted, lower, upper, distance)
-
-    @classmethod
-    def none(cls) -> Volume:
-        """Return no samples."""
-        return cls(np.zeros((0, 3)), *np.zeros((4, 0)))
-
-    def rows(self) -> tuple[Float, Float, Float, Float, Float]:
-        """Return all five arrays."""
-        return self.points, self.wanted, self.lower, self.upper, self.distance
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,23 @@ class LocalFieldParameters:
 
     cube_edge_lengths: float = 5.0  # in length scales: longer cubes need more features, shorter ones overlap too much
     data_margin_disk_radii: float = 2.0  # a cube is also fitted to data so far beyond it
-    volume_samples: int = 400  # samples of free space a cube
-    clearance_disk_radii: float = 3.5  # their least distance from the data: nearer, the winding number is unreliable
     least_points: int = 4  # of a cube; fewer do not define a surface
     most_length_stretch: float = 4.0  # most a cube's length scale may exceed the scan's where points are sparse
     selection_time_share: float = 0.2  # of the local fit, until length and noise are chosen, for the progress bar
+
+
+@dataclass(frozen=True)
+class FreeSpaceParameters:
+    """Samples of free space in a cube (`fit.free_space`)."""
+
+    volume_samples: int = 400  # of a whole cube
+    clearance_disk_radii: float = 3.5  # their least distance from the data: nearer, the coarse distance is none
+    near_samples: int = 400  # about the data, each time that wrong signs are looked for
+    near_clearance_disk_radii: float = 1.0  # their least distance; nearer, points do not tell the side
+    near_clearance_noises: float = 3.0  # and so many standard deviations of the points' noise more
+    least_field_share: float = 0.7  # of the coarse distance: a field between this
+    most_field_share: float = 1.5  # and this share of it needs no correction
+    sign_bound_share: float = 0.5  # of the coarse distance, that the field must keep where the sign is certain
 
 
 @dataclass(frozen=True)
@@ -159,7 +171,7 @@ class LocalSolveParameters:
 
     correction_rms_factor: float = 3.0  # prior standard deviation of the correction, over the residuals' RMS
     volume_deviation_share: float = 0.5  # standard deviation in free space, as a share of the distance from the data
-    bound_passes: int = 3  # active-set passes over samples beyond their bounds
+    bound_passes: int = 8  # most active-set passes, each with more samples, while some are beyond half of their bound
     bound_deviation_share: float = 0.1  # their standard deviation then, as a share of the distance
     damping_attempts: int = 6  # each with ten times the damping
     chunk_points: int = 16_384  # points whose features are held at once, so that memory does not grow with density
@@ -222,9 +234,6 @@ class ModelSelectionParameters:
     features: int = 700
     dense_features: int = 300
     least_slope: float = 0.05  # of the field along the normal, in a distance |f| / slope
-    least_field_share: float = 0.7  # of the coarse distance: a field between this
-    most_field_share: float = 1.5  # and this share of it needs no correction
-    sign_bound_share: float = 0.5  # of the coarse distance, that the field must keep where the sign is certain
     margin_lengths: float = 1.5  # how far a patch's data reaches beyond what it predicts, in length scales
 
 

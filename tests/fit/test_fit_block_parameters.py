@@ -15,16 +15,8 @@ import gnrecon
 from gnrecon.field.partition_of_unity import Partition
 from gnrecon.fit.blocks import solve, workers
 from gnrecon.fit.blocks.block_parameters import BlockParameters
-from gnrecon.fit.blocks.tree import DipoleTree
 
 DEFAULT = BlockParameters()
-
-
-def tree(**limits: float) -> DipoleTree:
-    rng = np.random.default_rng(0)
-    normals = rng.standard_normal((2000, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return DipoleTree.of(normals, normals, np.full(2000, 0.05), **limits)
 
 
 def test_they_are_frozen() -> None:
@@ -37,13 +29,6 @@ def test_each_is_used() -> None:
     nodes = [node for path in sources for node in ast.walk(ast.parse(path.read_text()))]
     used = {node.attr for node in nodes if isinstance(node, ast.Attribute) and "BlockParameters" in ast.unparse(node)}
     assert {field.name for field in fields(DEFAULT)} <= used
-
-
-def test_the_dipole_tree_is_by_its_parameters() -> None:
-    explicit = tree(leaf_side_radii=DEFAULT.leaf_side_radii, root_cubes=DEFAULT.root_cubes)
-    assert [len(level.radii) for level in tree().levels] == [len(level.radii) for level in explicit.levels]
-    assert len(tree(root_cubes=8).levels[0].radii) <= 8 < len(tree().levels[0].radii) <= DEFAULT.root_cubes
-    assert len(tree(leaf_side_radii=8.0).levels[-1].radii) < len(tree().levels[-1].radii)
 
 
 def test_processes_fit_into_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
+from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import LocalRowSystem, Patch, PatchSystem, patch_system
 from gnrecon.fit.parameters import LocalSolveParameters
 
@@ -29,7 +30,7 @@ def patch(rng: np.random.Generator) -> Patch:
     infinite = torch.full((3,), torch.inf).to(bound)
     lower, upper = torch.cat([bound[:5], -infinite]), torch.cat([bound[:2], infinite, bound[5:]])
     distance = torch.as_tensor(rng.uniform(0.5, 1.0, 8))
-    return Patch(*draws, lower, upper, distance, torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64))
+    return Patch(*draws, lower, upper, bound, distance, torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64))
 
 
 def rows(features: Features, x: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,6 +90,41 @@ def test_a_correction_within_its_bounds_is_left_alone(patch: Patch, features: Fe
     free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
     system = PatchSystem(free, features, LENGTH, free.size)
     torch.testing.assert_close(system.solve_with_bounds(POSITION, ANGLE), system.solve(POSITION, ANGLE), rtol=0, atol=0)
+
+
+def test_a_sample_at_half_of_its_bound_is_left_alone(patch: Patch, features: Features) -> None:
+    """Its sign is right by far; what the bound protects from are surfaces between samples."""
+    value = rows(features, patch.volume, patch.center)[0] @ PatchSystem(patch, features, LENGTH, patch.size).solve(
+        POSITION, ANGLE
+    )
+    none = torch.full((8,), torch.inf).double()
+    for beyond, moved in ((0.9, False), (1.1, True)):
+        # The bound is one above the zero, and the value so much below it.
+        bounded = replace(patch, lower=value + beyond / 2, upper=none, zero=value + beyond / 2 - 1.0)
+        system = PatchSystem(bounded, features, LENGTH, patch.size)
+        before = system.solve(POSITION, ANGLE)
+        assert bool((system.solve_with_bounds(POSITION, ANGLE) != before).any()) == moved
+
+
+def test_samples_that_are_drawn_keep_their_bounds_too(patch: Patch, features: Features) -> None:
+    free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
+    system, loose = PatchSystem(free, features, LENGTH, patch.size), (1.0, 10.0)
+    generator, drawn = np.random.default_rng(0), []
+
+    def draw() -> Volume:
+        """Samples at which the corrected field must be at least 1 and is 0 where the correction is 0.5."""
+        drawn.append(generator.standard_normal((30, 3)))
+        ones = np.ones(30)
+        return Volume(drawn[-1], ones, ones, np.inf * ones, 0.5 * ones, ones)
+
+    def wrong(amplitudes: Tensor) -> int:
+        x = torch.as_tensor(np.concatenate(drawn))
+        return int((rows(features, x, patch.center)[0] @ amplitudes < 0.5).sum())
+
+    found = system.solve_with_bounds(*loose, draw)
+    assert 1 < len(drawn) <= LocalSolveParameters.bound_passes
+    # No sum of so few sines keeps all of them.
+    assert wrong(PatchSystem(free, features, LENGTH, patch.size).solve(*loose)) > 100 > 2 * wrong(found)
 
 
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:

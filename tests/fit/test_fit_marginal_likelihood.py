@@ -29,7 +29,7 @@ def patches(count: int, points: int, rng: np.random.Generator) -> tuple[list[Pat
         x = torch.as_tensor(np.append(rng.uniform(-0.5, 0.5, (points, 2)), np.zeros((points, 1)), axis=1))
         amplitudes = torch.as_tensor(rng.standard_normal(300)) * (2 / 300) ** 0.5
         value, gradient = features.sums(amplitudes, x, center, LENGTH, 1)
-        made.append(Patch(x, value, gradient, none.reshape(0, 3), none, none, none, none, center))
+        made.append(Patch(x, value, gradient, none.reshape(0, 3), none, none, none, none, none, center))
     return made, features
 
 

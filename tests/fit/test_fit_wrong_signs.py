@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gnrecon.fit.free_space import Volume
 from gnrecon.fit.initialisation import WrongSignSearch
-from gnrecon.fit.model_selection import Volume
-from gnrecon.fit.parameters import ModelSelectionParameters
+from gnrecon.fit.parameters import FreeSpaceParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
 
@@ -67,10 +67,10 @@ def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:
     signed = np.repeat([0.2, -0.2], [5, 4])
     certain = np.arange(9) != 1
     volume = Volume.around(np.zeros((9, 3)), own, signed, certain, np.abs(signed))
-    near, far = 0.2 * ModelSelectionParameters.least_field_share, 0.2 * ModelSelectionParameters.most_field_share
+    near, far = 0.2 * FreeSpaceParameters.least_field_share, 0.2 * FreeSpaceParameters.most_field_share
     asked = [near, near, 0.2, 0.25, far, -near, -near, -0.2, -far]
     np.testing.assert_allclose(own + volume.wanted, asked, atol=1e-15)
-    share = ModelSelectionParameters.sign_bound_share
+    share = FreeSpaceParameters.sign_bound_share
     np.testing.assert_allclose((volume.lower + own)[:5], np.where(certain, share * 0.2, -np.inf)[:5])
     np.testing.assert_allclose((volume.upper + own)[5:], -share * 0.2)
     assert np.isposinf(volume.upper[:5]).all()
@@ -80,7 +80,7 @@ def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:
 def test_free_space_of_a_doubtful_sign_is_left_to_the_field() -> None:
     own, signed = np.array([-0.1, -0.9, 0.1, 0.01, 0.9]), np.array([0.2, 0.2, -0.2, 0.2, 0.2])
     volume = Volume.around(np.zeros((5, 3)), own, signed, np.zeros(5, dtype=bool), np.abs(signed))
-    near, far = 0.2 * ModelSelectionParameters.least_field_share, 0.2 * ModelSelectionParameters.most_field_share
+    near, far = 0.2 * FreeSpaceParameters.least_field_share, 0.2 * FreeSpaceParameters.most_field_share
     np.testing.assert_allclose(own + volume.wanted, [-0.1, -0.9, 0.1, near, far], atol=1e-15)
     assert np.isneginf(volume.lower).all()
     assert np.isposinf(volume.upper).all()

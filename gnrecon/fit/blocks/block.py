@@ -19,13 +19,14 @@ from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
-from gnrecon.fit.blocks.tree import Codes, DipoleTree, morton_codes
-from gnrecon.fit.local_fields import cube_length
-from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
-from gnrecon.fit.model_selection import FieldResiduals, Volume
+from gnrecon.fit.free_space import CubeSpace
+from gnrecon.fit.local_fields import cube_generator, cube_length, solve_cube
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding
+from gnrecon.geometry.octree import Codes, DipoleTree, morton_codes
+from gnrecon.geometry.signed_distance import Box
 
 
 def solve_block(folder: str | Path, number: int, device: str = "cpu") -> None:
@@ -125,10 +126,9 @@ class BlockSolver:
         if len(rows) < LocalFieldParameters.least_points:
             return None
         length = cube_length(self.hyperparameters, self.disks[rows], self.radius)
-        patch = self.residuals.patch(rows, center, self._free_space(key, center, nearby), self.device)
-        system = PatchSystem(patch, self.features, length, patch.size)
-        amplitudes = system.solve_with_bounds(self.hyperparameters.position, self.hyperparameters.angle)
-        return length, amplitudes.cpu().numpy()
+        space = self._space(key, center, rows, nearby)
+        cube = self.residuals, rows, length, space, self.features, self.hyperparameters, self.device
+        return length, solve_cube(*cube).cpu().numpy()
 
     def _nearby_points(self, key: Int) -> Int:
         """Return the rows of the points in a cell and its neighbours, in order: all points of the cube."""
@@ -141,18 +141,17 @@ class BlockSolver:
         runs = [np.arange(self.first[cell], self.first[cell + 1]) for cell in at]
         return np.concatenate([np.zeros(0, dtype=np.int64), *runs])
 
-    def _free_space(self, key: Int, center: Float, nearby: Int) -> Volume:
-        """Return samples of the cube away from the points, with the bounds that the coarse distance sets there."""
-        # The 3 separates the cubes' random streams from others of the fit with the same seed.
-        rng = np.random.default_rng([self.seed, 3, *(int(number) + 1 for number in key)])
-        x = center + self.partition.reach * rng.uniform(-1.0, 1.0, (LocalFieldParameters.volume_samples, 3))
-        x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
-        distance, nearest = cKDTree(self.residuals.points[nearby]).query(x)
-        disks = self.disks[nearby][nearest]
-        clear = distance > LocalFieldParameters.clearance_disk_radii * disks
-        x, distance, disks = x[clear], distance[clear], disks[clear]
-        winding = self.dipoles.winding_number(x, center, self.partition.reach)
-        # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
-        signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
-        value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, value, signed, is_sign_certain(winding), distance)
+    def _space(self, key: Int, center: Float, rows: Int, nearby: Int) -> CubeSpace:
+        """Return the space of a cube, the points of which have these rows, with others nearby."""
+        points, theta = self.residuals.points, self.theta
+        return CubeSpace(
+            center,
+            self.partition.reach,
+            self.box,
+            points[rows],
+            cKDTree(points[nearby]),
+            self.disks[nearby],
+            self.dipoles,
+            lambda x: self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy(),
+            cube_generator(self.seed, key),
+        )

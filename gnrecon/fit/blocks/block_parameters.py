@@ -9,15 +9,11 @@ from dataclasses import dataclass
 class BlockParameters:
     """How a large scan is divided into blocks, and these among processes.
 
-    The result depends on the dipole tree's parameters, within its error, and on no others.
-
-    Lengths that end in `_radii` are multiples of the median radius of the disk that a point stands for.
+    The result depends on none of them.
     """
 
     large_scan_points: int = 200_000  # from which on a scan is fitted by blocks
     block_points: int = 20_000  # of a block at most, unless one cube holds more: some seconds of work
     lookup_points: int = 100_000  # whose cubes are looked up at a time, to bound the memory
-    leaf_side_radii: float = 4.0  # of the dipole tree's smallest cubes: from there on the sign begins to be right
-    root_cubes: int = 64  # of the dipole tree's largest size at most
     worker_bytes: float = 1.2e9  # memory of a process at most, with Python and torch
     task_retries: int = 2  # of a block on a cluster, where a network file system shows files late

@@ -24,7 +24,6 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.blocks.store import WorkFolder
-from gnrecon.fit.blocks.tree import DipoleTree, morton_codes, octree_blocks
 from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
@@ -32,6 +31,7 @@ from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.octree import DipoleTree, morton_codes, octree_blocks
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import worker_count

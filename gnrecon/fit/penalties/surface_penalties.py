@@ -11,7 +11,7 @@ certain, a one-sided residual (`FreeSpace`) keeps it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,6 +25,7 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
@@ -162,11 +163,12 @@ class SurfacePenalties:
         reach: float,
         hyperparameters: Hyperparameters,
         system: PatchSystem,
+        draw: Callable[[], Volume] = Volume.none,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
     ) -> Tensor:
-        """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`."""
-        amplitudes = system.solve_with_bounds(hyperparameters.position, hyperparameters.angle)
+        """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`; see `PatchSystem` for the rest."""
+        amplitudes = system.solve_with_bounds(hyperparameters.position, hyperparameters.angle, draw)
         equations = system.equations(hyperparameters.position, hyperparameters.angle)
         rows = np.asarray((np.abs(self.surface.points - center) < reach).all(axis=1))
         scale = (len(self.density.points) / len(self.surface)) ** 0.5 / hyperparameters.position

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import winding_number
 
@@ -110,8 +109,8 @@ class DipoleTree:
         normals: Float,
         disks: Float,
         *,
-        leaf_side_radii: float = BlockParameters.leaf_side_radii,
-        root_cubes: int = BlockParameters.root_cubes,
+        leaf_side_radii: float = 0.5,
+        root_cubes: int = 64,
     ) -> DipoleTree:
         """Return the tree of oriented points.
 
@@ -119,7 +118,8 @@ class DipoleTree:
         ----------
         points, normals : arrays of shape (N, 3)
         disks : array of shape (N,), radius of the disk that each represents
-        leaf_side_radii : side of the smallest cubes, in the median of these radii
+        leaf_side_radii : side of the smallest cubes, in the median of these radii; with points that are so near to
+            each other, the sign is right from about a radius off the surface on
         root_cubes : of the largest size at most
         """
         origin = points.min(axis=0)
@@ -160,7 +160,7 @@ class DipoleTree:
     def dipoles_for(self, center: Float, reach: float) -> tuple[Float, Float, Float]:
         """Return positions, moments and radii of dipoles for all points, seen from a box of half an edge `reach`."""
         found: list[tuple[Float, Float, Float]] = []
-        rows = np.arange(len(self.levels[0].radii))
+        rows: Int = np.arange(len(self.levels[0].radii))
         for number, level in enumerate(self.levels):
             middle = level.lower[rows] + level.side / 2
             gap = np.abs(middle - center).max(axis=1) - reach - level.side / 2
@@ -169,15 +169,21 @@ class DipoleTree:
             found.append((level.places[whole], level.moments[whole], level.radii[whole]))
             if not last:
                 split = rows[gap <= level.side]
-                rows = np.concatenate(
-                    [np.arange(level.first[row], level.first[row + 1]) for row in split] or [rows[:0]]
-                )
+                rows = ranges(level.first[split], level.first[split + 1])
         places, moments, radii = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return places, moments, radii
 
     def winding_number(self, x: Float, center: Float, reach: float) -> Float:
         """Return the winding number, of shape (Q,), at x, of shape (Q, 3), within a box of half an edge `reach`."""
         return winding_number(x, *self.dipoles_for(center, reach))
+
+
+def ranges(first: Int, end: Int) -> Int:
+    """Return the numbers from each first one to before its end, one range after the other."""
+    counts = end - first
+    starts = np.cumsum(counts) - counts
+    numbers: Int = np.arange(int(counts.sum())) + np.repeat(first - starts, counts)
+    return numbers
 
 
 def _connected(codes: Codes, sums: Float) -> tuple[Codes, Float, Int]:

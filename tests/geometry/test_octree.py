@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnrecon.fit.blocks.tree import MORTON_BITS, morton_codes, octree_blocks
+from gnrecon.geometry.octree import MORTON_BITS, morton_codes, octree_blocks
 
 
 def interleaved(cell: tuple[int, int, int]) -> int:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnrecon.fit.blocks.block_parameters import BlockParameters
-from gnrecon.fit.blocks.tree import DipoleTree
+from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.signed_distance import Density, winding_number
 
 COUNT = 6000
@@ -30,7 +29,7 @@ def test_it_is_the_plain_sum_clear_of_the_points() -> None:
     inside = 0
     for center in centers:
         x = center + rng.uniform(-0.1, 0.1, (50, 3))
-        clear = np.linalg.norm(x[:, None] - points, axis=2).min(axis=1) > 3.5 * np.median(disks)
+        clear = np.linalg.norm(x[:, None] - points, axis=2).min(axis=1) > 1.5 * np.median(disks)
         plain = winding_number(x[clear], points, normals * (disks**2 / 4)[:, None], disks)
         found = tree.winding_number(x[clear], center, 0.1)
         assert found == pytest.approx(plain, abs=0.05)
@@ -42,7 +41,7 @@ def test_it_is_the_plain_sum_clear_of_the_points() -> None:
 def test_every_point_counts_once_and_few_terms_are_left() -> None:
     points, normals, disks = two_balls()
     tree = DipoleTree.of(points, normals, disks)
-    assert len(tree.levels[0].radii) <= BlockParameters.root_cubes
+    assert len(tree.levels[0].radii) <= 64
     for center in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 5.0, 5.0]):
         places, moments, radii = tree.dipoles_for(np.array(center), 0.05)
         assert (radii**2).sum() == pytest.approx((disks**2).sum())
@@ -56,3 +55,15 @@ def test_arrays_bring_it_back() -> None:
     again = DipoleTree.of_arrays(arrays.__getitem__, len(tree.levels))
     x = np.array([[0.1, 0.2, 0.0], [3.0, 0.0, 0.0]])
     assert again.winding_number(x, x[0], 0.0).tolist() == tree.winding_number(x, x[0], 0.0).tolist()
+
+
+def tree(**limits: float) -> DipoleTree:
+    rng = np.random.default_rng(0)
+    normals = rng.standard_normal((2000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return DipoleTree.of(normals, normals, np.full(2000, 0.05), **limits)
+
+
+def test_its_cubes_are_by_its_parameters() -> None:
+    assert len(tree(root_cubes=8).levels[0].radii) <= 8 < len(tree().levels[0].radii) <= 64
+    assert len(tree(leaf_side_radii=8.0).levels[-1].radii) < len(tree().levels[-1].radii)
