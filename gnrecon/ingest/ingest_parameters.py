@@ -71,8 +71,10 @@ class OrientationParameters:
     smooth_neighbours: int = 24  # and in a second attempt: steadier in noise
     off_plane_penalty: float = 2.0  # in the second attempt, against edges of the tree that leave the plane
     gauss_points: int = 2000  # at most, in the dense system of Gauss's formula, a matrix of 96 MB
-    consistent_points: int = 4000  # at most, in the refinement, which needs matrices of 64 MB
+    consistent_points: int = 6000  # at most, in the refinement, which needs two matrices of 144 MB
     most_disorder: float = 0.25  # of the winding number, above which signs are doubtful in places, or the scan is open
+    closed_outwardness: float = 0.75  # from which on normals are those of a closed surface; half a sphere has 0.6
+    closed_ratio: float = 1.1  # of disorders, and of outwardness, up to which signs by winding number are then taken
     better_disorder_ratio: float = 0.8  # that the global methods must reach against propagation to replace it
     most_conflicting: float = 0.003  # share of pairs of neighbours, see `Agreement`: 0.005 to 0.09 for signs by winding
     # number in open scenes, where propagation has up to 0.002

@@ -9,10 +9,11 @@ of the scanner is known, the line of sight decides (`orient_towards_scanner`). O
   number (`consistent_normals`): right for sparse closed clouds, thin walls included, and outward by construction; used
   on up to a few thousand points, from which the others take their sign.
 
-The winding number of the result (`winding_at_points`) measures the confidence. It decides between them only where
-neighbours do not contradict it: in an open scene, such as objects on a ground, normals of changing signs may have a
-winding number nearer to that of a closed surface than the right ones. Signs that change within a sheet show: the
-neighbours that face the other way lie in front of a point as often as behind it (`Agreement`).
+The winding number of the result (`winding_at_points`) measures the confidence. Where it is that of a closed surface
+with both, the second way is taken. Otherwise it decides only where neighbours do not contradict it: in an open scene,
+such as objects on a ground, normals of changing signs may have a winding number nearer to that of a closed surface than
+the right ones. Signs that change within a sheet show: the neighbours that face the other way lie in front of a point as
+often as behind it (`Agreement`).
 """
 
 from __future__ import annotations
@@ -129,6 +130,14 @@ def _by_shape(points: Float, axes: Float, free: bool, parameters: IngestParamete
     second = propagate_orientation(points, axes, smooth, limits.off_plane_penalty)
     normals, disorder, own = _propagated(points, normals, second, limits)
     others = by_winding or _by_winding(points, axes, free, parameters)
+    outward = outwardness(points, normals)
+    if outward >= limits.closed_outwardness:
+        # Noise and thin legs raise the disorder and the conflicts of right signs as of wrong ones; on closed surfaces
+        # the winding number has fewer wrong signs than any propagation, unless it divides a thick layer of points.
+        refined, ratio = winding_disorder(points, others[-1]), limits.closed_ratio
+        if refined <= ratio * disorder and ratio * outwardness(points, others[-1]) >= outward:
+            return others[-1], refined
+        return normals, disorder
     third, other = min(((found, winding_disorder(points, found)) for found in others), key=_disorder)
     agreement = agreement_of(points, third)
     allowed = agreement.shows_walls() or agreement.conflicting < own.conflicting - limits.most_conflicting

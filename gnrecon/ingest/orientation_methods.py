@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.ingest.point_spacing import mean_distances
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
 
 
@@ -247,16 +248,20 @@ def consistent_normals(points: Float, normals: Float, *, width_spacings: float =
 class _Winding:
     """w(p_i) = sum_j G_ij (p_j - p_i) . mu_j, with G_ij = 1 / (4 pi max(|p_j - p_i|, width_i)^3)."""
 
-    def __init__(self, points: Single, widths: Single) -> None:
+    def __init__(self, points: Single, widths: Single, *, chunk_rows: int = 256) -> None:
         from scipy.spatial.distance import cdist
 
-        distances = cdist(points, points).astype(np.float32)
-        bounded = np.maximum(distances, widths[:, None])
         self._points = points
-        square = bounded * bounded
-        self._kernel = 1 / (np.float32(4 * np.pi) * bounded * square)
-        # Within the width the kernel is constant and its slope is zero.
-        self._slope = np.where(distances < widths[:, None], np.float32(0), 3 * self._kernel / square)
+        self._kernel = np.empty((len(points), len(points)), np.float32)
+        self._slope = np.empty_like(self._kernel)
+        # Row by row, because distances in double precision and their powers would take five times the memory.
+        for rows in slices(len(points), chunk_rows):
+            distances = cdist(points[rows], points).astype(np.float32)
+            bounded = np.maximum(distances, widths[rows, None])
+            square = bounded * bounded
+            self._kernel[rows] = 1 / (np.float32(4 * np.pi) * bounded * square)
+            # Within the width the kernel is constant and its slope is zero.
+            self._slope[rows] = np.where(distances < widths[rows, None], np.float32(0), 3 * self._kernel[rows] / square)
 
     def at_points(self, mu: Single) -> Single:
         """Return w, of shape (N,)."""
