@@ -120,14 +120,19 @@ def _with_unit_normals(cloud: PointCloud) -> tuple[PointCloud, int]:
     """Return the points that have a normal, of unit length, and the number of others; or all points without normals."""
     if cloud.normals is None:
         return cloud, 0
-    # Scaled by the largest component first, so that squares of tiny or huge normals do not under- or overflow.
-    largest = np.abs(cloud.normals).max(axis=1, initial=0.0)
-    usable = np.isfinite(largest) & (largest > 0)
+    usable, directions = unit_normals(cloud.normals)
     if 2 * usable.sum() < len(cloud):
         return cloud.with_normals(None), 0
-    kept = cloud.select(usable)
-    scaled = cloud.normals[usable] / largest[usable, None]
-    return kept.with_normals(scaled / np.linalg.norm(scaled, axis=1, keepdims=True)), int((~usable).sum())
+    return cloud.select(usable).with_normals(directions), int((~usable).sum())
+
+
+def unit_normals(normals: Float) -> tuple[Mask, Float]:
+    """Return which normals, of shape (N, 3), are neither zero nor broken, and these at unit length, of shape (M, 3)."""
+    # Scaled by the largest component first, so that squares of tiny or huge normals do not under- or overflow.
+    largest = np.abs(normals).max(axis=1, initial=0.0)
+    usable = np.isfinite(largest) & (largest > 0)
+    scaled = normals[usable] / largest[usable, None]
+    return usable, scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
 
 
 def _centred(cloud: PointCloud) -> Float:

@@ -219,7 +219,9 @@ Single = npt.NDArray[np.float32]
 # Number Normal Consistency* (ACM TOG 2024).
 
 
-def consistent_normals(points: Float, normals: Float, *, width_spacings: float = 0.75, rounds: int = 10) -> Float:
+def consistent_normals(
+    points: Float, normals: Float, *, width_spacings: float = 0.75, least_width: float = 1e-5, rounds: int = 10
+) -> Float:
     """Return outward unit normals, of shape (N, 3).
 
     Parameters
@@ -228,20 +230,28 @@ def consistent_normals(points: Float, normals: Float, *, width_spacings: float =
     normals : array of shape (N, 3), of unit length, a first guess, such as that of `gauss_normals`
     width_spacings : width of the kernel at a point, in mean distances to its neighbours; below 1, so that the other
         sheet of a thin wall is not smoothed away
+    least_width : of the kernel, in extents of the cloud; squares of its values would overflow float32 below 1e-6
     rounds : number of iterations
     """
     scaled = points / np.abs(points).max()
     apart, count = mean_distances(scaled)
-    field = _Winding(scaled.astype(np.float32), (width_spacings * apart).astype(np.float32))
+    widths = np.maximum(width_spacings * apart, least_width)
+    field = _Winding(scaled.astype(np.float32), widths.astype(np.float32))
     mu = (normals * (np.pi / count * apart**2)[:, None]).astype(np.float32)
     for _ in range(rounds):
         downhill = field.transposed(0.5 - field.at_points(mu))
         change = field.at_points(downhill)
-        mu = mu + (downhill**2).sum() / max(float((change**2).sum()), 1e-30) * downhill
+        mu = mu + np.float32(_square_sum(downhill) / max(_square_sum(change), 1e-30)) * downhill
         steepest = field.descent(mu)
         mu = np.linalg.norm(mu, axis=1, keepdims=True) * _unit(steepest)
     refined = mu.astype(np.float64)
-    return np.asarray(refined / np.linalg.norm(refined, axis=1, keepdims=True))
+    lengths = np.maximum(np.linalg.norm(refined, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return np.asarray(refined / lengths)
+
+
+def _square_sum(values: Single) -> float:
+    """Return the sum of squares, which overflows single precision where points lie close together."""
+    return float(np.square(values, dtype=np.float64).sum())
 
 
 class _Winding:

@@ -15,7 +15,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.local_pca import principal_sums, tangent_coordinates
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.clean import usable_positions
+from gnrecon.ingest.clean import unit_normals, usable_positions
 from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise
@@ -119,7 +119,9 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
     )
 
 
-def is_single_sheet(points: Float, normals: Float, *, least_facing_share: float = 0.97) -> bool:
+def is_single_sheet(
+    points: Float, normals: Float, *, least_facing_share: float = 0.97, least_points: int = 100
+) -> bool:
     """Return whether a scan is a single sheet that was seen from one side, such as terrain, a relief or a wall.
 
     Its winding number is that of an open surface, without an inside, and nearly all normals are within 90 degrees of
@@ -129,7 +131,10 @@ def is_single_sheet(points: Float, normals: Float, *, least_facing_share: float 
     ----------
     points, normals : arrays of shape (N, 3), outward unit normals
     least_facing_share : of the normals within 90 degrees of the mean
+    least_points : fewer may be those of anything, so that the closed surface is the simplest
     """
+    if len(points) < least_points:
+        return False
     facing = float((normals @ normals.mean(axis=0) > 0).mean())
     return facing >= least_facing_share and is_open(outwardness(points - points.mean(axis=0), normals))
 
@@ -235,13 +240,14 @@ def _border_share(points: Float, limits: SurveyParameters) -> float:
 
 def _state(points: Float, normals: Float, limits: SurveyParameters) -> str:
     """Return the most severe defect of the normals, or ``"good"``."""
-    lengths = np.linalg.norm(normals, axis=1)
-    usable = np.isfinite(lengths) & (lengths > 0)
+    usable, directions = unit_normals(normals)
     if 2 * usable.sum() < len(normals):
         return "zero"
-    points, directions = points[usable], normals[usable] / lengths[usable, None]
+    points = points[usable]
     if are_inconsistent(points, directions):
         return "inconsistent"
     if flip_if_inward(points, directions)[1]:
         return "inward"
-    return "good" if (np.abs(lengths[usable] - 1) < limits.length_tolerance).all() else "unnormalised"
+    # Clipped, so that squares do not overflow; what was longer still is longer than 1.
+    lengths = np.linalg.norm(np.clip(normals[usable], -2.0, 2.0), axis=1)
+    return "good" if (np.abs(lengths - 1) < limits.length_tolerance).all() else "unnormalised"

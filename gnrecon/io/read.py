@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -137,7 +139,9 @@ def input_errors_for(path: Path) -> Iterator[None]:
     """Turn every failure to read a file into an error of one sentence that begins with the file's name."""
     name = "standard input" if is_standard_input(path) else path
     try:
-        yield
+        # Damaged bytes are any numbers; those that cannot be computed with are dropped and counted later.
+        with np.errstate(all="ignore"):
+            yield
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     except MemoryLimitError:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -94,6 +95,10 @@ def work(argument: dict[str, Any]) -> int:
     """Run the command line in a forked process, and return its exit code."""
     from gnrecon.cli.app import main
 
+    # The command line hides them from its users; those of the library would see them.
+    sys.warnoptions.append("default::RuntimeWarning")
+    warnings.simplefilter("ignore")
+    warnings.simplefilter("default", RuntimeWarning)
     try:
         main(argument["words"])
     except SystemExit as end:
