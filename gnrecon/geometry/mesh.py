@@ -131,7 +131,8 @@ class Mesh:
         # Damaged files hold vertices of any size: a face whose products overflow, or are lost, has no direction.
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             for corner, added in enumerate(additions):
-                np.add.at(sums, self.faces[:, corner], np.where(np.isfinite(added).all(axis=1, keepdims=True), added, 0.0))
+                finite = np.isfinite(added).all(axis=1, keepdims=True)
+                np.add.at(sums, self.faces[:, corner], np.where(finite, added, 0.0))
             lengths = np.linalg.norm(sums, axis=1, keepdims=True)
             sums /= np.maximum(lengths, np.finfo(np.float64).tiny)
         return np.where(np.isfinite(lengths), sums, 0.0)

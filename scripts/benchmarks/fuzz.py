@@ -3,8 +3,8 @@
 Foreseen are a verified mesh and one sentence with an exit code of its own. Exit code 1, a signal, a run that takes too
 long or too much memory, a traceback, a warning of a library, a file that a failed run leaves, and a mesh that trimesh
 does not find watertight are faults: they are listed, and their scans are kept with ``--keep``. A fault is made again by
-``--first NUMBER --count 1`` with the same seed; Ctrl-C reports the runs so far. One run in ten is killed at a random moment; its mesh must be whole or
-absent.
+``--first NUMBER --count 1`` with the same seed; Ctrl-C reports the runs so far. One run in ten is killed at a random
+moment; its mesh must be whole or absent.
 """
 
 from __future__ import annotations
