@@ -37,18 +37,23 @@ def continue_in_child(memory_mb: float | None = None) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     ended, ending = os.pipe()
+    # A signal that comes before the parent can pass it on waits until it can.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
     parent, child = os.getpid(), os.fork()
     if child == 0:
         os.close(ended)
         die_with_parent(parent)
         atexit.register(os.write, ending, b".")  # an exit by native code does not get there
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return
     os.close(ending)
-    raise SystemExit(_Waiting(child, ended, memory_mb).exit_code())
+    waiting = _Waiting(child, ended, memory_mb)
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    raise SystemExit(waiting.exit_code())
 
 
 class _Waiting:
-    """Waits for a child.
+    """Waits for a child, to which it passes signals on from its creation.
 
     Parameters
     ----------
@@ -59,12 +64,12 @@ class _Waiting:
 
     def __init__(self, child: int, ended: int, memory_mb: float | None) -> None:
         self._child, self._ended, self._memory_mb = child, ended, memory_mb
-
-    def exit_code(self, *, poll_seconds: float = 0.05) -> int:
-        """Wait, and return the exit code of this process; an end for lack of memory is printed."""
         for number in PASSED_ON:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._pass_on)
+
+    def exit_code(self, *, poll_seconds: float = 0.05) -> int:
+        """Wait, and return the exit code of this process; an end for lack of memory is printed."""
         while True:
             pid, status = os.waitpid(self._child, os.WNOHANG)
             if pid:
