@@ -46,7 +46,7 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
         When the limit of the shell leaves less than `least_addresses_mb`.
     """
     jobs = plan(request)
-    require_room_for_libraries(least_addresses_mb)
+    require_room_for_libraries(least_addresses_mb, in_new_process=True)
     devices = cuda_devices(jobs)
     threads = max(int(job.options["threads"]) for job in jobs)
     console, start = Console(stderr=True, quiet=request.quiet), time.monotonic()

@@ -53,19 +53,20 @@ def require_memory(needed_mb: float, *, thread_addresses_mb: float = 72.0) -> No
             )
 
 
-def require_room_for_libraries(least_mb: float) -> None:
+def require_room_for_libraries(least_mb: float, *, in_new_process: bool = False) -> None:
     """Refuse to import the numerical libraries under a limit in which they abort or wait for ever.
 
     Parameters
     ----------
     least_mb : addresses that they and their first buffers take, in MB of 10^6 bytes
+    in_new_process : whether a process that is still to be started imports them, so that this one's use does not count
 
     Raises
     ------
     MemoryLimitError
         When the limit is lower.
     """
-    for budget in _shell_budgets():
+    for budget in _shell_budgets(unused=in_new_process):
         if budget.mb < least_mb:
             raise MemoryLimitError(
                 f"The libraries of a run take {least_mb:,.0f} MB of addresses, and {budget.limit} leaves "
@@ -102,12 +103,13 @@ def _budgets() -> Iterator[Budget]:
     yield Budget(free / 1e6, "this machine")
 
 
-def _shell_budgets() -> Iterator[Budget]:
+def _shell_budgets(*, unused: bool = False) -> Iterator[Budget]:
     limits = ((resource.RLIMIT_AS, "VmSize", "v"), (resource.RLIMIT_DATA, "VmData", "d"))
     for number, name, letter in limits:
         soft, used = resource.getrlimit(number)[0], status_bytes(name)
         if soft != resource.RLIM_INFINITY and used is not None:
-            yield Budget(max(0.0, (soft - used) / 1e6), f"the limit of the shell (ulimit -{letter})", addresses=True)
+            left = soft if unused else max(0, soft - used)
+            yield Budget(left / 1e6, f"the limit of the shell (ulimit -{letter})", addresses=True)
 
 
 def _group_budgets(*, groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> Iterator[Budget]:

@@ -40,6 +40,7 @@ def test_limits_of_the_shell(monkeypatch: pytest.MonkeyPatch, number: int, lette
     with pytest.raises(MemoryLimitError, match=rf"take 1,000 MB of addresses, and the limit.*ulimit -{letter}"):
         require_room_for_libraries(1000.0)
     require_room_for_libraries(100.0)
+    require_room_for_libraries((most - 1) / 1e6, in_new_process=True)
 
 
 def test_threads_reserve_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
