@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
@@ -57,7 +57,7 @@ def clean(
     finite = usable_positions(cloud.points)
     cloud, counts = cloud.select(finite), replace(counts, non_finite=int((~finite).sum()))
     cloud, dropped = _with_unit_normals(cloud)
-    _, first = np.unique(cloud.points, axis=0, return_index=True)
+    first = distinct_positions(cloud.points)
     counts = replace(counts, zero_normals=dropped, duplicates=len(cloud) - len(first))
     cloud = cloud.select(np.sort(first))
     _require_points(cloud, counts, parameters.least_points)
@@ -114,6 +114,15 @@ def usable_positions(
         raise InputError(f"The points extend over {extent} file units, which cannot be computed with; scale the scan.")
     usable[usable] = away / spread <= most_spreads / 4
     return usable
+
+
+def distinct_positions(points: Float) -> Int:
+    """Return the first row, of shape (M,), of each position of finite points, of shape (N, 3), N > 0; sorted by it.
+
+    Positions count relative to the mean, as in all that follows: what coincides there cannot be told apart.
+    """
+    first: Int = np.unique(points - points.mean(axis=0), axis=0, return_index=True)[1]
+    return first
 
 
 def _with_unit_normals(cloud: PointCloud) -> tuple[PointCloud, int]:

@@ -15,7 +15,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.local_pca import principal_sums, tangent_coordinates
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.clean import unit_normals, usable_positions
+from gnrecon.ingest.clean import distinct_positions, unit_normals, usable_positions
 from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise
@@ -85,12 +85,14 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
     """
     limits = parameters.survey
     finite = usable_positions(cloud.points)
-    points, first = np.unique(cloud.points[finite], axis=0, return_index=True)
-    if len(points) <= min(limits.border_neighbours):
+    if finite.sum() <= min(limits.border_neighbours):
         return None
-    rows = np.flatnonzero(finite)[first]
+    rows = np.flatnonzero(finite)[distinct_positions(cloud.points[finite])]
+    points = cloud.points[rows]
     distinct, repeated = len(points), repeated_points(points - points.mean(axis=0))
     points, rows = points[~repeated], rows[~repeated]
+    if len(points) <= min(limits.border_neighbours):
+        return None
     chosen = np.random.default_rng(0).permutation(len(rows))[: limits.points]
     centred = points - points.mean(axis=0)
     nearest, area = _spacings(centred, chosen, limits.density_neighbour)
@@ -109,7 +111,7 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
         spacing=spacing,
         spacing_p5=float(np.percentile(nearest, 5)),
         spacing_p95=float(np.percentile(nearest, 95)),
-        density_variation=float(np.percentile(area, 95) / np.percentile(area, 5)),
+        density_variation=_ratio(area),
         noise=noise.deviation,
         noise_limit=noise.limit,
         normals="missing" if cloud.normals is None else _state(centred, cloud.normals[rows], limits),
@@ -222,6 +224,12 @@ def _spacings(points: Float, chosen: Int, neighbour: int) -> tuple[Float, Float]
 
     distances = cKDTree(points).query(points[chosen], neighbour + 1)[0]
     return distances[:, 1], distances[:, -1] ** 2
+
+
+def _ratio(values: Float) -> float:
+    """Return the ratio of the 95th to the 5th percentile of positive values, of which squares may have underflown."""
+    low, high = np.maximum(np.percentile(values / values.max(), [5, 95]), np.finfo(np.float64).tiny)
+    return float(high / low)
 
 
 def _border_share(points: Float, limits: SurveyParameters) -> float:
