@@ -117,11 +117,12 @@ def usable_positions(
 
 
 def distinct_positions(points: Float) -> Int:
-    """Return the first row, of shape (M,), of each position of finite points, of shape (N, 3), N > 0; sorted by it.
+    """Return the first row, of shape (M,), of each position of finite points, of shape (N, 3); sorted by position.
 
     Positions count relative to the mean, as in all that follows: what coincides there cannot be told apart.
     """
-    first: Int = np.unique(points - points.mean(axis=0), axis=0, return_index=True)[1]
+    middle = points.mean(axis=0) if len(points) else 0.0
+    first: Int = np.unique(points - middle, axis=0, return_index=True)[1]
     return first
 
 
