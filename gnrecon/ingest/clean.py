@@ -119,7 +119,7 @@ def usable_positions(
 def distinct_positions(points: Float) -> Int:
     """Return the first row, of shape (M,), of each position of finite points, of shape (N, 3); sorted by position.
 
-    Positions count relative to the mean, as in all that follows: what coincides there cannot be told apart.
+    Positions count relative to the mean, as in all that follows: what coincides there is one position.
     """
     middle = points.mean(axis=0) if len(points) else 0.0
     first: Int = np.unique(points - middle, axis=0, return_index=True)[1]
