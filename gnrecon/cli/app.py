@@ -109,7 +109,8 @@ def _guarded(words: list[str], command: str, *, least_mb: float = 1000.0, least_
     least_mb, least_light_mb : addresses that the libraries of commands take (measured: 750 and 215), and some work
     """
     try:
-        require_room_for_libraries(least_light_mb if words[0] in LIGHT_COMMANDS else least_mb)
+        light = not words or words[0] in LIGHT_COMMANDS
+        require_room_for_libraries(least_light_mb if light else least_mb)
         result: Any = command_line_app()(words, prog_name="gnrecon", standalone_mode=False, obj=command)
         # Newer versions of typer turn Ctrl-C into this value silently; `run` and `run_batch` raise SystemExit.
         if result == ExitCode.INTERRUPTED:
