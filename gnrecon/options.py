@@ -206,6 +206,7 @@ class Options(OptionTable):
             With the least length.
         """
         x, y, z = np.ptp(bounds, axis=0)
+        self.mesh().cells(bounds)  # refuses an edge length for which there would be too many
         if self.remesh is not None:
             # Faces of an equilateral mesh have an area of sqrt(3) / 4 of their squared edge.
             least = math.sqrt(2 * (x * y + y * z + z * x) / (most_faces * math.sqrt(3) / 4))

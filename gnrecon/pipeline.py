@@ -58,6 +58,7 @@ from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan
 from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
+from gnrecon.runtime.memory_budget import require_memory
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import AttributeSources, compute_attributes, requested_names, without_unsupported
 
@@ -271,15 +272,14 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals))
-    bounds = bounds_of(samples)
-    run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
-    run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    bounds, points = bounds_of(samples), samples.frame.to_world(samples.points)
+    run.options = run.options.for_scan(points, bounds)
     run.options.require_reachable(bounds)
     if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
+        require_memory(expected.memory_mb)
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
-    warnings = [] if ingested.layers is None else [ingested.layers.describe()]
-    few = few_points_remark(samples.frame.to_world(samples.points))
-    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings, *few])
+    layers = [] if ingested.layers is None else [ingested.layers.describe()]
+    run.remark([*scan.reading.remarks(), *counts.remarks(), *layers, *few_points_remark(points)])
     return ingested
 
 

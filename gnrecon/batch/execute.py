@@ -7,8 +7,10 @@ files hashed and recorded, and then moved to their final names, so that a killed
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
+import signal
 import tempfile
 import threading
 import time
@@ -42,6 +44,7 @@ from gnrecon.batch.job import (
 )
 from gnrecon.runtime.errors import ExitCode, GnreconError, OutputError, failure
 from gnrecon.runtime.files import sync
+from gnrecon.runtime.memory_budget import is_capped, kills_for_memory
 
 
 def run_job(
@@ -301,6 +304,7 @@ def _run_child_once(
     poll_seconds: float = 0.1,
 ) -> ChildEnd:
     """Run work in one child; limits are checked every `poll_seconds`, often enough for memory that grows quickly."""
+    kills = kills_for_memory()
     with start_child(threads, argument, log, environment, work) as child:
         start, peak, monitor = time.monotonic(), 0.0, MemoryMonitor(child.pid)
         while (status := child.wait(poll_seconds)) is None:
@@ -316,7 +320,36 @@ def _run_child_once(
                 return _killed(child, ChildEnd(Cause.TIMEOUT, None, sentence, peak, seconds))
         seconds = round(time.monotonic() - start, 3)
     message = describe_signal(-status) if status < 0 else ""
+    if _died_for_memory(status, log, kills):
+        sentence = f"Its memory ran out in native code, which ended it by {_end(status)}."
+        return ChildEnd(Cause.MEMORY, ExitCode.MEMORY, sentence, peak, seconds)
     return ChildEnd(cause_of(status), status, message, peak, seconds)
+
+
+def _died_for_memory(status: int, log: Path, kills: int, *, last_bytes: int = 20_000) -> bool:
+    """Whether a child ended, outside of Python, because it got no memory.
+
+    Parameters
+    ----------
+    status : its exit code, or negative signal
+    log : its output, in which native code says so
+    kills : `kills_for_memory` before its start
+    """
+    if status == -signal.SIGKILL:
+        return kills_for_memory() > kills
+    if status not in (-signal.SIGABRT, -signal.SIGSEGV, -signal.SIGBUS, ExitCode.UNFORESEEN):
+        return False
+    with suppress(OSError), log.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - last_bytes))
+        last = file.read()
+        # C++, OpenMP and OpenBLAS; what Python has seen has an exit code and a sentence.
+        words = (b"bad_alloc", b"annot allocate memory", b"ut of memory", b"Memory allocation", b"malloc failed")
+        return (is_capped() and status < 0) or (b"\ngnrecon: " not in last and any(word in last for word in words))
+    return False
+
+
+def _end(status: int) -> str:
+    return signal.Signals(-status).name if status < 0 else f"exit code {status}"
 
 
 def _killed(child: ForkedChild, end: ChildEnd, *, wait_seconds: float = 5.0) -> ChildEnd:

@@ -19,7 +19,6 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-import psutil
 
 from gnrecon.batch.child_process import close_fork_servers
 from gnrecon.batch.execute import run_job
@@ -28,6 +27,7 @@ from gnrecon.options import Options
 from gnrecon.report.estimate import estimate
 from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.memory_budget import available_memory_mb
 
 
 def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: Callable[[JobOutcome], None]) -> None:
@@ -215,14 +215,6 @@ def available_cores() -> int:
         quota, period = _read_cgroup("cpu.max").split()
         cores = min(cores, max(1, int(quota) // int(period)))
     return cores
-
-
-def available_memory_mb() -> float:
-    """Return the free memory, in MB of 10^6 bytes, within the limit of the control group."""
-    free = int(psutil.virtual_memory().available)
-    with suppress(OSError, ValueError):
-        free = min(free, int(_read_cgroup("memory.max")) - int(_read_cgroup("memory.current")))
-    return free / 1e6
 
 
 def _read_cgroup(name: str) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from gnrecon.batch.job import Job, Limits
@@ -13,6 +12,7 @@ from gnrecon.config import settings_text
 from gnrecon.io import all_input_files
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.typed_values import parse_megabytes, parse_seconds
 
 
 def plan(request: Request) -> list[Job]:
@@ -74,35 +74,3 @@ def _require_distinct_from_inputs(jobs: Sequence[Job], others: Sequence[Path]) -
         for name in job.file_names().values():
             if (job.output / name).resolve() in inputs:
                 raise UsageError(f"{job.output / name} is an input of the batch; choose another folder for the meshes.")
-
-
-def parse_seconds(text: str) -> float:
-    """Return a positive time in seconds, from text such as ``90``, ``30s``, ``10m`` or ``1.5h``.
-
-    Raises
-    ------
-    UsageError
-        When the text is not such a time.
-    """
-    units = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-    return _quantity(text, units, "a time such as 90, 30s, 10m or 2h")
-
-
-def parse_megabytes(text: str) -> float:
-    """Return a positive amount of memory in MB of 10^6 bytes, from text such as ``800MB`` or ``4GB``.
-
-    Raises
-    ------
-    UsageError
-        When the text is not such an amount.
-    """
-    units = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6, "kib": 2**10 / 1e6, "mib": 2**20 / 1e6, "gib": 2**30 / 1e6}
-    return _quantity(text, units, "an amount of memory such as 800MB, 4GB or 2GiB")
-
-
-def _quantity(text: str, units: Mapping[str, float], expected: str) -> float:
-    match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([a-z]*)\s*", text, re.IGNORECASE)
-    unit = None if match is None else units.get(match[2].lower())
-    if match is None or unit is None or float(match[1]) <= 0:
-        raise UsageError(f"{text!r} is not {expected}.")
-    return float(match[1]) * unit

@@ -30,8 +30,10 @@ from gnrecon.cli.learn_command import learn_command
 from gnrecon.cli.mesh_command import mesh_command
 from gnrecon.cli.reconstruct_command import reconstruct_command
 from gnrecon.cli.streams import lenient_streams
+from gnrecon.cli.supervision import continue_in_child
 from gnrecon.runtime.errors import ExitCode, failure
 from gnrecon.runtime.interrupts import polite_ends
+from gnrecon.runtime.memory_budget import is_capped, require_room_for_libraries
 from gnrecon.version import __version__
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -46,6 +48,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor_command,
     "schema": schema_command,
 }
+
+LIGHT_COMMANDS = ("--help", "--help-all", "check", "convert", "doctor", "schema")
+"""Words of commands that load no torch and no open3d."""
 
 
 def command_line_app() -> typer.Typer:
@@ -68,6 +73,8 @@ def command_line_app() -> typer.Typer:
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
     with lenient_streams() as streams, polite_ends():
+        if is_capped():
+            continue_in_child()
         code = streams.exit_code(_run(list(sys.argv[1:] if arguments is None else arguments)))
     sys.exit(code)
 
@@ -92,9 +99,18 @@ def _run(words: list[str]) -> int:
         return end.code if isinstance(end.code, int) else ExitCode.OK if end.code is None else ExitCode.UNFORESEEN
 
 
-def _guarded(words: list[str], command: str) -> int:
-    """Run the arguments and turn every failure into a sentence and an exit code; `command` is what was typed."""
+def _guarded(words: list[str], command: str, *, least_mb: float = 1000.0, least_light_mb: float = 300.0) -> int:
+    """Run the arguments and turn every failure into a sentence and an exit code.
+
+    Parameters
+    ----------
+    words : arguments
+    command : what was typed
+    least_mb, least_light_mb : addresses that the libraries of commands take (measured: 750 and 215), and some work
+    """
     try:
+        light = not words or words[0] in LIGHT_COMMANDS
+        require_room_for_libraries(least_light_mb if light else least_mb)
         result: Any = command_line_app()(words, prog_name="gnrecon", standalone_mode=False, obj=command)
         # Newer versions of typer turn Ctrl-C into this value silently; `run` and `run_batch` raise SystemExit.
         if result == ExitCode.INTERRUPTED:

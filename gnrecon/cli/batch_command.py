@@ -9,7 +9,14 @@ import typer
 
 from gnrecon.cli.command_classes import HelpAllOption
 from gnrecon.cli.option_parameters import given_options, with_table_options
-from gnrecon.cli.shared_parameters import ConfigOption, DebugOption, OverwriteOption, QuietOption, SetOption
+from gnrecon.cli.shared_parameters import (
+    ConfigOption,
+    DebugOption,
+    MemoryOption,
+    OverwriteOption,
+    QuietOption,
+    SetOption,
+)
 from gnrecon.option_table import Panel
 
 OutputOption = Annotated[
@@ -45,10 +52,6 @@ JobsOption = Annotated[
 TimeoutOption = Annotated[
     str | None,
     typer.Option(metavar="TIME", help="Time limit for a scan: 90, 10m, 2h.", rich_help_panel=Panel.BATCH),
-]
-MemoryOption = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Limit of resident memory for a scan: 800MB, 4GB.", rich_help_panel=Panel.BATCH),
 ]
 RetryOption = Annotated[
     int,

@@ -13,12 +13,15 @@ from gnrecon.cli.shared_parameters import (
     ConfigOption,
     DebugOption,
     FormatOption,
+    MemoryOption,
     OutputOption,
     OverwriteOption,
     QuietOption,
     SetOption,
 )
+from gnrecon.cli.supervision import continue_in_child
 from gnrecon.option_table import Panel
+from gnrecon.runtime.typed_values import parse_megabytes
 
 ScansArgument = Annotated[
     list[Path],
@@ -93,6 +96,7 @@ def reconstruct_command(
     words: SetOption = None,
     save_config: SaveConfigOption = None,
     log: LogOption = None,
+    memory: MemoryOption = None,
     dry_run: DryRunOption = False,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
@@ -106,7 +110,9 @@ def reconstruct_command(
     from gnrecon.run import Files, run
 
     del help_all, debug  # `main` reads it from the arguments, because it handles failures
-    settings = read_settings(config, words or (), given_options(context, options))
+    given = given_options(context, options) | ({} if memory is None else {"memory": memory})
+    settings = read_settings(config, words or (), given)
+    limit_mb = None if (limit := settings.of(scans[0]).get("memory")) is None else parse_megabytes(limit)
     chosen, named_reference = settings.for_single_run(scans[0])
     files = Files(
         tuple(scans),
@@ -126,4 +132,6 @@ def reconstruct_command(
 
         files.check()
         raise SystemExit(info(scans, chosen, format))
+    if limit_mb is not None:
+        continue_in_child(limit_mb)
     raise SystemExit(run(files, chosen, command=context.obj, quiet=quiet, verbose=verbose, log=log))

@@ -53,3 +53,7 @@ QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="Print failures
 DebugOption = Annotated[
     bool, typer.Option("--debug", help="Print a traceback on failure.", rich_help_panel=Panel.OUTPUT)
 ]
+MemoryOption = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE", help="Limit of resident memory for a scan: 800MB, 4GB.", rich_help_panel=Panel.FIT),
+]

@@ -91,19 +91,25 @@ class Partition:
         rows, numbers = np.nonzero(inside)
         return own[rows] + subsets[numbers] * neighbour[rows], rows
 
-    def pairs_of_boxes(self, low: Float, high: Float) -> tuple[Int, Int]:
+    def pairs_of_boxes(self, low: Float, high: Float, known: Int) -> tuple[Int, Int]:
         """Return every pair of a cube's key, of shape (P, 3), and a row of a box that it intersects, of shape (P,).
 
         Parameters
         ----------
         low, high : arrays of shape (N, 3)
             Corners of the boxes.
+        known : array of shape (B, 3)
+            Keys of which all must be among the pairs; others may be missing.
         """
         first, last = (
             turn((x - self.origin) / self.cell - 0.5 + sign * (1.0 + self.overlap) / 2).astype(np.int64)
             for turn, x, sign in ((np.ceil, low, -1.0), (np.floor, high, 1.0))
         )
         most = int((last - first).max(initial=0)) + 1
+        if most**3 > len(known):
+            # Boxes far larger than the cubes, as where two dense parts are far apart, hold fewer cubes than cells.
+            rows, which = np.nonzero(((first[:, None] <= known) & (known <= last[:, None])).all(axis=2))
+            return known[which], rows
         steps = np.array(list(itertools.product(range(most), repeat=3)))
         keys = first[:, None] + steps
         rows, which = np.nonzero((keys <= last[:, None]).all(axis=2))
@@ -263,7 +269,7 @@ class Detail:
 
     def _blend_around(self, x: Float, offsets: Float) -> Float:
         """Return the result of `value_around` for one batch of centres, with all of their cubes."""
-        keys, rows = self.partition.pairs_of_boxes(x + offsets.min(axis=0), x + offsets.max(axis=0))
+        keys, rows = self.partition.pairs_of_boxes(x + offsets.min(axis=0), x + offsets.max(axis=0), self.keys)
         cubes = self._cubes(keys)
         by_cube = np.flatnonzero(cubes >= 0)
         by_cube = by_cube[np.argsort(cubes[by_cube], kind="stable")]

@@ -128,10 +128,14 @@ class Mesh:
     def _directions(self, additions: Sequence[Float]) -> Float:
         """Return unit sums at the vertices of the vectors, (F, 3) each, of first, second and third corners of faces."""
         sums = np.zeros_like(self.vertices)
-        for corner, added in enumerate(additions):
-            np.add.at(sums, self.faces[:, corner], added)
-        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        return sums
+        # Damaged files hold vertices of any size: a face whose products overflow, or are lost, has no direction.
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            for corner, added in enumerate(additions):
+                finite = np.isfinite(added).all(axis=1, keepdims=True)
+                np.add.at(sums, self.faces[:, corner], np.where(finite, added, 0.0))
+            lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+            sums /= np.maximum(lengths, np.finfo(np.float64).tiny)
+        return np.where(np.isfinite(lengths), sums, 0.0)
 
     def with_vertices(self, vertices: Float) -> Mesh:
         """Return the same faces, normals and attributes over moved vertices, of shape (V, 3)."""
@@ -145,5 +149,7 @@ class Mesh:
 def area_vectors(vertices: Float, faces: Int) -> Float:
     """Area vectors, of shape (F, 3), of faces of shape (F, 3): along the normal, with the area as length."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    vectors: Float = 0.5 * np.cross(b - a, c - a)
+    # Vertices of damaged files may be of any size; their area vectors are then not finite.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        vectors: Float = 0.5 * np.cross(b - a, c - a)
     return vectors

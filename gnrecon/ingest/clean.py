@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
@@ -57,7 +57,7 @@ def clean(
     finite = usable_positions(cloud.points)
     cloud, counts = cloud.select(finite), replace(counts, non_finite=int((~finite).sum()))
     cloud, dropped = _with_unit_normals(cloud)
-    _, first = np.unique(cloud.points, axis=0, return_index=True)
+    first = distinct_positions(cloud.points)
     counts = replace(counts, zero_normals=dropped, duplicates=len(cloud) - len(first))
     cloud = cloud.select(np.sort(first))
     _require_points(cloud, counts, parameters.least_points)
@@ -116,18 +116,33 @@ def usable_positions(
     return usable
 
 
+def distinct_positions(points: Float) -> Int:
+    """Return the first row, of shape (M,), of each position of finite points, of shape (N, 3); sorted by position.
+
+    Positions count relative to the mean, as in all that follows: what coincides there is one position.
+    """
+    middle = points.mean(axis=0) if len(points) else 0.0
+    first: Int = np.unique(points - middle, axis=0, return_index=True)[1]
+    return first
+
+
 def _with_unit_normals(cloud: PointCloud) -> tuple[PointCloud, int]:
     """Return the points that have a normal, of unit length, and the number of others; or all points without normals."""
     if cloud.normals is None:
         return cloud, 0
-    # Scaled by the largest component first, so that squares of tiny or huge normals do not under- or overflow.
-    largest = np.abs(cloud.normals).max(axis=1, initial=0.0)
-    usable = np.isfinite(largest) & (largest > 0)
+    usable, directions = unit_normals(cloud.normals)
     if 2 * usable.sum() < len(cloud):
         return cloud.with_normals(None), 0
-    kept = cloud.select(usable)
-    scaled = cloud.normals[usable] / largest[usable, None]
-    return kept.with_normals(scaled / np.linalg.norm(scaled, axis=1, keepdims=True)), int((~usable).sum())
+    return cloud.select(usable).with_normals(directions), int((~usable).sum())
+
+
+def unit_normals(normals: Float) -> tuple[Mask, Float]:
+    """Return which normals, of shape (N, 3), are neither zero nor broken, and these at unit length, of shape (M, 3)."""
+    # Scaled by the largest component first, so that squares of tiny or huge normals do not under- or overflow.
+    largest = np.abs(normals).max(axis=1, initial=0.0)
+    usable = np.isfinite(largest) & (largest > 0)
+    scaled = normals[usable] / largest[usable, None]
+    return usable, scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
 
 
 def _centred(cloud: PointCloud) -> Float:

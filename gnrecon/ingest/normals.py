@@ -113,7 +113,9 @@ def _across_edges(points: Float, rows: Int, found: Float, parameters: NormalPara
     for chunk in slices(len(points), parameters.chunk_points):
         others = near[chunk]
         off = np.einsum("gci,gci->gc", points[chunk, None] - centroids[others], normals[others])
-        score = (flatness[others] + parameters.off_plane_weight * off**2) / across[others]
+        # Neighbours on a line have no plane, and a score that may overflow to infinity.
+        with np.errstate(over="ignore"):
+            score = (flatness[others] + parameters.off_plane_weight * off**2) / across[others]
         best = score.argmin(axis=1)
         each = np.arange(len(best))
         better = flatness[chunk] / across[chunk] > parameters.edge_fit_ratio * score[each, best]

@@ -130,9 +130,10 @@ def orient_towards_scanner(
     """
     if origins is None:
         return None
-    sight = origins - points
-    lengths = np.linalg.norm(sight, axis=1)
-    with np.errstate(invalid="ignore"):
+    # Damaged origins may be any numbers; where lengths overflow, the line of sight does not decide.
+    with np.errstate(over="ignore", invalid="ignore"):
+        sight = origins - points
+        lengths = np.linalg.norm(sight, axis=1)
         cosines = np.einsum("ij,ij->i", directions, sight) / np.maximum(lengths, np.finfo(np.float64).tiny)
     known = np.isfinite(cosines) & (lengths > 0)
     decided = known & (np.abs(cosines) >= float(np.sin(np.radians(grazing_degrees))))
@@ -220,7 +221,9 @@ Single = npt.NDArray[np.float32]
 # Number Normal Consistency* (ACM TOG 2024).
 
 
-def consistent_normals(points: Float, normals: Float, *, width_spacings: float = 0.75, rounds: int = 10) -> Float:
+def consistent_normals(
+    points: Float, normals: Float, *, width_spacings: float = 0.75, least_width: float = 1e-5, rounds: int = 10
+) -> Float:
     """Return outward unit normals, of shape (N, 3).
 
     Parameters
@@ -229,20 +232,31 @@ def consistent_normals(points: Float, normals: Float, *, width_spacings: float =
     normals : array of shape (N, 3), of unit length, a first guess, such as that of `gauss_normals`
     width_spacings : width of the kernel at a point, in mean distances to its neighbours; below 1, so that the other
         sheet of a thin wall is not smoothed away
+    least_width : of the kernel, in extents of the cloud; squares of its values would overflow float32 below 1e-6
     rounds : number of iterations
     """
     scaled = points / np.abs(points).max()
     apart, count = mean_distances(scaled)
-    field = _Winding(scaled.astype(np.float32), (width_spacings * apart).astype(np.float32))
+    widths = np.maximum(width_spacings * apart, least_width)
+    field = _Winding(scaled.astype(np.float32), widths.astype(np.float32))
     mu = (normals * (np.pi / count * apart**2)[:, None]).astype(np.float32)
-    for _ in range(rounds):
-        downhill = field.transposed(0.5 - field.at_points(mu))
-        change = field.at_points(downhill)
-        mu = mu + (downhill**2).sum() / max(float((change**2).sum()), 1e-30) * downhill
-        steepest = field.descent(mu)
-        mu = np.linalg.norm(mu, axis=1, keepdims=True) * _unit(steepest)
+    # Where points lie so unevenly that single precision overflows, the first guess is kept.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(rounds):
+            downhill = field.transposed(0.5 - field.at_points(mu))
+            change = field.at_points(downhill)
+            mu = mu + np.float32(_square_sum(downhill) / max(_square_sum(change), 1e-30)) * downhill
+            steepest = field.descent(mu)
+            mu = np.linalg.norm(mu, axis=1, keepdims=True) * _unit(steepest)
     refined = mu.astype(np.float64)
-    return np.asarray(refined / np.linalg.norm(refined, axis=1, keepdims=True))
+    lengths = np.linalg.norm(refined, axis=1, keepdims=True)
+    usable = np.isfinite(lengths) & (lengths > 0)
+    return np.where(usable, np.where(usable, refined, 0.0) / np.where(usable, lengths, 1.0), normals)
+
+
+def _square_sum(values: Single) -> float:
+    """Return the sum of squares, which overflows single precision where points lie close together."""
+    return float(np.square(values, dtype=np.float64).sum())
 
 
 class _Winding:
@@ -302,17 +316,19 @@ def _unit(vectors: Single) -> Single:
 # thousand.
 
 
-def gauss_normals(points: Float, *, regularisation: float = 2.0) -> Float:
+def gauss_normals(points: Float, *, regularisation: float = 2.0, least_width: float = 1e-9) -> Float:
     """Return outward unit normals, of shape (N, 3).
 
     Parameters
     ----------
     points : array of shape (N, 3), distinct, samples of a closed surface
     regularisation : alpha, the factor of the system's diagonal
+    least_width : of the kernel, in extents of the cloud, for points that doubles can hardly tell apart
     """
     from scipy.linalg import cho_factor, cho_solve
 
-    width, _ = mean_distances(points)
+    points = points / np.abs(points).max()
+    width = np.maximum(mean_distances(points)[0], least_width)
     offsets = points[None, :, :] - points[:, None, :]
     distances = np.maximum(np.linalg.norm(offsets, axis=2), width[:, None])
     A = (offsets / (4 * np.pi * distances**3)[:, :, None]).reshape(len(points), -1)

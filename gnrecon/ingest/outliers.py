@@ -40,13 +40,15 @@ def find_outliers(points: Float, *, parameters: DensityOutlierParameters = Densi
     points : array of shape (N, 3), centred, N > 1
     parameters : tuning constants
     """
-    remaining = np.arange(len(points))
+    remaining, least = np.arange(len(points)), np.finfo(np.float64).tiny
     bound: float | None = None
     for _ in range(parameters.passes):
         if len(remaining) <= parameters.neighbours:
             break
         spacing, neighbours = _spacing(points[remaining], parameters.neighbours)
-        ratio = np.log(spacing / np.median(spacing[neighbours], axis=1))
+        # A difference of logarithms, because in damaged scans a ratio may overflow.
+        own, around = (np.maximum(x, least) for x in (spacing, np.median(spacing[neighbours], axis=1)))
+        ratio = np.log(own) - np.log(around)
         if bound is None:
             middle = float(np.median(ratio))
             spread = robust_deviation(ratio - middle)

@@ -15,7 +15,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.local_pca import principal_sums, tangent_coordinates
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest.clean import usable_positions
+from gnrecon.ingest.clean import distinct_positions, unit_normals, usable_positions
 from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import estimate_noise
@@ -85,12 +85,14 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
     """
     limits = parameters.survey
     finite = usable_positions(cloud.points)
-    points, first = np.unique(cloud.points[finite], axis=0, return_index=True)
-    if len(points) <= min(limits.border_neighbours):
+    if finite.sum() <= min(limits.border_neighbours):
         return None
-    rows = np.flatnonzero(finite)[first]
+    rows = np.flatnonzero(finite)[distinct_positions(cloud.points[finite])]
+    points = cloud.points[rows]
     distinct, repeated = len(points), repeated_points(points - points.mean(axis=0))
     points, rows = points[~repeated], rows[~repeated]
+    if len(points) <= min(limits.border_neighbours):
+        return None
     chosen = np.random.default_rng(0).permutation(len(rows))[: limits.points]
     centred = points - points.mean(axis=0)
     nearest, area = _spacings(centred, chosen, limits.density_neighbour)
@@ -109,7 +111,7 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
         spacing=spacing,
         spacing_p5=float(np.percentile(nearest, 5)),
         spacing_p95=float(np.percentile(nearest, 95)),
-        density_variation=float(np.percentile(area, 95) / np.percentile(area, 5)),
+        density_variation=_ratio(area),
         noise=noise.deviation,
         noise_limit=noise.limit,
         normals="missing" if cloud.normals is None else _state(centred, cloud.normals[rows], limits),
@@ -119,7 +121,9 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
     )
 
 
-def is_single_sheet(points: Float, normals: Float, *, least_facing_share: float = 0.97) -> bool:
+def is_single_sheet(
+    points: Float, normals: Float, *, least_facing_share: float = 0.97, least_points: int = 100
+) -> bool:
     """Return whether a scan is a single sheet that was seen from one side, such as terrain, a relief or a wall.
 
     Its winding number is that of an open surface, without an inside, and nearly all normals are within 90 degrees of
@@ -129,7 +133,10 @@ def is_single_sheet(points: Float, normals: Float, *, least_facing_share: float 
     ----------
     points, normals : arrays of shape (N, 3), outward unit normals
     least_facing_share : of the normals within 90 degrees of the mean
+    least_points : fewer may be those of anything, so that the closed surface is the simplest
     """
+    if len(points) < least_points:
+        return False
     facing = float((normals @ normals.mean(axis=0) > 0).mean())
     return facing >= least_facing_share and is_open(outwardness(points - points.mean(axis=0), normals))
 
@@ -219,6 +226,12 @@ def _spacings(points: Float, chosen: Int, neighbour: int) -> tuple[Float, Float]
     return distances[:, 1], distances[:, -1] ** 2
 
 
+def _ratio(values: Float) -> float:
+    """Return the ratio of the 95th to the 5th percentile of positive values, of which squares may have underflown."""
+    low, high = np.maximum(np.percentile(values / values.max(), [5, 95]), np.finfo(np.float64).tiny)
+    return float(high / low)
+
+
 def _border_share(points: Float, limits: SurveyParameters) -> float:
     """Return the share of points at an open border."""
     from scipy.spatial import cKDTree
@@ -235,13 +248,14 @@ def _border_share(points: Float, limits: SurveyParameters) -> float:
 
 def _state(points: Float, normals: Float, limits: SurveyParameters) -> str:
     """Return the most severe defect of the normals, or ``"good"``."""
-    lengths = np.linalg.norm(normals, axis=1)
-    usable = np.isfinite(lengths) & (lengths > 0)
+    usable, directions = unit_normals(normals)
     if 2 * usable.sum() < len(normals):
         return "zero"
-    points, directions = points[usable], normals[usable] / lengths[usable, None]
+    points = points[usable]
     if are_inconsistent(points, directions):
         return "inconsistent"
     if flip_if_inward(points, directions)[1]:
         return "inward"
-    return "good" if (np.abs(lengths[usable] - 1) < limits.length_tolerance).all() else "unnormalised"
+    # Clipped, so that squares do not overflow; what was longer still is longer than 1.
+    lengths = np.linalg.norm(np.clip(normals[usable], -2.0, 2.0), axis=1)
+    return "good" if (np.abs(lengths - 1) < limits.length_tolerance).all() else "unnormalised"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ from gnrecon.runtime.plugins import Plugin, PluginKind, find, installed
 READERS: dict[str, Callable[[Path], Contents]] = {
     ".ply": read_ply,
     ".pcd": read_pcd,
-    **dict.fromkeys(TABLE_SUFFIXES, read_table),
+    **{suffix: partial(read_table, extension=suffix) for suffix in TABLE_SUFFIXES},
     ".npy": read_npy,
     ".npz": read_npy,
     ".obj": read_obj,

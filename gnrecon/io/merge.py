@@ -19,8 +19,9 @@ from gnrecon.io.contents import Contents, faces_cover
 from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.parse import read_text, sibling_path
-from gnrecon.io.read import check_file, extension_of, input_errors_for, reader_extension, uncompressed_file
+from gnrecon.io.read import check_file, extension_of, input_errors_for, reader_extension
 from gnrecon.io.streaming import VoxelThinning, drop_unused, read_chunks
+from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, UsageError
 
 _log = logging.getLogger(__name__)

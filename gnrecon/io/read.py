@@ -1,26 +1,23 @@
 """Reads a file as a cloud, as a mesh, or as whichever it holds; every malformed file gives one `InputError`.
 
-The source may be a file, a gzip-compressed file, or standard input. Readers seek, compare sizes and pass names to
-libraries, so anything but a plain file is first copied into a temporary one.
+The source may be a file, a gzip-compressed file, or standard input, see `gnrecon.io.unpacking`.
 """
 
 from __future__ import annotations
 
-import gzip
 import logging
-import shutil
-import sys
-import tempfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import Contents, faces_cover
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
+from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import is_standard_input
 
@@ -137,7 +134,9 @@ def input_errors_for(path: Path) -> Iterator[None]:
     """Turn every failure to read a file into an error of one sentence that begins with the file's name."""
     name = "standard input" if is_standard_input(path) else path
     try:
-        yield
+        # Damaged bytes are any numbers; those that cannot be computed with are dropped and counted later.
+        with np.errstate(all="ignore"):
+            yield
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     except MemoryLimitError:
@@ -188,51 +187,3 @@ def check_file(path: Path, extension: str) -> None:
 def extension_of(path: Path) -> str:
     """Return the extension that says how a file is read, in lower case; ``.gz`` is skipped."""
     return Path(path.stem if path.suffix.lower() == ".gz" else path.name).suffix.lower()
-
-
-@contextmanager
-def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
-    """Yield a plain file with the data to read: the file itself, or a temporary copy of compressed data or a stream.
-
-    Parameters
-    ----------
-    path : file to read; ``-`` for standard input
-    extension : how it is to be read, with the dot; the copy has this extension
-
-    Raises
-    ------
-    InputError
-        When compressed data is damaged.
-    UsageError
-        When standard input is a terminal, so that no file is sent.
-    """
-    if not is_standard_input(path) and not _is_compressed(path):
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="gnrecon-") as folder:
-        source = _from_standard_input(Path(folder) / f"stream{extension}") if is_standard_input(path) else path
-        yield _unpacked(source, Path(folder) / f"unpacked{extension}") if _is_compressed(source) else source
-
-
-def _is_compressed(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(2) == b"\x1f\x8b"  # the magic number of gzip
-
-
-def _from_standard_input(copy: Path) -> Path:
-    if sys.stdin.isatty():
-        raise UsageError("Standard input is a terminal; send it a file, as in: gnrecon - --format xyz < scan.xyz")
-    with copy.open("wb") as file:
-        shutil.copyfileobj(sys.stdin.buffer, file)
-    return copy
-
-
-def _unpacked(packed: Path, target: Path) -> Path:
-    try:
-        with gzip.open(packed) as source, target.open("wb") as file:
-            shutil.copyfileobj(source, file)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise InputError(f"the compressed data is damaged ({error}).") from None
-    return target

@@ -132,7 +132,7 @@ def read_chunks(
     read_by_chunks = chunk_reader(extension)
     if columns:
         if extension not in (*TABLE_SUFFIXES, ".npy", ".npz"):
-            raise UsageError(f"--columns names the columns of tables, but {path.name} is not one.")
+            raise UsageError(f"--columns names the columns of tables, but {extension[1:].upper()} files are none.")
         read_by_chunks = None if read_by_chunks is None else partial(table_chunks, columns=columns)
     if read_by_chunks is not None and path.stat().st_size >= parameters.chunked_file_bytes:
         yield from read_by_chunks(path, parameters.chunk_points)
@@ -154,7 +154,7 @@ def chunk_reader(extension: str) -> Callable[[Path, int], Iterator[Contents]] | 
             return ptx_chunks
         case ".ply":
             return ply_chunks
-    return table_chunks if extension in TABLE_SUFFIXES else None
+    return partial(table_chunks, extension=extension) if extension in TABLE_SUFFIXES else None
 
 
 def drop_unused(contents: Contents, extensions: Iterable[str]) -> Contents:

@@ -21,7 +21,9 @@ class CostModel:
     mesh_cells: int = 256  # the default resolution
     detail_features: int = 600  # features per cube with --quality normal
     two_core_share: float = 0.5  # share of the processor seconds that pass on two idle cores; more cores help little
-    fit_memory_mb: float = 950.0  # upper end of the measured 750 to 950 MB of a fit
+    fit_memory_mb: float = 700.0  # measured: fits of a few hundred points, with one thread or two
+    dense_fit_memory_mb: float = 700.0  # measured: what a fit of `dense_fit_points` or more takes more, at most
+    dense_fit_points: int = 5000  # the size of that measurement; larger scans are fitted in pieces
     mesh_memory_mb: float = 505.0  # measured: mesh of few cells
     mesh_cells_memory_mb: float = 886.0  # measured: what a mesh of `mesh_memory_cells` takes more
     mesh_memory_cells: int = 512  # the resolution of that measurement

@@ -91,13 +91,21 @@ def suggestion(word: str, known: Iterable[str], *, kind: str = "options") -> str
     return f"; the {kind} are {', '.join(names)}" if kind else ""
 
 
+def _lacks_memory(error: BaseException) -> bool:
+    """Whether memory was missing; for libraries and threads, the system says so by other errors, and their text."""
+    words = ("failed to map segment", "annot allocate memory", "can't start new thread")
+    return isinstance(error, MemoryError) or (
+        isinstance(error, ImportError | OSError | RuntimeError) and any(word in str(error) for word in words)
+    )
+
+
 def failure(error: BaseException) -> tuple[str, ExitCode]:
     """Return the message and the exit code for the exception that ended a run."""
     if isinstance(error, GnreconError):
         return str(error), error.exit_code
     if isinstance(error, KeyboardInterrupt):
         return "Interrupted; nothing was written.", ExitCode.INTERRUPTED
-    if isinstance(error, MemoryError):
+    if _lacks_memory(error):
         return f"There is not enough memory. {error}".strip(), ExitCode.MEMORY
     # A bug in gnrecon: the user still gets one sentence, and a way to report it.
     name = type(error).__name__

@@ -97,14 +97,14 @@ def _read_mark() -> int:
 
 def _high_water() -> int:
     # Preferred over `getrusage`, whose peak includes the parent process before the exec.
-    found = _status("VmHWM")
+    found = status_bytes("VmHWM")
     if found is not None:
         return found
     # Kilobytes on Linux, bytes on macOS.
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def _status(name: str, *, path: Path = Path("/proc/self/status")) -> int | None:
+def status_bytes(name: str, *, path: Path = Path("/proc/self/status")) -> int | None:
     """Return a size of /proc/self/status in bytes, or None where there is none."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

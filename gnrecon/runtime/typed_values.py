@@ -1,4 +1,4 @@
-"""Checks that the values of options have the types that their dataclass states, and turns them into plain ones.
+"""Checks that the values of options have the types that their dataclass states, and reads times and sizes from text.
 
 Only the standard library is imported here, because the command line reads its table of options whenever it starts.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import operator
 import os
+import re
 import types
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from numbers import Real
@@ -80,3 +82,35 @@ def _plain(kind: Any, value: Any) -> Any:
         # A whole number stays as the caller wrote it.
         return value if type(value) is int else float(value) if isinstance(value, Real) else None
     return os.fspath(value) if isinstance(value, str | os.PathLike) else None
+
+
+def parse_seconds(text: str) -> float:
+    """Return a positive time in seconds, from text such as ``90``, ``30s``, ``10m`` or ``1.5h``.
+
+    Raises
+    ------
+    UsageError
+        When the text is not such a time.
+    """
+    units = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+    return _quantity(text, units, "a time such as 90, 30s, 10m or 2h")
+
+
+def parse_megabytes(text: str) -> float:
+    """Return a positive amount of memory in MB of 10^6 bytes, from text such as ``800MB`` or ``4GB``.
+
+    Raises
+    ------
+    UsageError
+        When the text is not such an amount.
+    """
+    units = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6, "kib": 2**10 / 1e6, "mib": 2**20 / 1e6, "gib": 2**30 / 1e6}
+    return _quantity(text, units, "an amount of memory such as 800MB, 4GB or 2GiB")
+
+
+def _quantity(text: str, units: Mapping[str, float], expected: str) -> float:
+    match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([a-z]*)\s*", text, re.IGNORECASE)
+    unit = None if match is None else units.get(match[2].lower())
+    if match is None or unit is None or float(match[1]) <= 0:
+        raise UsageError(f"{text!r} is not {expected}.")
+    return float(match[1]) * unit

@@ -3,17 +3,19 @@
 Foreseen are a verified mesh and one sentence with an exit code of its own. Exit code 1, a signal, a run that takes too
 long or too much memory, a traceback, a warning of a library, a file that a failed run leaves, and a mesh that trimesh
 does not find watertight are faults: they are listed, and their scans are kept with ``--keep``. A fault is made again by
-``--first NUMBER --count 1`` with the same seed. One run in ten is killed at a random moment; its mesh must be whole or
-absent.
+``--first NUMBER --count 1`` with the same seed; Ctrl-C reports the runs so far. One run in ten is killed at a random
+moment; its mesh must be whole or absent.
 """
 
 from __future__ import annotations
 
 import shutil
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -37,6 +39,7 @@ from gnrecon.batch.child_process import close_fork_servers
 from gnrecon.batch.execute import run_child
 from gnrecon.batch.job import Limits
 from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.interrupts import polite_ends
 
 OPTIONS = (
     (),
@@ -94,6 +97,10 @@ def work(argument: dict[str, Any]) -> int:
     """Run the command line in a forked process, and return its exit code."""
     from gnrecon.cli.app import main
 
+    # The command line hides them from its users; those of the library would see them.
+    sys.warnoptions.append("default::RuntimeWarning")
+    warnings.simplefilter("ignore")
+    warnings.simplefilter("default", RuntimeWarning)
     try:
         main(argument["words"])
     except SystemExit as end:
@@ -194,15 +201,18 @@ def main(arguments: Sequence[str]) -> int:
     report = provenance("fuzz", arguments)
     console, found = Console(), list[Run]()
     numbers = range(chosen.first, chosen.first + chosen.count)
-    for run in runs(numbers, chosen.seed, chosen.jobs, Limits(chosen.seconds, chosen.memory), chosen.keep):
-        found.append(run)
-        if run.fault:
-            words = " ".join(run.options)
-            console.print(
-                f"{run.number} ({run.scan} {words}): {run.fault}", markup=False, highlight=False, soft_wrap=True
-            )
-        if console.is_terminal and len(found) % 10 == 0:
-            print(f"{len(found)} of {chosen.count}", end="\r", file=sys.stderr)
+    limits = Limits(chosen.seconds, chosen.memory)
+    # What was found until an interrupt is reported, too.
+    with polite_ends(), suppress(KeyboardInterrupt):
+        for run in runs(numbers, chosen.seed, chosen.jobs, limits, chosen.keep):
+            found.append(run)
+            if run.fault:
+                words = " ".join(run.options)
+                console.print(
+                    f"{run.number} ({run.scan} {words}): {run.fault}", markup=False, highlight=False, soft_wrap=True
+                )
+            if console.is_terminal and len(found) % 10 == 0:
+                print(f"{len(found)} of {chosen.count}", end="\r", file=sys.stderr)
     console.print(table(found))
     faults = [run for run in found if run.fault]
     console.print(f"{len(faults)} faults.")

@@ -156,6 +156,14 @@ def test_a_batch_killed_before_files_were_moved_knows_them_as_its_own(tmp_path: 
         ("signal SIGKILL", Limits(), Cause.SIGNAL, -signal.SIGKILL, "Killed by SIGKILL. Perhaps the system"),
         ("sleep", Limits(seconds=0.5), Cause.TIMEOUT, None, "It had not ended after 0.5 s"),
         ("hog", Limits(memory_mb=200.0), Cause.MEMORY, 7, "the limit is 200 MB"),
+        (
+            "native what(): std::bad_alloc",
+            Limits(),
+            Cause.MEMORY,
+            7,
+            "ran out in native code, which ended it by SIGABRT",
+        ),
+        ("native assertion failed", Limits(), Cause.SIGNAL, -signal.SIGABRT, "Killed by SIGABRT."),
         ("nonsense", Limits(), Cause.UNFORESEEN, 1, "Its process ended with exit code 1."),
     ],
 )
@@ -167,6 +175,13 @@ def test_failures_are_named(
     assert words in outcome.message
     assert outcome.files == {}
     assert outputs(job(tmp_path, "bad", text)) == [".gnrecon/logs/bad.log"]
+
+
+def test_a_kill_by_the_system_for_memory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kills = iter((3, 4))
+    monkeypatch.setattr("gnrecon.batch.execute.kills_for_memory", lambda: next(kills))
+    outcome = done(job(tmp_path, "bad", "signal SIGKILL"))
+    assert (outcome.cause, outcome.exit_code) == (Cause.MEMORY, ExitCode.MEMORY)
 
 
 def test_a_scan_that_is_missing_is_an_input_error(tmp_path: Path) -> None:

@@ -111,4 +111,3 @@ def test_as_many_jobs_as_cores_and_memory_allow(tmp_path: Path, monkeypatch: pyt
 
 def test_what_this_machine_has_is_positive() -> None:
     assert executors.available_cores() >= 1
-    assert executors.available_memory_mb() > 0

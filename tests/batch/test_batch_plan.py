@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from gnrecon.batch.job import Limits
-from gnrecon.batch.plan import parse_megabytes, parse_seconds, plan
+from gnrecon.batch.plan import plan
 from gnrecon.batch.request import Request
 from gnrecon.config import Settings, read_settings
 from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.typed_values import parse_megabytes, parse_seconds
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -31,6 +32,7 @@ from gnrecon.config import Settings, read_settings
 from gnrecon.export import verify_file
 from gnrecon.report.report import report_schema
 from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
+from gnrecon.runtime.files import sync
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
 WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")
@@ -244,6 +246,40 @@ def test_an_interrupted_batch_writes_its_summary(
     assert capfd.readouterr().err == f"gnrecon: Interrupted; {written} lists what was done until then.\n"
     assert not list(running_folder(tmp_path / "out").glob("*"))
     assert not (tmp_path / "out" / "b.obj").exists()
+
+
+def fill_disk(monkeypatch: pytest.MonkeyPatch, *stems: str) -> None:
+    """Let the disk be full wherever a file of such a name is written, or moved into place, by this process."""
+
+    def flush(path: Path) -> None:
+        if path.name.startswith(tuple(f".{stem}." for stem in stems)):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        sync(path)
+
+    monkeypatch.setattr("gnrecon.runtime.files.sync", flush)
+
+
+@pytest.mark.usefixtures("errand_runs")
+def test_a_full_disk_costs_scans_and_not_the_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = write_errands(tmp_path / "scans", a="good", b="good", c="good")
+    fill_disk(monkeypatch, "b")
+    assert run_batch(Request((str(scans),), tmp_path / "out", jobs=1, quiet=True)) == ExitCode.BATCH
+    found = summary(tmp_path / "out")
+    assert {name: scan["cause"] for name, scan in found.items()} == {"a": None, "b": "output", "c": None}
+    assert str(found["b"]["message"]).endswith("b.json could not be written: No space left on device.")
+    assert not (tmp_path / "out" / "b.obj").exists()
+
+
+@pytest.mark.usefixtures("errand_runs")
+def test_a_summary_that_finds_no_space_is_announced_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scans = write_errands(tmp_path / "scans", a="good")
+    fill_disk(monkeypatch, "summary")
+    with pytest.raises(OutputError, match=r"summary.json could not be written: No space left on device\.$"):
+        run_batch(Request((str(scans),), tmp_path / "out", jobs=1))
+    assert "1 of 1 scans reconstructed" in capfd.readouterr().err
+    assert (tmp_path / "out" / "a.obj").is_file()
 
 
 def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:

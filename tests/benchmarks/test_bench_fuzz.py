@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from benchmarks import fuzz
 from benchmarks.__main__ import main as bench
+from benchmarks.damage import damaged_scan
 from benchmarks.fuzz import Run, runs, table
 
 from gnrecon.batch.job import Limits
-from gnrecon.runtime.errors import ExitCode
+from gnrecon.ingest import prepare, survey
+from gnrecon.io import read_scans
+from gnrecon.options import Options
+from gnrecon.runtime.errors import ExitCode, InputError
 
 
 def test_damaged_scans_end_in_a_mesh_or_in_one_sentence() -> None:
@@ -18,6 +24,28 @@ def test_damaged_scans_end_in_a_mesh_or_in_one_sentence() -> None:
     assert [run.number for run in found] == list(range(17, 25))
     assert [f"{run.number} {run.scan} {run.fault}" for run in found if run.fault] == []
     assert {ExitCode.OK, ExitCode.INPUT} <= {run.code for run in found}
+
+
+@pytest.mark.parametrize("first", range(1000, 1300, 50))
+def test_damaged_scans_are_prepared_or_refused_by_one_sentence(tmp_path: Path, first: int) -> None:
+    options, prepared = Options(), 0
+    for number in range(first, first + 50):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        scan = damaged_scan(folder, np.random.default_rng([0, number]))
+        sentence, samples = "", None
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            try:
+                cloud, _ = read_scans([scan], None, options.read_points, options.region())
+                samples, _ = prepare(cloud, **options.ingest())
+                survey(cloud)
+            except InputError as error:
+                sentence = str(error)
+        assert "\n" not in sentence, number
+        assert sentence or (samples is not None and np.isfinite(samples.points).all()), number
+        prepared += not sentence
+    assert 0 < prepared < 50
 
 
 @pytest.mark.parametrize(

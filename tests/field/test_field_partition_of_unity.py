@@ -52,7 +52,10 @@ def test_a_box_meets_the_cubes_that_hold_some_of_its_points(
 ) -> None:
     low = cloud(partition, rng, 40)
     sizes = rng.uniform(0.0, size, low.shape)
-    keys, rows = partition.pairs_of_boxes(low, low + sizes)
+    around = partition.members(low)[0]
+    lattice = np.stack([np.arange(20) + start for start in around.min(axis=0) - 3])
+    cubes = np.stack(np.meshgrid(*lattice, indexing="ij"), axis=-1).reshape(-1, 3)
+    keys, rows = partition.pairs_of_boxes(low, low + sizes, cubes)
     found = {(tuple(key), int(row)) for key, row in zip(keys.tolist(), rows, strict=True)}
     assert len(found) == len(rows)
     grid = np.stack(np.meshgrid(*3 * [np.linspace(0.0, 1.0, 12)], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -63,6 +66,13 @@ def test_a_box_meets_the_cubes_that_hold_some_of_its_points(
         center = partition.center(key)
         nearest = np.clip(center, low[row], low[row] + sizes[row])
         assert (np.abs(nearest - center) <= partition.reach + 1e-12).all()
+    # Of few cubes, each is compared with each box, so that boxes may be of any size.
+    few = around[:3]
+    keys, rows = partition.pairs_of_boxes(low, low + sizes, few)
+    assert {(tuple(key), int(row)) for key, row in zip(keys.tolist(), rows, strict=True)} == {
+        (key, row) for key, row in found if list(key) in few.tolist()
+    }
+    assert len(partition.pairs_of_boxes(low - 1e9, low + 1e9, few)[1]) == 3 * len(low)
 
 
 def test_derivatives_are_those_of_autodiff(partition: Partition, rng: np.random.Generator) -> None:

@@ -99,5 +99,5 @@ def test_without_a_reset_a_mark_that_rises_tells_the_peak_all_the_same() -> None
 
 
 def test_without_a_mark_the_system_is_asked_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "_status", partial(memory._status, path=tmp_path / "missing"))
+    monkeypatch.setattr(memory, "status_bytes", partial(memory.status_bytes, path=tmp_path / "missing"))
     assert memory._high_water() / 1e6 > resident() / 2

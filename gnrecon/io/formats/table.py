@@ -27,19 +27,21 @@ from gnrecon.runtime.errors import InputError
 TABLE_SUFFIXES = (".xyz", ".pts", ".txt", ".csv", ".asc", ".xyzn", ".xyzrgb", ".dat")
 
 
-def read_table(path: Path, columns: Sequence[str] = ()) -> Contents:
+def read_table(path: Path, columns: Sequence[str] = (), extension: str = "") -> Contents:
     """Read a table of points; `columns` are the names of its columns where the user gives them.
+
+    The extension by which it is read says what the columns of some tables are.
 
     Raises
     ------
     InputError
         When a word is not a number, rows differ in length, a count is wrong, or the columns are ambiguous.
     """
-    return concatenated(list(table_chunks(path, None, columns)))
+    return concatenated(list(table_chunks(path, None, columns, extension)))
 
 
 def table_chunks(
-    path: Path, rows: int | None, columns: Sequence[str] = (), *, sampled_lines: int = 400
+    path: Path, rows: int | None, columns: Sequence[str] = (), extension: str = "", *, sampled_lines: int = 400
 ) -> Iterator[Contents]:
     """Yield the points of at most `rows` lines at a time; what the columns are is decided on the first block.
 
@@ -65,7 +67,7 @@ def table_chunks(
                 continue
             table = _parsed(text, dialect, found)
             if kept is None:
-                kept, more = _kept(dialect, table, path.suffix.lower(), columns)
+                kept, more = _kept(dialect, table, extension, columns)
                 remarks += more
             found += len(table)
             contents = from_columns({name: table[:, place].copy() for place, name in kept})
