@@ -210,7 +210,7 @@ def reconstruct(
         scan = _read(run, source, normals, format, reference)
         ingested = _ingest(run, scan)
         fitted = _fit(run, ingested)
-        surface = _trim(run, ingested, _mesh(run, scan, fitted))
+        surface = _trim(run, ingested, _mesh(run, scan, ingested, fitted))
         finished, uncertainty = _finish(run, scan, ingested, fitted, surface)
         report = run_report(run.source, run.options, run.stages, scan, ingested, fitted, surface, finished)
     interrupted = fitted.solution.interrupted
@@ -303,7 +303,7 @@ def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
     return Fitted(sdf, solution, residuals, held_out)
 
 
-def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
+def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted) -> MeshedScan:
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
@@ -313,7 +313,9 @@ def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     neighbourhood = Neighbourhood(scan.cloud.points)
-    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, neighbourhood.spacing(), None)
+    # Between lines of points, the points that were kept say how far the surface is known.
+    spacing = ingested.counts.line_step or neighbourhood.spacing()
+    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, spacing, None)
 
 
 def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedScan:

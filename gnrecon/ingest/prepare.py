@@ -12,12 +12,14 @@ from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.clean import clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
+from gnrecon.ingest.line_scans import lie_on_lines, normals_across_lines, thinned_along_lines
 from gnrecon.ingest.noise import estimate_noise
+from gnrecon.ingest.normals import unoriented_normals
 from gnrecon.ingest.orientation import require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.smooth import smooth_points
 from gnrecon.ingest.subsample import subsample as thin
-from gnrecon.ingest.survey import fill_a_volume, lie_on_lines, outer_surface
+from gnrecon.ingest.survey import fill_a_volume, outer_surface
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -69,13 +71,22 @@ def prepare(
     cleaned, counts = clean(cloud, outliers, clusters=clusters, units=units, parameters=parameters)
     advance(0.2)  # cleaning takes about a fifth of the time, and normals another half
     centred = cleaned.points - cleaned.points.mean(axis=0)
-    arrangement = "lines" if lie_on_lines(centred) else "volume" if fill_a_volume(centred) else None
+    arrangement = (
+        "lines" if lie_on_lines(centred, parameters=parameters.lines) else "volume" if fill_a_volume(centred) else None
+    )
     counts = replace(counts, arrangement=arrangement)
     if arrangement == "volume" and cleaned.normals is None:
         outer, normals = outer_surface(centred)
         cleaned = cleaned.select(outer).with_normals(normals)
         counts = replace(counts, inner=int((~outer).sum()))
-    oriented, orientation = with_outward_normals(cleaned, orient, parameters=parameters)
+    axes = None
+    if arrangement == "lines":
+        rows, side = thinned_along_lines(centred, parameters=parameters.lines)
+        axes, found = normals_across_lines(centred, rows, side, parameters=parameters.lines)
+        axes[~found] = unoriented_normals(centred[rows], parameters=parameters.normals)[~found]
+        counts = replace(counts, along_lines=len(cleaned) - len(rows), line_step=side)
+        cleaned = cleaned.select(rows)
+    oriented, orientation = with_outward_normals(cleaned, orient, axes, parameters=parameters)
     if counts.inner:
         orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
