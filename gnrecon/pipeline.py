@@ -313,8 +313,7 @@ def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted)
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     neighbourhood = Neighbourhood(scan.cloud.points)
-    # Between lines of points, the points that were kept say how far the surface is known.
-    spacing = ingested.counts.line_step or neighbourhood.spacing()
+    spacing = ingested.counts.line_step or neighbourhood.spacing()  # lines are farther apart than their points
     return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, spacing, None)
 
 

@@ -79,7 +79,7 @@ class LineParameters:
         0.2  # of the neighbours of a point that gets a normal across lines: noise widens lines
     )
     across_neighbours: int = 24  # among which points on other lines are looked for
-    most_along_cosine: float = 0.5  # of the angle, 60 degrees, between the line and a point beside it
+    most_along_cosine: float = 0.5  # of the angle, 60 degrees, between the line and a point off it
     own_line_weight: float = 2.0  # on the distances of points of the same line
     least_opposite_cosine: float = 0.3  # of the turn between both sides, at least 107 degrees
     most_second_ratio: float = 3.0  # of the distances of the points on both sides; beyond, only the nearer one counts

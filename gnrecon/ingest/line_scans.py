@@ -52,7 +52,7 @@ def thinned_along_lines(points: Float, *, parameters: LineParameters = LineParam
     parameters : tuning constants
     """
     rng, side = np.random.default_rng(0), mean_spacing(points)
-    rows = np.arange(len(points))
+    rows: Int = np.arange(len(points))
     while True:
         side *= parameters.growth
         fewer = np.sort(voxel_representatives_of_side(points, side, rng))
@@ -69,7 +69,7 @@ def normals_across_lines(
 ) -> tuple[Float, Mask]:
     """Return unit normals of either sign at some of the points, of shape (M, 3), and where there are any.
 
-    There is none where the nearest points do not lie on one line, or none are found beside it.
+    There is none where the nearest points do not lie on one line, or none are found on other lines.
 
     Parameters
     ----------
@@ -119,15 +119,15 @@ def _across(offsets: Float, distances: Float, along: Float, side: float, paramet
     """
     height, gaps = np.einsum("gki,gi->gk", offsets, along), np.linalg.norm(offsets, axis=2)
     flat = offsets - height[:, :, None] * along[:, None]
-    beside = (gaps > side) & (np.abs(height) < parameters.most_along_cosine * gaps)
+    aside = (gaps > side) & (np.abs(height) < parameters.most_along_cosine * gaps)
     each = np.arange(len(along))
-    first = np.where(beside, distances, np.inf).argmin(axis=1)
-    one = np.where(beside[each, first, None], flat[each, first], 0.0)
+    first = np.where(aside, distances, np.inf).argmin(axis=1)
+    one = np.where(aside[each, first, None], flat[each, first], 0.0)
     length = np.linalg.norm(one, axis=1)
     lengths = np.linalg.norm(flat, axis=2)
     cosines = np.einsum("gki,gi->gk", flat, one) / np.maximum(lengths * length[:, None], np.finfo(np.float64).tiny)
     reach = parameters.most_second_ratio * distances[each, first, None]
-    opposite = beside & (cosines < -parameters.least_opposite_cosine) & (distances < reach)
+    opposite = aside & (cosines < -parameters.least_opposite_cosine) & (distances < reach)
     second = np.where(opposite, distances, np.inf).argmin(axis=1)
     ratio = np.where(opposite[each, second], lengths[each, second] / np.maximum(length, np.finfo(np.float64).tiny), 1.0)
     other = np.where(opposite[each, second, None], flat[each, second], 0.0)

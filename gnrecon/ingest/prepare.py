@@ -133,5 +133,5 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Sa
     if len(held_out) and held_out.normals is not None:
         held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
     points = frame.to_unit(kept.points)
-    noise = estimate_noise(points, mean_spacing(points)).deviation if estimated and len(points) >= 16 else None
+    noise = estimate_noise(points, mean_spacing(points)).deviation if len(points) >= 16 else None
     return Samples(points, kept.normals, frame, held, estimated, noise)
