@@ -261,7 +261,8 @@ def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, refe
         limits = run.options.read_points, run.options.region(), run.options.column_names()
         cloud, reading = read_source(source, normals, format, *limits)
         run.progress.advance(0.5)
-        scan = ScanRead(cloud, reading, _reference(reference))
+        read = read_reference if isinstance(reference, str | Path) else as_shape
+        scan = ScanRead(cloud, reading, None if reference is None else read(reference))
     requested_names(cloud, run.options.attributes)  # a misspelt name is refused before the work
     return scan
 
@@ -293,8 +294,9 @@ def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
         run.progress.step(record, total)
 
     with run.stages("fit"):
-        where = options.work_dir, options.block_scheduler
-        sdf, solution = fit(samples, options.fit(), step, run.progress.advance, *where)
+        sdf, solution = fit(
+            samples, options.fit(), step, run.progress.advance, options.work_dir, options.block_scheduler
+        )
         residuals = Misfit.of(sdf, samples)
         held_out = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
     run.remark([solution.status])
@@ -312,9 +314,9 @@ def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted)
     run.remark([] if sdf.data is None else coarse_parts_remark(sdf.data, cell))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
-    neighbourhood = Neighbourhood(scan.cloud.points)
-    spacing = ingested.counts.line_step or neighbourhood.spacing()  # lines are farther apart than their points
-    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, spacing, None)
+    around = Neighbourhood(scan.cloud.points)
+    spacing = ingested.counts.half_line_distance or around.spacing()
+    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, around, spacing, None)
 
 
 def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedScan:
@@ -393,9 +395,3 @@ def _files(source: Any) -> list[str | Path]:
         return [source]
     paths = list(source) if isinstance(source, list | tuple) else []
     return paths if all(isinstance(path, str | Path) for path in paths) else []
-
-
-def _reference(reference: Any) -> Mesh | PointCloud | None:
-    if reference is None:
-        return None
-    return read_reference(reference) if isinstance(reference, str | Path) else as_shape(reference)

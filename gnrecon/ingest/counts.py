@@ -22,7 +22,7 @@ class IngestCounts:
     clusters_found : points in isolated clusters that were kept, for the same reasons
     inner : dropped, because they fill the volume below its surface
     along_lines : dropped, because they lie closer along lines than anything is known between the lines
-    line_step : the distance at which points along lines were kept, in file units; None elsewhere
+    half_line_distance : about half of the distance of the lines, in file units; None elsewhere
     arrangement : ``"lines"`` or ``"volume"`` where the points lie along lines or fill a volume; None on surfaces
     held_out : validation points, which the fit does not use
     moved : root mean square distance by which smoothing moved the points, in file units; None without smoothing
@@ -44,7 +44,7 @@ class IngestCounts:
     clusters_found: int = 0
     inner: int = 0
     along_lines: int = 0
-    line_step: float | None = None
+    half_line_distance: float | None = None
     arrangement: str | None = None
     held_out: int = 0
     moved: float | None = None
@@ -74,10 +74,10 @@ class IngestCounts:
         if self.clusters_found:
             sentences.append(f"Kept {self.clusters_found} points in isolated clusters.")
         if self.arrangement == "lines":
-            kept = f" Kept points about {self.line_step:.3g} apart, without {self.along_lines} between them."
+            left_out = f" Left out {self.along_lines} points along the lines." if self.along_lines else ""
             sentences.append(
                 "The points lie along lines that are far apart for the distance of points on a line; what is between "
-                f"the lines is interpolated.{kept if self.line_step is not None else ''}"
+                f"the lines is interpolated.{left_out}"
             )
         if self.arrangement == "volume":
             what = f" Kept its outer surface, without {self.inner} points below it." if self.inner else ""

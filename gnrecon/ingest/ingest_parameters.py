@@ -75,6 +75,8 @@ class LineParameters:
     most_thinned_share: float = 0.1  # of points on lines, below which they are thinned enough
     growth: float = 1.5  # of the side of the cubes in each step of thinning
     least_points: int = 50  # that thinning leaves
+    given_side_share: float = 1 / 6  # of the side of these cubes, where normals are given: the fit then uses points
+    # that are up to a dozen times closer on a line than lines are to each other
     most_own_width_share: float = (
         0.2  # of the neighbours of a point that gets a normal across lines: noise widens lines
     )

@@ -43,6 +43,11 @@ def _on_line(points: Float, some: Int, parameters: LineParameters) -> Mask:
     return np.asarray(sums[:, 1] < parameters.most_width_share * sums[:, 2])
 
 
+def rows_along_lines(points: Float, side: float) -> Int:
+    """Return the row of a point in each cube of a side, in the order of the points, an array of shape (N, 3)."""
+    return np.sort(voxel_representatives_of_side(points, side, np.random.default_rng(0)))
+
+
 def thinned_along_lines(points: Float, *, parameters: LineParameters = LineParameters()) -> tuple[Int, float]:
     """Return the rows of a part of the points that does not lie on lines, in their order, and the side of its cubes.
 
@@ -55,7 +60,7 @@ def thinned_along_lines(points: Float, *, parameters: LineParameters = LineParam
     rows: Int = np.arange(len(points))
     while True:
         side *= parameters.growth
-        fewer = np.sort(voxel_representatives_of_side(points, side, rng))
+        fewer = rows_along_lines(points, side)
         if len(fewer) < parameters.least_points:
             return rows, side / parameters.growth
         rows = fewer
@@ -87,7 +92,7 @@ def normals_across_lines(
         along = axes[:, :, 2]
         distances, near = thin.query(own, count)
         # A bent line comes near itself, so points of other lines go first.
-        weights = np.where(lines[near] == lines[part][:, None], parameters.own_line_weight, 1.0)
+        weights = np.where(lines[near] == lines[part, None], parameters.own_line_weight, 1.0)
         across = _across(points[rows][near] - own[:, None], distances * weights, along, side, parameters)
         normal = np.cross(along, across)
         lengths = np.linalg.norm(normal, axis=1)

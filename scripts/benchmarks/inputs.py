@@ -22,7 +22,7 @@ from benchmarks.harness import command_line
 from benchmarks.harness.measurement import timed
 from benchmarks.harness.tables import number_or_dash, row_table
 from gnrecon.export import verify
-from gnrecon.export.metrics import SurfaceQuery
+from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -132,7 +132,7 @@ def both_ways(mesh: Mesh, truth: Float) -> float:
     """Return the mean of the distances from the truth to a mesh and from the mesh to the truth."""
     from scipy.spatial import cKDTree
 
-    there = float(SurfaceQuery(mesh).nearest(truth)[0].mean())
+    there = float(nearest_on_surface(mesh, truth)[0].mean())
     back = float(cKDTree(truth).query(_sampled(mesh))[0].mean())
     return (there + back) / 2
 

@@ -31,7 +31,10 @@ def test_normals_of_lines_are_those_of_the_surface(ratio: float, noise: float) -
     samples, counts = prepare(PointCloud(points + 100))
     assert counts.arrangement == "lines"
     assert counts.along_lines == len(points) - len(samples) > 0.2 * len(points)
-    assert any("The points lie along lines" in remark and "Kept points about" in remark for remark in counts.remarks())
+    assert any(
+        "The points lie along lines" in remark and f"Left out {counts.along_lines} points" in remark
+        for remark in counts.remarks()
+    )
     kept = samples.frame.to_world(samples.points) - 100
     found = np.linalg.norm(points[:, None] - kept[None, ::7], axis=2).argmin(axis=0)
     cosines = np.einsum("ij,ij->i", samples.normals[::7], normals[found])
@@ -54,3 +57,13 @@ def test_surfaces_and_slightly_uneven_lines_are_no_lines(rng: np.random.Generato
     points, normals = rings(2, 0.0)
     samples, counts = prepare(PointCloud(points, normals))
     assert (counts.arrangement, counts.along_lines, len(samples)) == (None, 0, len(points))
+
+
+def test_good_given_normals_keep_more_points_and_sparse_clouds_all() -> None:
+    points, normals = rings(12, 0.0)
+    given, estimated = (prepare(PointCloud(points, one))[1] for one in (normals, None))
+    assert given.normals == "given"
+    assert given.along_lines < 0.4 * len(points) < 0.6 * len(points) < estimated.along_lines
+    few, _ = rings(4, 0.0, 0.4, 0.25)
+    samples, counts = prepare(PointCloud(few))
+    assert (counts.arrangement, counts.half_line_distance, len(samples)) == ("lines", None, len(few))
