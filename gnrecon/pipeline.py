@@ -34,7 +34,7 @@ from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.ingest import is_single_sheet, layers_of, prepare, survey
+from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey
 from gnrecon.io import (
     Reading,
     as_cloud,
@@ -50,12 +50,12 @@ from gnrecon.io import (
     write_mesh,
 )
 from gnrecon.optim import Record
-from gnrecon.options import Options
+from gnrecon.options import Options, cells_for_sheet
 from gnrecon.report.estimate import estimate
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
-from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark
+from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark, thin_sheet_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
 from gnrecon.version import __version__
@@ -272,15 +272,18 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals))
-    bounds = bounds_of(samples)
-    run.options = run.options.for_scan(samples.frame.to_world(samples.points), bounds)
-    run.options.mesh().cells(bounds)  # an impossible edge length is refused before the work
+    bounds, points = bounds_of(samples), samples.frame.to_world(samples.points)
+    sheet = sheet_thickness(points, samples.normals)
+    run.options = run.options.for_scan(points, bounds, sheet)
+    cells, longest = run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
     run.options.require_reachable(bounds)
     if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
-    warnings = [] if ingested.layers is None else [ingested.layers.describe()]
-    few = few_points_remark(samples.frame.to_world(samples.points))
-    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings, *few])
+    layers = ingested.layers
+    warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
+    unclear = layers.offset if layers is not None and samples.estimated else None
+    warnings += thin_sheet_remark(sheet, unclear, cells, partial(cells_for_sheet, longest))
+    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested
 
 

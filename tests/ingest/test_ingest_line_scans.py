@@ -59,11 +59,17 @@ def test_surfaces_and_slightly_uneven_lines_are_no_lines(rng: np.random.Generato
     assert (counts.arrangement, counts.along_lines, len(samples)) == (None, 0, len(points))
 
 
-def test_good_given_normals_keep_more_points_and_sparse_clouds_all() -> None:
+def test_good_given_normals_keep_more_points() -> None:
     points, normals = rings(12, 0.0)
     given, estimated = (prepare(PointCloud(points, one))[1] for one in (normals, None))
     assert given.normals == "given"
     assert given.along_lines < 0.4 * len(points) < 0.6 * len(points) < estimated.along_lines
-    few, _ = rings(4, 0.0, 0.4, 0.25)
-    samples, counts = prepare(PointCloud(few))
-    assert (counts.arrangement, counts.half_line_distance, len(samples)) == ("lines", None, len(few))
+
+
+def test_sparse_clouds_whose_winding_number_is_clear_are_not_thinned() -> None:
+    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(-0.9, 0.9, 7))
+    radius = np.sqrt(1 - height**2)
+    points = np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel(), height.ravel()])
+    samples, counts = prepare(PointCloud(points))
+    assert (counts.arrangement, counts.half_line_distance, len(samples)) == ("lines", None, len(points))
+    assert (np.einsum("ij,ij->i", samples.normals, points) > 0.9).all()
