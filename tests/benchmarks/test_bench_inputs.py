@@ -1,4 +1,4 @@
-"""The benchmark of scans that people have: its scans are what they claim, its distance is one, its report is complete."""
+"""The benchmark of scans that people have: its distances, its scans of lines, and its report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gnrecon.runtime.errors import ExitCode
 
 def test_distances_are_means_both_ways(rng: np.random.Generator) -> None:
     ball = trimesh.creation.icosphere(3)
-    mesh = Mesh(np.asarray(ball.vertices) + [5, 0, 0], np.asarray(ball.faces))
+    mesh = Mesh(ball.vertices + np.array([5, 0, 0]), np.asarray(ball.faces))
     directions = rng.normal(size=(5_000, 3))
     points = 1.1 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [5, 0, 0]
     assert both_ways(mesh, points) == pytest.approx(0.1, abs=0.02)
