@@ -15,9 +15,7 @@ from gnrecon.runtime.errors import InputError
 POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]])
 
 
-def pcd(
-    path: Path, fields: str, sizes: str, kinds: str, counts: str, rows: np.ndarray, keyword: str = "FIELDS"
-) -> Path:
+def pcd(path: Path, keyword: str, fields: str, sizes: str, kinds: str, counts: str, rows: np.ndarray) -> Path:
     head = f"# .PCD v0.7\nVERSION 0.7\n{keyword} {fields}\nSIZE {sizes}\nTYPE {kinds}\nCOUNT {counts}\n"
     head += f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
     path.write_bytes(head.encode() + rows.tobytes())
