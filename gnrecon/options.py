@@ -178,18 +178,24 @@ class Options(OptionTable):
             return parse_reach(str(self.trim), spacing, self.units)
         return open_reach_spacings * spacing if (sheet if self.open is None else self.open) else None
 
-    def for_scan(self, points: Float, bounds: Float) -> Options:
+    def for_scan(
+        self, points: Float, bounds: Float, sheet: float | None = None, *, most_sheet_cells: int = 512
+    ) -> Options:
         """Return the options with a resolution that suits a scan where none was given.
 
         Parameters
         ----------
         points : array of shape (N, 3), file units, that will be fitted
         bounds : box in which they will be meshed, of shape (2, 3), file units
+        sheet : thickness of the thinnest sheet that they show, file units, if there is one
+        most_sheet_cells : along the box for its sake
         """
         if self.resolution is not None or self.edge_length is not None:
             return self
         longest = float(np.ptp(bounds, axis=0).max())
-        return replace(self, resolution=_default_cells(longest, points))
+        cells = _default_cells(longest, points)
+        thin = cells if sheet is None else cells_for_sheet(longest, sheet)
+        return replace(self, resolution=max(cells, thin if thin <= most_sheet_cells else cells))
 
     def require_reachable(self, bounds: Float, *, most_faces: float = 1e8, least_error: float = 1e-9) -> None:
         """Refuse lengths for which the mesh would not fit into memory, before the work.
@@ -260,6 +266,11 @@ def _shortened(value: float, *, most_digits: int = 30) -> str:
     # Python refuses to print whole numbers of thousands of digits.
     large = isinstance(value, int) and abs(value) >= 10**most_digits
     return f"a number of more than {most_digits} digits" if large else f"{value}"
+
+
+def cells_for_sheet(longest: float, thickness: float, *, cells_through: float = 2.0) -> int:
+    """Return the cells along a box that resolve a sheet: with fewer through it, its two sides meet in places."""
+    return math.ceil(cells_through * longest / thickness)
 
 
 def _default_cells(

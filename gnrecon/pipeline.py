@@ -34,7 +34,7 @@ from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.ingest import is_single_sheet, layers_of, prepare, survey
+from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey
 from gnrecon.io import (
     Reading,
     as_cloud,
@@ -50,12 +50,12 @@ from gnrecon.io import (
     write_mesh,
 )
 from gnrecon.optim import Record
-from gnrecon.options import Options
+from gnrecon.options import Options, cells_for_sheet
 from gnrecon.report.estimate import estimate
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
-from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark
+from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark, thin_sheet_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
 from gnrecon.runtime.memory_budget import require_memory
@@ -144,8 +144,7 @@ class Reconstruction:
         OutputError
             When the file cannot be written.
         """
-        # Only trimming makes a mesh open, and the file is verified as the mesh was.
-        bordered = not self.report["mesh"]["closed"]
+        bordered = not self.report["mesh"]["closed"]  # only by trimming; the file is verified as the mesh was
         mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
         return write_mesh(mesh, path, overwrite, verify=partial(verify_file, bordered=bordered))
 
@@ -211,7 +210,7 @@ def reconstruct(
         scan = _read(run, source, normals, format, reference)
         ingested = _ingest(run, scan)
         fitted = _fit(run, ingested)
-        surface = _trim(run, ingested, _mesh(run, scan, fitted))
+        surface = _trim(run, ingested, _mesh(run, scan, ingested, fitted))
         finished, uncertainty = _finish(run, scan, ingested, fitted, surface)
         report = run_report(run.source, run.options, run.stages, scan, ingested, fitted, surface, finished)
     interrupted = fitted.solution.interrupted
@@ -262,7 +261,8 @@ def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, refe
         limits = run.options.read_points, run.options.region(), run.options.column_names()
         cloud, reading = read_source(source, normals, format, *limits)
         run.progress.advance(0.5)
-        scan = ScanRead(cloud, reading, _reference(reference))
+        read = read_reference if isinstance(reference, str | Path) else as_shape
+        scan = ScanRead(cloud, reading, None if reference is None else read(reference))
     requested_names(cloud, run.options.attributes)  # a misspelt name is refused before the work
     return scan
 
@@ -273,13 +273,17 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals))
     bounds, points = bounds_of(samples), samples.frame.to_world(samples.points)
-    run.options = run.options.for_scan(points, bounds)
+    sheet = sheet_thickness(points, samples.normals)
+    run.options = run.options.for_scan(points, bounds, sheet)
     run.options.require_reachable(bounds)
     if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
         require_memory(expected.memory_mb)
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
-    layers = [] if ingested.layers is None else [ingested.layers.describe()]
-    run.remark([*scan.reading.remarks(), *counts.remarks(), *layers, *few_points_remark(points)])
+    layers, cells = ingested.layers, run.options.mesh().cells(bounds)
+    warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
+    unclear = layers.offset if layers is not None and samples.estimated else None
+    warnings += thin_sheet_remark(sheet, unclear, cells, partial(cells_for_sheet, np.ptp(bounds, axis=0).max()))
+    run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested
 
 
@@ -293,8 +297,9 @@ def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
         run.progress.step(record, total)
 
     with run.stages("fit"):
-        where = options.work_dir, options.block_scheduler
-        sdf, solution = fit(samples, options.fit(), step, run.progress.advance, *where)
+        sdf, solution = fit(
+            samples, options.fit(), step, run.progress.advance, options.work_dir, options.block_scheduler
+        )
         residuals = Misfit.of(sdf, samples)
         held_out = None if samples.held_out is None else Misfit.of(sdf, samples.held_out)
     run.remark([solution.status])
@@ -303,7 +308,7 @@ def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
     return Fitted(sdf, solution, residuals, held_out)
 
 
-def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
+def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted) -> MeshedScan:
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
@@ -312,8 +317,9 @@ def _mesh(run: _PipelineRun, scan: ScanRead, fitted: Fitted) -> MeshedScan:
     run.remark([] if sdf.data is None else coarse_parts_remark(sdf.data, cell))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
-    neighbourhood = Neighbourhood(scan.cloud.points)
-    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, neighbourhood, neighbourhood.spacing(), None)
+    around = Neighbourhood(scan.cloud.points)
+    spacing = ingested.counts.half_line_distance or around.spacing()
+    return MeshedScan(meshed.mesh, meshed.fineness, meshed.actions, around, spacing, None)
 
 
 def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedScan:
@@ -392,9 +398,3 @@ def _files(source: Any) -> list[str | Path]:
         return [source]
     paths = list(source) if isinstance(source, list | tuple) else []
     return paths if all(isinstance(path, str | Path) for path in paths) else []
-
-
-def _reference(reference: Any) -> Mesh | PointCloud | None:
-    if reference is None:
-        return None
-    return read_reference(reference) if isinstance(reference, str | Path) else as_shape(reference)

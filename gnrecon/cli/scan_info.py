@@ -9,7 +9,7 @@ from typing import Any
 
 from gnrecon.fit import bounds_of
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest import Layers, layers_of, prepare, survey
+from gnrecon.ingest import Layers, layers_of, prepare, sheet_thickness, survey
 from gnrecon.ingest.ingest_parameters import SurveyParameters
 from gnrecon.io import Reading
 from gnrecon.options import Options
@@ -47,7 +47,8 @@ def _plan(cloud: PointCloud, reading: Reading, options: Options) -> tuple[dict[s
     """What a run would do, as plain values, and the layers that it would find."""
     samples, counts = prepare(cloud, **options.ingest())
     fit, bounds = options.fit(), bounds_of(samples)
-    options = options.for_scan(samples.frame.to_world(samples.points), bounds)
+    points = samples.frame.to_world(samples.points)
+    options = options.for_scan(points, bounds, sheet_thickness(points, samples.normals))
     expected = estimate(reading.points, len(samples), bounds, options)
     plan = {
         "points": len(samples),

@@ -18,6 +18,7 @@ class FitSummary:
     length : median length scale of the local features, file units
     position_noise : of the points, file units
     angle_noise : of the normals, degrees
+    shown_noise : that the points themselves show, file units, or None where it is unknown or was smoothed away
     flipped_share : share of the normals that were turned around, in [0, 1]
     outliers : points that were left out
     averaging_width : of the bilateral filter, in disk radii, or None where points were not averaged
@@ -34,6 +35,7 @@ class FitSummary:
     length: float
     position_noise: float
     angle_noise: float
+    shown_noise: float | None = None
     flipped_share: float = 0.0
     outliers: int = 0
     averaging_width: float | None = None
@@ -62,8 +64,18 @@ def _solved(summary: FitSummary) -> Iterator[str]:
             f"Chosen from the data: length scale {summary.length:.3g}, noise {summary.position_noise:.2g} in position "
             f"and {summary.angle_noise:.2g} degrees in normals."
         )
+        yield from _disagreement(summary)
     else:
         yield f"The length scale is {summary.length:.3g}, the shortest that the samples of sharp faces allow."
+
+
+def _disagreement(summary: FitSummary, *, notable_factor: float = 3.0) -> Iterator[str]:
+    """Yield a sentence where the noise that the fit assumes is far from the noise that the points show."""
+    shown, assumed = summary.shown_noise, summary.position_noise
+    if not shown or summary.averaging_width is not None or shown / notable_factor <= assumed <= shown * notable_factor:
+        return
+    way = "smooths more" if assumed > shown else "follows the points more closely"
+    yield f"Their spread about quadrics suggests a noise of {shown:.2g} in position; the fit {way}."
 
 
 def _changed_data(summary: FitSummary) -> Iterator[str]:

@@ -298,6 +298,7 @@ def _summary(detail: Detail, data: _Data, options: FitOptions) -> FitSummary:
         length=chosen["length"],
         position_noise=chosen["position_noise"],
         angle_noise=chosen["angle_noise"],
+        shown_noise=None if data.scan.noise is None else data.scan.noise * data.scan.frame.scale,
         snapped_points=0 if snapped is None else int(snapped.on_primitive.sum()),
         primitives=0 if snapped is None else snapped.primitives,
         edge_samples=None if data.sharp is None else len(data.samples) - len(data.scan) - len(data.across),

@@ -6,6 +6,7 @@ from gnrecon.ingest.double_walls import Layers, layers_of
 from gnrecon.ingest.ingest_parameters import IngestParameters
 from gnrecon.ingest.isolated_clusters import isolated_clusters
 from gnrecon.ingest.noise import Noise, estimate_noise
+from gnrecon.ingest.normal_agreement import sheet_thickness
 from gnrecon.ingest.orientation import flip_if_inward, oriented_normals
 from gnrecon.ingest.outliers import find_outliers, parse_outliers
 from gnrecon.ingest.point_spacing import mean_spacing
@@ -34,6 +35,7 @@ __all__ = [
     "parse_outliers",
     "prepare",
     "require_mode",
+    "sheet_thickness",
     "subsample",
     "survey",
 ]

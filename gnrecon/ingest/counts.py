@@ -21,6 +21,8 @@ class IngestCounts:
     clusters : dropped, because they are in isolated clusters
     clusters_found : points in isolated clusters that were kept, for the same reasons
     inner : dropped, because they fill the volume below its surface
+    along_lines : dropped, because they lie closer along lines than anything is known between the lines
+    half_line_distance : about half of the distance of the lines, in file units; None elsewhere
     arrangement : ``"lines"`` or ``"volume"`` where the points lie along lines or fill a volume; None on surfaces
     held_out : validation points, which the fit does not use
     moved : root mean square distance by which smoothing moved the points, in file units; None without smoothing
@@ -41,6 +43,8 @@ class IngestCounts:
     clusters: int = 0
     clusters_found: int = 0
     inner: int = 0
+    along_lines: int = 0
+    half_line_distance: float | None = None
     arrangement: str | None = None
     held_out: int = 0
     moved: float | None = None
@@ -70,10 +74,10 @@ class IngestCounts:
         if self.clusters_found:
             sentences.append(f"Kept {self.clusters_found} points in isolated clusters.")
         if self.arrangement == "lines":
+            left_out = f" Left out {self.along_lines} points along the lines." if self.along_lines else ""
             sentences.append(
                 "The points lie along lines that are far apart for the distance of points on a line; what is between "
-                "the lines is interpolated. Normals from the scanner, or --spacing of about half the distance of the "
-                "lines, help."
+                f"the lines is interpolated.{left_out}"
             )
         if self.arrangement == "volume":
             what = f" Kept its outer surface, without {self.inner} points below it." if self.inner else ""

@@ -64,6 +64,31 @@ class NormalParameters:
 
 
 @dataclass(frozen=True)
+class LineParameters:
+    """Points along lines (`ingest.line_scans`)."""
+
+    neighbours: int = 8  # of a point, itself included, that may lie on one line
+    queries: int = 2000  # random points at which they are looked up
+    most_width_share: float = 0.05  # second principal sum of squares over the first; 0.4 on surfaces, 0.3 in the median
+    # where points are three times denser along lines than across
+    least_share: float = 0.3  # of points on lines: 0.4 to 0.9 at four times, and 0.2 at three times
+    most_thinned_share: float = 0.1  # of points on lines, below which they are thinned enough
+    growth: float = 1.5  # of the side of the cubes in each step of thinning
+    least_points: int = 50  # that thinning leaves
+    given_side_share: float = 1 / 6  # of the side of these cubes, where normals are given: the fit then uses points
+    # that are up to a dozen times closer on a line than lines are to each other
+    most_own_width_share: float = (
+        0.2  # of the neighbours of a point that gets a normal across lines: noise widens lines
+    )
+    across_neighbours: int = 24  # among which points on other lines are looked for
+    most_along_cosine: float = 0.5  # of the angle, 60 degrees, between the line and a point off it
+    own_line_weight: float = 2.0  # on the distances of points of the same line
+    least_opposite_cosine: float = 0.3  # of the turn between both sides, at least 107 degrees
+    most_second_ratio: float = 3.0  # of the distances of the points on both sides; beyond, only the nearer one counts
+    chunk_points: int = 50_000  # handled at a time, which bounds memory
+
+
+@dataclass(frozen=True)
 class OrientationParameters:
     """Signs of normals (`ingest.orientation`)."""
 
@@ -134,6 +159,7 @@ class IngestParameters:
     clusters: IsolatedClusterParameters = IsolatedClusterParameters()
     noise: NoiseParameters = NoiseParameters()
     normals: NormalParameters = NormalParameters()
+    lines: LineParameters = LineParameters()
     orientation: OrientationParameters = OrientationParameters()
     smoothing: SmoothingParameters = SmoothingParameters()
     survey: SurveyParameters = SurveyParameters()

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.voxel_grid import cells_of
 from gnrecon.ingest.ingest_parameters import IsolatedClusterParameters
 from gnrecon.ingest.point_spacing import neighbour_spacing
-from gnrecon.ingest.voxel_grid import cells_of
 
 
 def isolated_clusters(points: Float, *, parameters: IsolatedClusterParameters = IsolatedClusterParameters()) -> Mask:

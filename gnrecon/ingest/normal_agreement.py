@@ -93,3 +93,35 @@ def _depth_variation(heights: Float, opposing: Mask, *, least_neighbours: int = 
     squares = (np.where(opposing, heights - means[:, None], 0.0) ** 2).sum(axis=1) / (count - 1)
     solid = means != 0
     return float(np.median(np.sqrt(squares[solid]) / np.abs(means[solid]))) if solid.any() else np.inf
+
+
+def sheet_thickness(
+    points: Float,
+    normals: Float,
+    *,
+    neighbours: int = 16,
+    queries: int = 10_000,
+    least_share: float = 0.02,
+    percentile: float = 10.0,
+) -> float | None:
+    """Return the thickness of the thinnest sheets that two opposite layers of points show; None where there are none.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3); outward unit normals
+    neighbours : of a point, among which the layer behind it is looked for; farther layers are far for the spacing
+    queries : random points at which it is measured
+    least_share : of these with a layer behind them, below which it may be noise
+    percentile : of the depths of these layers
+    """
+    from scipy.spatial import cKDTree
+
+    some = np.random.default_rng(0).permutation(len(points))[:queries]
+    near = cKDTree(points).query(points[some], min(neighbours + 1, len(points)))[1]
+    depths = -np.einsum("gki,gi->gk", points[near] - points[some, None], normals[some])
+    behind = (np.einsum("gki,gi->gk", normals[near], normals[some]) < -0.9) & (depths > 0)
+    found = np.flatnonzero(behind.any(axis=1))
+    if len(found) < least_share * len(some):
+        return None
+    depths = np.where(behind, depths, 0.0)[found].sum(axis=1) / behind[found].sum(axis=1)
+    return float(np.percentile(depths, percentile))

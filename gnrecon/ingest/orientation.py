@@ -246,7 +246,7 @@ def require_orientation(mode: str) -> None:
 
 
 def with_outward_normals(
-    cloud: PointCloud, mode: str, *, parameters: IngestParameters = IngestParameters()
+    cloud: PointCloud, mode: str, axes: Float | None = None, *, parameters: IngestParameters = IngestParameters()
 ) -> tuple[PointCloud, Orientation]:
     """Return the cloud with outward unit normals, and their origin.
 
@@ -254,6 +254,8 @@ def with_outward_normals(
     ----------
     cloud : with unit normals or none
     mode : one of `ORIENTATIONS`
+    axes : array of shape (N, 3), optional
+        Unit normals of either sign, to be oriented where normals are estimated; by default from the neighbours.
     parameters : tuning constants
 
     Raises
@@ -263,9 +265,9 @@ def with_outward_normals(
     """
     normals = cloud.normals
     if normals is None or mode == "estimate":
-        found = oriented_normals(cloud.points, cloud.origins, parameters=parameters)
+        found = oriented_normals(cloud.points, cloud.origins, axes, parameters=parameters)
     elif mode == "auto" and are_inconsistent(cloud.points - cloud.points.mean(axis=0), normals):
-        found = oriented_normals(cloud.points, cloud.origins, parameters=parameters)
+        found = oriented_normals(cloud.points, cloud.origins, axes, parameters=parameters)
         found = replace(found, how=f"{found.how}, because the given ones are inconsistent")
     elif mode == "signs":
         sides = oriented_normals(cloud.points, cloud.origins, along=normals, parameters=parameters)

@@ -12,12 +12,14 @@ from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.clean import clean
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
+from gnrecon.ingest.line_scans import lie_on_lines, normals_across_lines, rows_along_lines, thinned_along_lines
 from gnrecon.ingest.noise import estimate_noise
-from gnrecon.ingest.orientation import require_orientation, with_outward_normals
+from gnrecon.ingest.normals import unoriented_normals
+from gnrecon.ingest.orientation import Orientation, are_inconsistent, require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.smooth import smooth_points
 from gnrecon.ingest.subsample import subsample as thin
-from gnrecon.ingest.survey import fill_a_volume, lie_on_lines, outer_surface
+from gnrecon.ingest.survey import fill_a_volume, outer_surface
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -69,13 +71,20 @@ def prepare(
     cleaned, counts = clean(cloud, outliers, clusters=clusters, units=units, parameters=parameters)
     advance(0.2)  # cleaning takes about a fifth of the time, and normals another half
     centred = cleaned.points - cleaned.points.mean(axis=0)
-    arrangement = "lines" if lie_on_lines(centred) else "volume" if fill_a_volume(centred) else None
+    arrangement = (
+        "lines" if lie_on_lines(centred, parameters=parameters.lines) else "volume" if fill_a_volume(centred) else None
+    )
     counts = replace(counts, arrangement=arrangement)
     if arrangement == "volume" and cleaned.normals is None:
         outer, normals = outer_surface(centred)
         cleaned = cleaned.select(outer).with_normals(normals)
         counts = replace(counts, inner=int((~outer).sum()))
-    oriented, orientation = with_outward_normals(cleaned, orient, parameters=parameters)
+    if arrangement == "lines":
+        cleaned, orientation, half = _along_lines(cleaned, orient, parameters)
+        counts = replace(counts, along_lines=len(centred) - len(cleaned), half_line_distance=half)
+        oriented = cleaned.with_normals(orientation.normals)
+    else:
+        oriented, orientation = with_outward_normals(cleaned, orient, parameters=parameters)
     if counts.inner:
         orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
@@ -92,6 +101,30 @@ def prepare(
     message = "Kept %d of %d points, %d for validation; normals: %s."
     _log.info(message, len(kept), len(cloud), len(held_out), orientation.how)
     return _in_unit_ball(kept, held_out, orientation.estimated), counts
+
+
+def _along_lines(
+    cloud: PointCloud, orient: str, parameters: IngestParameters
+) -> tuple[PointCloud, Orientation, float | None]:
+    """Return a cloud of points along lines, thinned, its normals, and about half of the distance of the lines.
+
+    In sparse clouds, normals by the winding number of all points need no neighbours, and may be better (None then).
+    """
+    points, limits = cloud.points - cloud.points.mean(axis=0), parameters.lines
+    rows, side = thinned_along_lines(points, parameters=limits)
+    given = cloud.normals is not None and orient != "estimate"
+    if given and cloud.normals is not None and not (orient == "auto" and are_inconsistent(points, cloud.normals)):
+        fewer = cloud.select(rows_along_lines(points, limits.given_side_share * side))
+        return fewer, with_outward_normals(fewer, orient, parameters=parameters)[1], side
+    axes, found = normals_across_lines(points, rows, side, parameters=limits)
+    axes[~found] = unoriented_normals(points[rows], parameters=parameters.normals)[~found]
+    fewer = cloud.select(rows)
+    orientation = with_outward_normals(fewer, orient, axes, parameters=parameters)[1]
+    if len(cloud) <= parameters.orientation.gauss_points:
+        plain = with_outward_normals(cloud, orient, parameters=parameters)[1]
+        if (plain.confidence or 0.0) >= (orientation.confidence or 0.0):
+            return cloud, plain, None
+    return fewer, orientation, side
 
 
 def _hold_out(cloud: PointCloud, share: float | None, seed: int) -> tuple[PointCloud, PointCloud]:
@@ -122,5 +155,5 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Sa
     if len(held_out) and held_out.normals is not None:
         held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
     points = frame.to_unit(kept.points)
-    noise = estimate_noise(points, mean_spacing(points)).deviation if estimated and len(points) >= 16 else None
+    noise = estimate_noise(points, mean_spacing(points)).deviation if len(points) >= 16 else None
     return Samples(points, kept.normals, frame, held, estimated, noise)

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.local_pca import surface_variation
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.geometry.voxel_grid import voxel_representatives, voxel_representatives_of_side
 from gnrecon.ingest.point_spacing import mean_spacing
-from gnrecon.ingest.voxel_grid import voxel_representatives, voxel_representatives_of_side
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import UsageError
 

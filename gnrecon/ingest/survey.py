@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.geometry.local_pca import principal_sums, tangent_coordinates
+from gnrecon.geometry.local_pca import surface_variation, tangent_coordinates
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.ingest.clean import distinct_positions, unit_normals, usable_positions
 from gnrecon.ingest.ingest_parameters import IngestParameters, SurveyParameters
@@ -141,23 +141,6 @@ def is_single_sheet(
     return facing >= least_facing_share and is_open(outwardness(points - points.mean(axis=0), normals))
 
 
-def lie_on_lines(points: Float, *, neighbours: int = 8, queries: int = 2000, most_width_share: float = 0.05) -> bool:
-    """Return whether points lie along lines that are far apart, as the profiles of a laser do.
-
-    The nearest points are then all on the same line: their second principal variance is small against the first. On
-    surfaces it is 0.4 of it, and where points are three times denser along lines than across, 0.3.
-
-    Parameters
-    ----------
-    points : array of shape (N, 3), centred, distinct
-    neighbours : of a point, itself included
-    queries : random points at which they are looked up
-    most_width_share : ratio of the variances, in the median
-    """
-    sums = _neighbour_sums(points, neighbours, queries)
-    return bool(len(points) > neighbours and np.median(sums[:, 1] / sums[:, 2]) < most_width_share)
-
-
 def fill_a_volume(
     points: Float, *, neighbours: int = 64, queries: int = 2000, points_per_neighbour: int = 16, least: float = 0.15
 ) -> bool:
@@ -175,17 +158,11 @@ def fill_a_volume(
     """
     if len(points) < points_per_neighbour * neighbours:
         return False
-    sums = _neighbour_sums(points, neighbours, queries)
-    return float(np.median(sums[:, 0] / sums.sum(axis=1))) > least
-
-
-def _neighbour_sums(points: Float, neighbours: int, queries: int) -> Float:
-    """Return the squared extents of neighbourhoods along their principal axes, of shape (Q, 3), smallest first."""
     from scipy.spatial import cKDTree
 
     some = np.random.default_rng(0).permutation(len(points))[:queries]
-    near = cKDTree(points).query(points[some], min(neighbours, len(points)))[1]
-    return np.maximum(principal_sums(points[near]), np.finfo(np.float64).tiny)
+    near = cKDTree(points).query(points[some], neighbours)[1]
+    return float(np.median(surface_variation(points[near]))) > least
 
 
 def outer_surface(

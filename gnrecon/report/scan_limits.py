@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -19,6 +21,31 @@ def few_points_remark(points: Float, *, few: int = 100) -> list[str]:
     return [
         f"There are only {len(points)} points, {spacing:.3g} apart ({share:.0f} % of the diagonal): between them the "
         "surface is the simplest guess, and shapes smaller than that are unknown."
+    ]
+
+
+def thin_sheet_remark(
+    thickness: float | None, layers: float | None, cells: int, needed: Callable[[float], int]
+) -> list[str]:
+    """Return a sentence where the mesh does not resolve the thinnest sheet that two layers of points show.
+
+    Parameters
+    ----------
+    thickness : between layers that face opposite ways, file units, if there are any
+    layers : distance of layers that face the same way by estimated normals, file units, if there are any
+    cells : of the mesh, along its box
+    needed : the cells that a thickness needs
+    """
+    if layers is not None:
+        return [
+            "The two layers may also be the two sides of a thin sheet, which estimated normals do not show: give "
+            f"outward normals and --resolution {needed(layers)} for that."
+        ]
+    if thickness is None or cells >= needed(thickness):
+        return []
+    return [
+        f"Two opposite layers of points are {thickness:.3g} apart, a sheet too thin for {cells} cells along the box; "
+        f"--resolution {needed(thickness)} resolves it."
     ]
 
 

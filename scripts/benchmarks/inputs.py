@@ -22,7 +22,7 @@ from benchmarks.harness import command_line
 from benchmarks.harness.measurement import timed
 from benchmarks.harness.tables import number_or_dash, row_table
 from gnrecon.export import verify
-from gnrecon.export.metrics import SurfaceQuery
+from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -66,6 +66,14 @@ def terrain(count: int, rng: np.random.Generator) -> Float:
     return np.column_stack([x, y, np.sin(x) + np.cos(1.3 * y) + 0.3 * np.sin(3 * x + 2 * y)])
 
 
+def rings(ratio: float, *, radius: float = 0.4, apart: float = 0.15) -> Float:
+    """Return rings around the tube of a torus, with points denser along them by a ratio than the rings are apart."""
+    v, u = np.meshgrid(np.arange(0, 2 * np.pi, apart / ratio / radius), np.arange(0, 2 * np.pi - apart / 2, apart))
+    u, v = u.ravel(), v.ravel()
+    out = 1 + radius * np.cos(v)
+    return np.column_stack([out * np.cos(u), out * np.sin(u), radius * np.sin(v)])
+
+
 def strips(count: int, rng: np.random.Generator) -> Float:
     """Return points of two overlapping flights over one terrain, in which some points come close together."""
     points = terrain(count, rng)
@@ -80,21 +88,22 @@ def _noisy(points: Float, deviation: float, rng: np.random.Generator) -> PointCl
     return PointCloud(points + deviation * rng.standard_normal(points.shape))
 
 
-def _made(name: str) -> KnownScan:
-    """Make one of the scans of `KINDS`."""
+def _made(name: str, count: int) -> KnownScan:
+    """Make one of the scans of `KINDS`, of about so many points."""
     rng = np.random.default_rng(0)
-    points, normals = torus(4000, rng)
+    points, normals = torus(count, rng)
     dense = torus(60_000, rng)[0]
     made: dict[str, Callable[[], KnownScan]] = {
-        "objects on a plate": lambda: KnownScan(_noisy(scene(4000, rng), 0.01, rng), scene(60_000, rng)),
-        "terrain": lambda: KnownScan(_noisy(terrain(4000, rng), 0.01, rng), terrain(60_000, rng)),
-        "overlapping strips": lambda: KnownScan(_noisy(strips(3000, rng), 0.0, rng), terrain(60_000, rng)),
+        "objects on a plate": lambda: KnownScan(_noisy(scene(count, rng), 0.01, rng), scene(60_000, rng)),
+        "terrain": lambda: KnownScan(_noisy(terrain(count, rng), 0.01, rng), terrain(60_000, rng)),
+        "overlapping strips": lambda: KnownScan(_noisy(strips(3 * count // 4, rng), 0.0, rng), terrain(60_000, rng)),
         "normals half turned": lambda: KnownScan(
-            PointCloud(points, normals * rng.choice([-1.0, 1.0], (4000, 1))), dense
+            PointCloud(points, normals * rng.choice([-1.0, 1.0], (count, 1))), dense
         ),
         "noise, no normals": lambda: KnownScan(_noisy(points, 0.013, rng), dense),
+        "points along lines": lambda: KnownScan(_noisy(rings(count / 500), 0.002, rng), dense),
         "filled volume": lambda: KnownScan(
-            PointCloud(ball(4000, rng) * rng.random((4000, 1)) ** (1 / 3)), ball(60_000, rng)
+            PointCloud(ball(count, rng) * rng.random((count, 1)) ** (1 / 3)), ball(60_000, rng)
         ),
     }
     return made[name]()
@@ -106,6 +115,7 @@ KINDS = (
     "overlapping strips",
     "normals half turned",
     "noise, no normals",
+    "points along lines",
     "filled volume",
 )
 
@@ -132,16 +142,16 @@ def both_ways(mesh: Mesh, truth: Float) -> float:
     """Return the mean of the distances from the truth to a mesh and from the mesh to the truth."""
     from scipy.spatial import cKDTree
 
-    there = float(SurfaceQuery(mesh).nearest(truth)[0].mean())
+    there = float(nearest_on_surface(mesh, truth)[0].mean())
     back = float(cKDTree(truth).query(_sampled(mesh))[0].mean())
     return (there + back) / 2
 
 
-def figures(scan: KnownScan, quality: str) -> dict[str, Any]:
-    """Return the figures of both methods for a scan, and what gnrecon remarks."""
+def figures(scan: KnownScan, **options: Any) -> dict[str, Any]:
+    """Return the figures of both methods for a scan; the options are those of `gnrecon.reconstruct`."""
     cloud = scan.cloud
     truth = cloud.points[np.isfinite(cloud.points).all(axis=1)] if scan.truth is None else scan.truth
-    seconds, result = timed(lambda: reconstruct(cloud, quality=quality))
+    seconds, result = timed(lambda: reconstruct(cloud, **options))
     facts = verify(result.mesh)
     found: dict[str, Any] = {"points": len(cloud), "normals": result.report["ingest"]["normals"]}
     found["gnrecon"] = {
@@ -157,25 +167,29 @@ def figures(scan: KnownScan, quality: str) -> dict[str, Any]:
     return found
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the benchmark with arguments; return the exit code, that of a batch with failures if gnrecon made no mesh."""
+def main(arguments: Sequence[str], **options: Any) -> int:
+    """Run the benchmark with arguments; return the exit code, that of a batch with failures if gnrecon made no mesh.
+
+    The options are those of `gnrecon.reconstruct`.
+    """
     parser = command_line.benchmark_parser("inputs", __doc__)
     command_line.add_outputs(parser)
     stored = command_line.shared_data().parent / "cases"
     parser.add_argument("--data", type=Path, default=stored, metavar="DIR", help="folder of cases, a folder for each")
     command_line.add_quality(parser)
+    parser.add_argument("--points", type=int, default=4000, metavar="N", help="of the scans that are made here")
     parser.add_argument("--cases", nargs="*", metavar="NAME", help="only those whose names begin so")
     chosen: argparse.Namespace = parser.parse_args(arguments)
     command_line.require_folders(chosen.json)
     folders = sorted(folder for folder in chosen.data.glob("[0-9]*") if any(folder.glob("scan.*")))
-    scans: dict[str, Callable[[], KnownScan]] = {name: partial(_made, name) for name in KINDS}
+    scans: dict[str, Callable[[], KnownScan]] = {name: partial(_made, name, chosen.points) for name in KINDS}
     scans |= {folder.name: partial(stored_case, folder) for folder in folders}
     report: dict[str, Any] = command_line.provenance("inputs", arguments) | {"cases": []}
     for name, load in scans.items():
         if chosen.cases and not name.startswith(tuple(chosen.cases)):
             continue
         try:
-            report["cases"].append({"case": name} | figures(load(), chosen.quality or "normal"))
+            report["cases"].append({"case": name} | figures(load(), quality=chosen.quality or "normal", **options))
         except GnreconError as error:
             report["cases"].append({"case": name, "error": str(error)})
         command_line.write_report(chosen.json, report)

@@ -16,7 +16,7 @@ from gnrecon.export.export_parameters import ExportParameters, ResolutionParamet
 from gnrecon.export.mesh_field import MeshOptions, cells_for_curvature, mesh_field
 from gnrecon.export.resolution import chord_error
 from gnrecon.ingest.point_spacing import neighbour_spacing
-from gnrecon.options import Options
+from gnrecon.options import Options, cells_for_sheet
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError
 
@@ -110,7 +110,10 @@ def test_cells_follow_the_points_where_nothing_was_asked_for() -> None:
     assert Options().for_scan(points[:5], box).resolution == 128
     assert Options().for_scan(points, 3 * box).resolution == 256
     assert Options().for_scan(np.zeros((9, 3)), box).resolution == 256
-    assert Options(resolution=50).for_scan(points, box).resolution == 50
+    assert Options(resolution=50).for_scan(points, box, sheet=0.01).resolution == 50
+    # A box of length 1: two cells through a sheet, up to 512 along the box.
+    assert Options().for_scan(points, box, sheet=1 / 200).resolution == cells_for_sheet(1, 1 / 200) == 400
+    assert Options().for_scan(points, box, sheet=1 / 2000) == Options().for_scan(points, box)
 
 
 def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from gnrecon.fit.fit_summary import FitSummary, describe
 from gnrecon.fit.penalties.regularisers import regularisers
 
@@ -52,3 +54,13 @@ def test_each_step_that_did_something_has_a_sentence() -> None:
 def test_a_ball_and_its_gaps() -> None:
     summary = FitSummary(2, 0.1, 0.01, 1.0, ball_radius=16.0, ball_points=80, ball_samples=900)
     assert "Snapped 80 points to a ball of radius 16. Filled gaps of the ball with 900 samples." in describe(summary)
+
+
+def test_a_noise_far_from_that_of_the_points_is_said() -> None:
+    summary = FitSummary(cubes=2, length=0.25, position_noise=0.01, angle_noise=2.0)
+    for shown, way in ((0.031, "follows the points more closely"), (0.003, "smooths more")):
+        text = describe(replace(summary, shown_noise=shown))
+        assert f"Their spread about quadrics suggests a noise of {shown} in position; the fit {way}." in text
+        assert "suggests" not in describe(replace(summary, shown_noise=shown, averaging_width=2.0))
+    for shown in (None, 0.0, 0.004, 0.029):
+        assert "suggests" not in describe(replace(summary, shown_noise=shown))

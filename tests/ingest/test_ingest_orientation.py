@@ -11,7 +11,7 @@ from made_shapes import sphere
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest import prepare
+from gnrecon.ingest import prepare, sheet_thickness
 from gnrecon.ingest.orientation import are_inconsistent, oriented_normals
 from gnrecon.ingest.orientation_methods import orient_towards_scanner
 from gnrecon.io import read_scans
@@ -140,3 +140,13 @@ def test_normals_at_right_angles_or_on_two_sides_of_a_sheet_are_consistent(rng: 
         normals[rows, axis] = 2 * side - 1
         assert not are_inconsistent(points, normals)
         assert are_inconsistent(points, normals * rng.choice([-1.0, 1.0], (3000, 1)))
+
+
+def test_two_opposite_layers_show_the_thickness_of_a_sheet(rng: np.random.Generator) -> None:
+    sides = rng.choice([-1.0, 1.0], 3000)
+    flat = np.column_stack([rng.uniform(-1, 1, (3000, 2)), 0.02 * sides])
+    normals = sides[:, None] * [[0.0, 0, 1]]
+    assert sheet_thickness(flat + 1000, normals) == pytest.approx(0.04)
+    assert sheet_thickness(flat, np.abs(normals)) is None
+    assert sheet_thickness(flat, -normals) is None  # the layers face each other: nothing is between them
+    assert sheet_thickness(*sphere(3000)) is None

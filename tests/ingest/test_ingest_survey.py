@@ -8,9 +8,10 @@ import pytest
 from analytic_clouds import torus
 
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.ingest import IngestCounts, prepare
+from gnrecon.ingest import prepare
+from gnrecon.ingest.line_scans import lie_on_lines
 from gnrecon.ingest.repeated_points import repeated_points
-from gnrecon.ingest.survey import Survey, fill_a_volume, is_single_sheet, lie_on_lines, survey
+from gnrecon.ingest.survey import Survey, fill_a_volume, is_single_sheet, survey
 
 
 def sphere(rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -89,19 +90,6 @@ def test_single_sheets_are_terrain_and_walls_not_bowls_or_solids(rng: np.random.
     assert not is_single_sheet(terrain, up * rng.choice([-1.0, 1.0], (3000, 1)))
 
 
-def profiles(ratio: int, rng: np.random.Generator) -> np.ndarray:
-    """Rings around a tube, with points `ratio` times denser along them than the rings are apart."""
-    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 20 * ratio, endpoint=False), 0.314 * np.arange(20))
-    points = np.column_stack([np.cos(angle).ravel(), np.sin(angle).ravel(), height.ravel()])
-    return points + 0.002 * rng.standard_normal(points.shape)
-
-
-@pytest.mark.parametrize("ratio", [6, 30])
-def test_points_on_lines_are_said_to_be(ratio: int, rng: np.random.Generator) -> None:
-    assert lie_on_lines(profiles(ratio, rng))
-    assert "The points lie along lines" in " ".join(IngestCounts(1, arrangement="lines").remarks())
-
-
 def test_a_filled_volume_is_its_outer_surface(rng: np.random.Generator) -> None:
     points = sphere(rng)[0][:4000] * rng.random((4000, 1)) ** (1 / 3) * [1.0, 2.0, 1.5] + 10
     samples, counts = prepare(PointCloud(points))
@@ -115,8 +103,8 @@ def test_a_filled_volume_is_its_outer_surface(rng: np.random.Generator) -> None:
 
 def test_surfaces_are_neither_lines_nor_volumes(rng: np.random.Generator) -> None:
     grid = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0)), -1).reshape(-1, 2)
-    clouds = [sphere(rng, 0.04)[0], profiles(2, rng), np.column_stack([grid, np.zeros(1600)])]
-    clouds.append(np.concatenate([clouds[2], clouds[2] + [0.5, 0.5, 0.3]]))  # both sides of a thin sheet
+    clouds = [sphere(rng, 0.04)[0], np.column_stack([grid, np.zeros(1600)])]
+    clouds.append(np.concatenate([clouds[1], clouds[1] + [0.5, 0.5, 0.3]]))  # both sides of a thin sheet
     for points in clouds:
         assert not lie_on_lines(points)
         assert not fill_a_volume(points)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scan_files import torus
 
-from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark
+from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark, thin_sheet_remark
 
 
 def test_few_points_say_how_far_apart_they_are() -> None:
@@ -38,3 +38,16 @@ def test_scans_of_one_part_are_never_said_to_have_more() -> None:
     rng = np.random.default_rng(0)
     for points in (torus(50, rng)[0], rng.normal(size=(3000, 3)), np.zeros((5, 3)), np.empty((0, 3))):
         assert coarse_parts_remark(points, 10.0) == []
+
+
+def test_a_sheet_too_thin_for_the_cells_is_said() -> None:
+    def needed(thickness: float) -> int:
+        return round(100 / thickness)
+
+    assert thin_sheet_remark(None, None, 10, needed) == thin_sheet_remark(0.5, None, 200, needed) == []
+    (sentence,) = thin_sheet_remark(0.25, None, 256, needed)
+    assert "0.25 apart" in sentence
+    assert "--resolution 400 resolves it" in sentence
+    (sentence,) = thin_sheet_remark(None, 0.2, 256, needed)
+    assert "the two sides of a thin sheet" in sentence
+    assert "--resolution 500" in sentence

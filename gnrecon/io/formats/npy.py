@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Values
-from gnrecon.io.contents import Contents, from_columns, guard_parser
+from gnrecon.io.contents import Contents, decoded_normals, from_columns, guard_parser
 from gnrecon.io.formats.table_columns import guessed, named_by_user
 from gnrecon.runtime.errors import InputError
 
@@ -39,25 +40,15 @@ def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
     contents = _cloud(arrays[chosen], columns)
     rest = {name: one for name, one in arrays.items() if name != chosen and _fits(one, len(contents.points))}
     normals = next((rest.pop(name) for name in list(rest) if name.lower() in ("normals", "normal")), None)
+    lost: tuple[str, ...] = ()
     if normals is not None and normals.shape[1:] == (3,):
-        named = {
-            **dict(zip("xyz", contents.points.T, strict=True)),
-            **dict(zip(("nx", "ny", "nz"), normals.T, strict=True)),
-        }
-        given = from_columns(named)
-        contents = Contents(given.points, given.normals, attributes=contents.attributes, remarks=contents.remarks)
+        directions, lost = decoded_normals(normals)
+        contents = replace(contents, normals=directions)
     unread = tuple(
         f"the array {name}" for name in arrays if name != chosen and name not in rest and arrays[name] is not normals
     )
     renamed = {"colors" if name.lower() in ("colours", "rgb") else name: values for name, values in rest.items()}
-    return Contents(
-        contents.points,
-        contents.normals,
-        contents.faces,
-        {**contents.attributes, **renamed},
-        unread,
-        remarks=contents.remarks,
-    )
+    return replace(contents, attributes={**contents.attributes, **renamed}, unread=(*contents.unread, *unread, *lost))
 
 
 def _arrays(path: Path, *, largest_ratio: int = 1032) -> Mapping[str, Values]:
@@ -95,5 +86,4 @@ def _cloud(values: Values, columns: Sequence[str]) -> Contents:
     else:
         names, remarks = guessed(numbers, range(table.shape[1]))
     named = {name: numbers[:, place] for place, name in enumerate(names) if name not in ("", "index")}
-    found = from_columns(named)
-    return Contents(found.points, found.normals, found.faces, found.attributes, found.unread, None, remarks)
+    return replace(from_columns(named), remarks=remarks)

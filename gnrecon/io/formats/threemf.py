@@ -162,7 +162,7 @@ def read_3mf(path: Path) -> Contents:
     except (zipfile.BadZipFile, zlib.error, expat.ExpatError, KeyError, EOFError) as error:
         raise InputError(f"the file is not a well-formed 3MF archive ({error}).") from None
     _require_bounded(model)
-    pieces = [piece for key, matrix in model.items for piece in _transformed(model, key, matrix, 0)]
+    pieces = [piece for key, matrix in model.items for piece in _transformed(model, key, matrix)]
     if not pieces:
         raise InputError("the 3MF model builds no mesh.")
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
@@ -280,16 +280,14 @@ def _require_bounded(
         )
 
 
-def _transformed(model: _Model, key: Key, matrix: Float, depth: int, *, most_depth: int = 32) -> Iterator[Mesh]:
-    """The meshes of an object and its components, moved into place; components deeper than `most_depth` are a cycle."""
-    if key not in model.objects or depth > most_depth:
-        raise InputError(f"the 3MF model builds the object {key[1]!r}, which does not exist or contains itself.")
+def _transformed(model: _Model, key: Key, matrix: Float) -> Iterator[Mesh]:
+    """The meshes of an object and its components, moved into place; the model has no cycles, see `_require_bounded`."""
     current = model.objects[key]
     if current.corners:
         yield _mesh(current, matrix)
     for inner, step in current.parts:
         # Transforms move rows (x, y, z, 1), so the inner one comes first, as a 4 x 4 matrix.
-        yield from _transformed(model, inner, np.hstack([step, np.eye(4)[:, 3:]]) @ matrix, depth + 1)
+        yield from _transformed(model, inner, np.hstack([step, np.eye(4)[:, 3:]]) @ matrix)
 
 
 def _mesh(current: _Object, matrix: Float) -> Mesh:

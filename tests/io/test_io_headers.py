@@ -1,0 +1,121 @@
+"""Headers as programs write them: padding and case in PCD, old and odd PLY, comments in OBJ, grids in VTK, old LAZ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.io import read_any, read_cloud, read_mesh, read_reference
+from gnrecon.runtime.errors import InputError
+
+POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]])
+
+
+def pcd(path: Path, keyword: str, fields: str, sizes: str, kinds: str, counts: str, rows: np.ndarray) -> Path:
+    head = f"# .PCD v0.7\nVERSION 0.7\n{keyword} {fields}\nSIZE {sizes}\nTYPE {kinds}\nCOUNT {counts}\n"
+    head += f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+    path.write_bytes(head.encode() + rows.tobytes())
+    return path
+
+
+def test_pcd_with_padding_fields_of_nothing_upper_case_and_columns(tmp_path: Path) -> None:
+    rows = np.zeros(4, [("p", "<f4", 3), ("pad", "u1", 4), ("i", "<f4"), ("more", "u1", 8), ("ring", "<u2")])
+    rows["p"], rows["i"], rows["ring"], rows["pad"] = POINTS, [5, 6, 7, 8], [1, 2, 3, 4], 255
+    words = ("4 4 4 1 4 1 2 1", "F F F U F U U U", "1 1 1 4 1 8 1 0")
+    for keyword in ("FIELDS", "COLUMNS"):
+        cloud = read_cloud(pcd(tmp_path / "a.pcd", keyword, "X Y Z _ intensity _ ring _", *words, rows))
+        np.testing.assert_array_equal(cloud.points, POINTS)
+        assert cloud.attributes["intensity"].tolist() == [5, 6, 7, 8]
+        assert cloud.attributes["ring"].tolist() == [1, 2, 3, 4]
+        assert set(cloud.attributes) == {"intensity", "ring"}
+
+
+def test_ply_with_bool_and_points_and_cr(tmp_path: Path) -> None:
+    lines = ["ply", "format ascii 1.0", "element point 4", "property double x", "property double y"]
+    lines += ["property double z", "property bool used", "end_header"]
+    lines += [f"{x!r} {y!r} {z!r} {k % 2}" for k, (x, y, z) in enumerate(POINTS.tolist())]
+    for end in ("\n", "\r", "\r\n"):
+        path = tmp_path / "a.ply"
+        path.write_bytes((end.join(lines) + end).encode())
+        cloud = read_cloud(path)
+        np.testing.assert_array_equal(cloud.points, POINTS)
+        assert cloud.attributes["used"].tolist() == [0, 1, 0, 1]
+
+
+def test_ply_triangle_strips_are_a_scan_and_a_reference(tmp_path: Path) -> None:
+    """The strip 0 1 2 3, and after -1 the strip 3 2 1, whose triangle faces the other way."""
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    strips = np.array([8, 0, 1, 2, 3, -1, 3, 2, 1], "<i4")
+    path = tmp_path / "a.ply"
+    path.write_bytes(head.encode() + POINTS.astype("<f4").tobytes() + strips.tobytes())
+    assert len(read_cloud(path).points) == 4
+    for mesh in (read_mesh(path), read_reference(path)):
+        assert isinstance(mesh, Mesh)
+        assert {tuple(np.roll(face, -face.argmin())) for face in mesh.faces} == {(0, 1, 2), (1, 3, 2), (1, 3, 2)}
+        assert len(mesh.faces) == 3
+    normals = read_mesh(path).face_vectors
+    assert (normals[:, 2] > 0).all()
+
+
+def test_obj_with_comments_in_lines_and_colours_of_some_vertices(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0 # first\nv 1 0 0#second\nv 0 1 0 1 0 0\nf 1 2 3 # face\n")
+    shape, unread = read_any(path)
+    np.testing.assert_array_equal(shape.vertices, POINTS[:3])
+    assert shape.faces.tolist() == [[0, 1, 2]]
+    assert "colors" not in shape.attributes
+    assert unread == ("colours, which only some of the vertices have",)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "expected"),
+    [
+        ("STRUCTURED_POINTS\nDIMENSIONS 2 2 1\nORIGIN 1 2 3\nSPACING 0.5 1 1", [[1, 2, 3], [1.5, 2, 3], [1, 3, 3]]),
+        (
+            "RECTILINEAR_GRID\nDIMENSIONS 2 2 1\nX_COORDINATES 2 float\n0 4\nY_COORDINATES 2 float\n1 2\n"
+            "Z_COORDINATES 1 float\n7",
+            [[0, 1, 7], [4, 1, 7], [0, 2, 7]],
+        ),
+        (
+            "STRUCTURED_GRID\nDIMENSIONS 2 2 1\nPOINTS 4 float\n0 0 0 1 0 0 0 1 0 1 1 0",
+            [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        ),
+    ],
+)
+def test_vtk_grids_are_points(tmp_path: Path, dataset: str, expected: list[list[float]]) -> None:
+    path = tmp_path / "a.vtk"
+    values = "POINT_DATA 4\nSCALARS height float 1\nLOOKUP_TABLE default\n1 2 3 4\n"
+    path.write_text(f"# vtk DataFile Version 3.0\ngrid\nASCII\nDATASET {dataset}\n{values}")
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.points[:3], expected)
+    assert cloud.attributes["height"].tolist() == [1, 2, 3, 4]
+
+
+def test_faces_of_unstructured_vtk_grids_are_read_and_solids_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.vtk"
+    path.write_text(
+        "# vtk DataFile Version 3.0\ncells\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 float\n"
+        "0 0 0 1 0 0 0 1 0 1 1 0.5\nCELLS 3 14\n3 0 1 2\n4 0 1 3 2\n4 0 1 2 3\nCELL_TYPES 3\n5\n9\n10\n"
+    )
+    shape, unread = read_any(path)
+    assert shape.faces.tolist() == [[0, 1, 2], [0, 1, 3], [0, 3, 2]]
+    assert unread == ("1 cells that are no polygons",)
+
+
+def test_old_laz_is_refused_with_a_way_out(tmp_path: Path) -> None:
+    data = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    data.x, data.y, data.z = POINTS.T
+    path = tmp_path / "a.laz"
+    data.write(str(path))
+    old = bytearray(path.read_bytes())
+    place = old.find(b"laszip encoded") + 52
+    assert old[place : place + 2] in (b"\2\0", b"\3\0")
+    old[place : place + 2] = b"\1\0"
+    path.write_bytes(old)
+    with pytest.raises(InputError, match=r"before 2011.*laszip -i old.laz -o new.las"):
+        read_cloud(path)
