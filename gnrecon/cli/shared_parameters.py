@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gnrecon.cli.option_parameters import table_option
+from gnrecon.cli.option_parameters import table_option, valued_option
 from gnrecon.option_table import Panel
 
 OutputOption = Annotated[
@@ -18,9 +18,7 @@ OutputOption = Annotated[
 ]
 FormatOption = Annotated[
     str | None,
-    typer.Option(
-        help="Format of the scan, such as ply; by default its file's extension.", rich_help_panel=Panel.POINTS
-    ),
+    valued_option(help="Format of the scan, such as ply.", panel=Panel.POINTS, default="its file's extension"),
 ]
 ColumnsOption = Annotated[str | None, table_option("columns")]
 CurvatureOption = Annotated[bool, table_option("curvature")]
