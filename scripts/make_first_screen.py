@@ -29,7 +29,7 @@ END = "<!-- The table ends. -->"
 
 
 def first_screen(summary: dict[str, Any], threads: int) -> list[str]:
-    """Return the README's table: three figures of one scan, gnrecon's beside screened Poisson's."""
+    """Return the README's table: three figures of one scan, gnrecon's next to screened Poisson's."""
     ours, theirs = (summary["methods"][name] for name in ("gnrecon", "Poisson"))
     rows = {
         "mean distance to the true surface": ("chamfer_mean", "{:.3f} mm"),
