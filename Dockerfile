@@ -17,8 +17,8 @@ COPY constraints.txt ./
 RUN pip install --no-cache-dir --constraint constraints.txt --index-url "${TORCH_INDEX}" "torch>=2.4"
 COPY setup.cfg pyproject.toml README.md LICENSE ./
 COPY gnrecon ./gnrecon
-# The import finds out, while the image is built, whether a system library is missing.
-RUN pip install --no-cache-dir --constraint constraints.txt ".[e57]" \
+# The import finds out, while the image is built, whether a system library is missing. There is no compiler here.
+RUN pip install --no-cache-dir --prefer-binary --constraint constraints.txt ".[e57]" \
     && python -c "import manifold3d, open3d, pymeshlab, torch"
 
 RUN useradd --create-home --uid 1000 gnrecon

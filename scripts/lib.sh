@@ -98,11 +98,12 @@ make_environment() {
     say "setting up $venv (once, some minutes)"
     [ -x "$venv/bin/python" ] || "$python" -m venv -- "$venv" >>"$log" 2>&1 ||
         fail_with_log "No virtual environment could be made"
-    # From the repository's folder, where pip looks for the files in its arguments.
+    # From the repository's folder, where pip looks for the files in its arguments. A release that would have to be
+    # compiled, as fpsample's newest, gives way to an older one that is ready.
     (
         cd -- "$repository"
         "$venv/bin/python" -m pip install --no-input --disable-pip-version-check --progress-bar off \
-            -c constraints.txt -e "$target"
+            --prefer-binary -c constraints.txt -e "$target"
     ) >>"$log" 2>&1 </dev/null || fail_with_log "Packages could not be installed"
     # An environment with an extra serves those who need none as well.
     stamp base >"$venv/ready.base"

@@ -8,9 +8,11 @@ from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 
+from marked_page import with_part
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGE = REPOSITORY / "docs" / "architecture.md"
-BEGIN = "<!-- The list below is made by scripts/make_architecture.py. -->\n"
+BEGIN = "<!-- The list below is made by scripts/make_architecture.py. -->"
 
 
 def updated(page: str, package: Path = REPOSITORY / "gnrecon") -> str:
@@ -21,10 +23,7 @@ def updated(page: str, package: Path = REPOSITORY / "gnrecon") -> str:
     ValueError
         When the page has no mark.
     """
-    head, mark, _ = page.partition(BEGIN)
-    if not mark:
-        raise ValueError(f"The page has no line {BEGIN.strip()!r}.")
-    return head + BEGIN + "\n" + "\n".join(lines(package)) + "\n"
+    return with_part(page, BEGIN, list(lines(package)))
 
 
 def lines(package: Path) -> Iterator[str]:

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
+from marked_page import with_part
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGE = REPOSITORY / "docs" / "licences.md"
-BEGIN = "<!-- The table below is made by scripts/make_licences.py. -->\n"
+BEGIN = "<!-- The table below is made by scripts/make_licences.py. -->"
 
 
 def required(extras: tuple[str, ...] = ("e57", "cluster", "figures")) -> dict[str, str]:
@@ -66,12 +68,8 @@ def updated(page: str) -> str:
     ValueError
         When the page has no mark.
     """
-    head, mark, _ = page.partition(BEGIN)
-    if not mark:
-        raise ValueError(f"The page has no line {BEGIN.strip()!r}.")
     rows = [f"| {name} | {licence(name)} | {extra} |" for name, extra in sorted(closure(required()).items())]
-    table = ["| package | licence | only with |", "|---|---|---|", *rows]
-    return head + BEGIN + "\n" + "\n".join(table) + "\n"
+    return with_part(page, BEGIN, ["| package | licence | only with |", "|---|---|---|", *rows])
 
 
 def _lines(text: str) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Makes the pictures of the documentation: scan and mesh side by side.
+"""Makes the pictures of the documentation: scan and mesh side by side; scripts/make_first_screen.py makes the README's.
 
 Run it as ``.venv/bin/python scripts/make_pictures.py [NAME ...]``. Scans that are not part of the
 repository are taken from ``--data``; those that are missing are skipped with a message.
@@ -19,7 +19,6 @@ from PIL import Image
 import gnrecon
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-OWN = {"bracket": (REPOSITORY / "sample_data" / "bracket_dense.ply", (-55.0, 28.0), "z")}
 OPEN = {"open_scan": ("real/bunny_scans/bun000.ply", (40.0, 20.0), "y")}
 HOLED: dict[str, tuple[dict[str, Any], ...]] = {
     "regularised": ({}, {"fill": "minimal"}, {"prior": "developable"}, {"smooth": "strain=1e-4"})
@@ -31,7 +30,7 @@ def main() -> int:
     """Draw the named pictures, by default all."""
     folder, size = REPOSITORY / "docs" / "images", (1200, 520)
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=[*OWN, *HOLED, *OTHERS, *OPEN], help="pictures to make")
+    parser.add_argument("names", nargs="*", default=[*HOLED, *OTHERS, *OPEN], help="pictures to make")
     parser.add_argument(
         "--data", type=Path, default=REPOSITORY.parent / "shared" / "data", help="folder of other scans"
     )
@@ -42,7 +41,7 @@ def main() -> int:
         if name in HOLED:
             draw_holed(folder / f"{name}.png", HOLED[name], size)
             continue
-        scan, view, up = {**OWN, **others}[name]
+        scan, view, up = others[name]
         if not scan.is_file():
             print(f"{name}: skipped, because there is no file {scan}.", file=sys.stderr)
             continue

@@ -20,6 +20,9 @@ from typing import NamedTuple
 
 import pytest
 
+from gnrecon.export import measure
+from gnrecon.io import read_mesh
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCUMENTS = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("**/*.md"))]
 LIMIT = 600.0  # seconds a block
@@ -112,6 +115,20 @@ def test_block_runs(document: Path, block: Block, scratch: dict[Path, Path]) -> 
         pytest.skip(block.reason)
     done = run(block, scratch[document])
     assert done.returncode == 0, f"{block.code}\n{done.stdout}\n{done.stderr}"
+
+
+def test_the_first_command_makes_what_the_first_screen_shows(scratch: dict[Path, Path]) -> None:
+    first, folder = blocks(DOCUMENTS[0].read_text())[0], scratch[DOCUMENTS[0]]
+    mesh = folder / first.code.split()[-1]
+    if not mesh.is_file():  # this test alone
+        assert run(first, folder).returncode == 0
+    truth = read_mesh(folder / "sample_data" / "bracket_reference.ply")
+    found = measure(read_mesh(mesh), truth, samples=20_000)
+    for title, value, room in (("mean distance", found.chamfer_mean, 1.2), ("largest distance", found.hausdorff, 1.5)):
+        stated = re.search(rf"^\| {title}.*? \| ([0-9.]+) mm", DOCUMENTS[0].read_text(), re.MULTILINE)
+        assert stated is not None
+        # Another processor rounds differently; beyond that, scripts/make_first_screen.py makes the figures again.
+        assert value < room * float(stated[1]), title
 
 
 def test_there_is_a_readme_with_commands() -> None:

@@ -154,9 +154,9 @@ def test_a_package_is_listed_room_by_room(tmp_path: Path) -> None:
     (tmp_path / "room").mkdir()
     for path, text in {"__init__.py": "All.", "b.py": "One\nsentence.\n\nMore.", "room/__init__.py": "A room."}.items():
         (tmp_path / path).write_text(f'"""{text}"""\n')
-    page = make_architecture.updated("# Title\n\n" + make_architecture.BEGIN + "old\n", tmp_path)
+    page = make_architecture.updated("# Title\n\n" + make_architecture.BEGIN + "\nold\n", tmp_path)
     listed = f"**{tmp_path.name}/**: All.\n\n- `b.py`: One sentence.\n\n**{tmp_path.name}/room/**: A room.\n"
-    assert page.startswith("# Title\n\n" + make_architecture.BEGIN + "\n" + listed)
+    assert page.startswith("# Title\n\n" + make_architecture.BEGIN + "\n\n" + listed)
     assert "old" not in page
     with pytest.raises(ValueError, match="no line"):
         make_architecture.updated("# Title\n", tmp_path)

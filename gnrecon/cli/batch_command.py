@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from gnrecon.cli.command_classes import HelpAllOption
-from gnrecon.cli.option_parameters import given_options, with_table_options
+from gnrecon.cli.option_parameters import given_options, valued_option, with_table_options
 from gnrecon.cli.shared_parameters import (
     ConfigOption,
     DebugOption,
@@ -32,44 +32,65 @@ ListsOption = Annotated[
 ]
 PatternOption = Annotated[
     list[str] | None,
-    typer.Option(help="Take files of this name from folders, such as '*.ply'.", rich_help_panel=Panel.BATCH),
+    valued_option(
+        help="Take files of this name from folders, such as '*.ply'.",
+        panel=Panel.BATCH,
+        default="every format that is read",
+    ),
 ]
 RecursiveOption = Annotated[
     bool, typer.Option("--recursive", "-r", help="Enter subfolders.", rich_help_panel=Panel.BATCH)
 ]
 NameOption = Annotated[
     str | None,
-    typer.Option(
+    valued_option(
         metavar="TEMPLATE",
-        help="Names of the outputs, from {stem}, {name}, {folder}, {parent} and {index}; by default {folder}/{stem}.",
-        rich_help_panel=Panel.BATCH,
+        help="Names of the outputs, from {stem}, {name}, {folder}, {parent} and {index}.",
+        panel=Panel.BATCH,
+        default="{folder}/{stem}",
     ),
 ]
 JobsOption = Annotated[
     str,
-    typer.Option(help="Scans at a time: a number, or auto, from cores and memory.", rich_help_panel=Panel.BATCH),
+    valued_option(
+        help="Scans at a time: a number, or auto, from cores and memory.",
+        panel=Panel.BATCH,
+        limits="at least 1",
+        default="auto",
+    ),
 ]
 TimeoutOption = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help="Time limit for a scan: 90, 10m, 2h.", rich_help_panel=Panel.BATCH),
+    valued_option(
+        metavar="TIME",
+        help="Time limit for a scan: 90, 10m, 2h.",
+        panel=Panel.BATCH,
+        limits="above 0",
+        default="none",
+    ),
 ]
 RetryOption = Annotated[
     int,
-    typer.Option(
+    valued_option(
         help="Further attempts at a scan that was killed or exceeded a limit of time or memory.",
-        rich_help_panel=Panel.BATCH,
+        panel=Panel.BATCH,
+        limits="at least 0",
+        default="0",
     ),
 ]
 EngineOption = Annotated[
     str,
-    typer.Option(help="local, or dask for a Dask cluster of processes on this machine.", rich_help_panel=Panel.BATCH),
+    valued_option(
+        help="local, or dask for a Dask cluster of processes on this machine.", panel=Panel.BATCH, default="local"
+    ),
 ]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option(
+    valued_option(
         metavar="ADDRESS",
         help="Address of a running Dask cluster, such as tcp://host:8786.",
-        rich_help_panel=Panel.BATCH,
+        panel=Panel.BATCH,
+        default="off",
     ),
 ]
 FreshOption = Annotated[
@@ -78,8 +99,8 @@ FreshOption = Annotated[
 ]
 MeshFormatOption = Annotated[
     str,
-    typer.Option(
-        "--format", help="Format of the meshes: obj, ply, stl, off, glb or 3mf.", rich_help_panel=Panel.OUTPUT
+    valued_option(
+        "--format", help="Format of the meshes: obj, ply, stl, off, glb or 3mf.", panel=Panel.OUTPUT, default="obj"
     ),
 ]
 ReportsOption = Annotated[
@@ -110,10 +131,11 @@ ReferenceDirOption = Annotated[
 ]
 ReferenceNameOption = Annotated[
     str | None,
-    typer.Option(
+    valued_option(
         metavar="TEMPLATE",
-        help="Names of the references, from the same fields as --name; by default {stem}.",
-        rich_help_panel=Panel.BATCH,
+        help="Names of the references, from the same fields as --name.",
+        panel=Panel.BATCH,
+        default="{stem}",
     ),
 ]
 

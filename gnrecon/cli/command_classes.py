@@ -10,27 +10,13 @@ from typer.core import TyperCommand, TyperGroup
 
 from gnrecon.runtime.errors import UsageError, suggestion
 
-EVERYDAY = frozenset(
-    {
-        "output",
-        "reference",
-        "html",
-        "preview",
-        "overwrite",
-        "crop",
-        "units",
-        "max_points",
-        "quality",
-        "resolution",
-        "trim",
-        "faces",
-        "recursive",
-        "jobs",
-        "timeout",
-        "help_all",
-    }
-)
-"""Parameters that ``--help`` lists; ``--help-all`` lists the others too."""
+EVERYDAY = {
+    "reconstruct": "output reference html preview overwrite crop units max_points quality resolution trim faces",
+    "batch": "output recursive jobs timeout overwrite crop units max_points quality resolution trim faces",
+    "mesh": "output overwrite resolution crop offset shell units remesh simplify faces",
+    "learn": "output report overwrite optimiser budget steps seed resolution data share region interfaces",
+}
+"""Parameters that ``--help`` lists, command by command; ``--help-all`` lists the others too."""
 
 
 class DefaultCommandGroup(TyperGroup):
@@ -68,7 +54,8 @@ class EverydayHelpCommand(TyperCommand):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help text without the options that few runs need; completion still offers them."""
         hidden = {parameter: getattr(parameter, "hidden", False) for parameter in self.params}
-        rare = [one for one in self.params if one.param_type_name == "option" and one.name not in EVERYDAY]
+        everyday = {"help_all", *EVERYDAY[self.name or ""].split()}
+        rare = [one for one in self.params if one.param_type_name == "option" and one.name not in everyday]
         try:
             for parameter in [] if self.lists_everything else rare:
                 parameter.hidden = True  # type: ignore[attr-defined]

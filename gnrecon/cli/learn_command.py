@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from gnrecon.cli.command_classes import HelpAllOption
+from gnrecon.cli.option_parameters import valued_option
 from gnrecon.cli.shared_parameters import (
     CurvatureOption,
     DebugOption,
@@ -27,64 +29,89 @@ ProblemArgument = Annotated[
 ]
 OptimiserOption = Annotated[
     str,
-    typer.Option(help="gn (Gauss-Newton), or the paper's baselines, lbfgs and adam.", rich_help_panel=Panel.FIT),
+    valued_option(help="gn (Gauss-Newton), or the paper's baselines, lbfgs and adam.", panel=Panel.FIT, default="gn"),
 ]
 BudgetOption = Annotated[
     float | None,
-    typer.Option(help="Time limit in seconds; by default 600.", rich_help_panel=Panel.FIT),
+    valued_option(
+        help="Time limit in seconds.", panel=Panel.FIT, limits="above 0", default="600, or none with --steps"
+    ),
 ]
 StepsOption = Annotated[
     int | None,
-    typer.Option(
+    valued_option(
         help="Limit of steps; without a budget, the same steps and seed give the same mesh.",
-        rich_help_panel=Panel.FIT,
+        panel=Panel.FIT,
+        limits="at least 1",
+        default="none",
     ),
 ]
 WiderOption = Annotated[
     int,
-    typer.Option(
+    valued_option(
         help="Additional hidden units in each layer at the start; the least needed units are pruned again.",
-        rich_help_panel=Panel.FIT,
+        panel=Panel.FIT,
+        limits="at least 0",
+        default="0",
     ),
 ]
 ResolutionOption = Annotated[
-    int, typer.Option(help="Cells along the longest side of the box that is meshed.", rich_help_panel=Panel.MESH)
+    int,
+    valued_option(
+        help="Cells along the longest side of the box that is meshed.",
+        panel=Panel.MESH,
+        limits="at least 16",
+        default="192",
+    ),
 ]
 DataOption = Annotated[
     Path | None,
-    typer.Option(help="Folder of bun_zipper.ply and rocker-arm.off.", rich_help_panel=Panel.POINTS),
+    valued_option(
+        help="Folder of bun_zipper.ply and rocker-arm.off, which bunny and rockerarm need.",
+        panel=Panel.POINTS,
+        default="none",
+    ),
 ]
 ShareOption = Annotated[
     float | None,
-    typer.Option(help="For a scan: share of the points to learn from, such as 0.2.", rich_help_panel=Panel.POINTS),
+    valued_option(
+        help="For a scan: share of the points to learn from, such as 0.2.",
+        panel=Panel.POINTS,
+        limits="above 0, up to 1",
+        default="1",
+    ),
 ]
 RegionOption = Annotated[
     Path | None,
-    typer.Option(
-        help="For a bracket: closed mesh that bounds the part; by default that of sample_data.",
-        rich_help_panel=Panel.DESIGN,
+    valued_option(
+        help="For a bracket: closed mesh that bounds the part.", panel=Panel.DESIGN, default="that of sample_data"
     ),
 ]
 InterfacesOption = Annotated[
     Path | None,
-    typer.Option(
+    valued_option(
         help="For a bracket: open mesh that the part attaches to, with faces pointing out of the part.",
-        rich_help_panel=Panel.DESIGN,
+        panel=Panel.DESIGN,
+        default="that of sample_data",
     ),
 ]
 InterfacesFrameOption = Annotated[
     str | None,
-    typer.Option(
+    valued_option(
         metavar="X,Y,Z,SCALE",
         help="Origin and scale of the interfaces' coordinates in those of the region.",
-        rich_help_panel=Panel.DESIGN,
+        panel=Panel.DESIGN,
+        limits="scale above 0",
+        default="the same coordinates",
     ),
 ]
 ClipOption = Annotated[
     float | None,
-    typer.Option(
+    valued_option(
         help="Upper limit of the strain k1^2 + k2^2 in the loss, in units where the region's half-length is 1.",
-        rich_help_panel=Panel.DESIGN,
+        panel=Panel.DESIGN,
+        limits="above 0",
+        default="none",
     ),
 ]
 ReportOption = Annotated[Path | None, typer.Option(help="JSON report to write.", rich_help_panel=Panel.OUTPUT)]
@@ -116,12 +143,13 @@ def learn_command(
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
     debug: DebugOption = False,
+    help_all: HelpAllOption = False,
 ) -> None:
     """Learn a surface from constraints alone: the paper's data-free problems, or a part from its design."""
     from gnrecon.cli.learn_inputs import DesignFiles, ScanFiles
     from gnrecon.cli.learn_problem import LearnOptions, run_learn
 
-    del debug
+    del help_all, debug
     options = LearnOptions(optimiser, budget, steps, seed, resolution, curvature, threads, wider)
     raise SystemExit(
         run_learn(

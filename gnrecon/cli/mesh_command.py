@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from gnrecon.cli.option_parameters import table_option
+from gnrecon.cli.command_classes import HelpAllOption
+from gnrecon.cli.option_parameters import table_option, valued_option
 from gnrecon.cli.shared_parameters import (
     CurvatureOption,
     DebugOption,
@@ -24,27 +25,40 @@ EdgeLengthOption = Annotated[str | None, table_option("edge_length")]
 MaxErrorOption = Annotated[str | None, table_option("max_error")]
 CropOption = Annotated[
     str | None,
-    typer.Option(
+    valued_option(
         help="Box to keep: xmin,ymin,zmin,xmax,ymax,zmax in file units; the resolution is then that of the box, "
         "and cuts are closed by flat caps.",
-        rich_help_panel=Panel.MESH,
+        panel=Panel.MESH,
+        default="all",
+        metavar="BOX",
     ),
 ]
 OffsetOption = Annotated[
     str,
-    typer.Option(
-        help="Move the surface outward, inward if negative: 0.5, or 2mm with --units.", rich_help_panel=Panel.MESH
+    valued_option(
+        help="Move the surface outward, inward if negative: 0.5, or 2mm with --units.",
+        panel=Panel.MESH,
+        limits="any length",
+        default="0",
+        metavar="LENGTH",
     ),
 ]
 ShellOption = Annotated[
     str | None,
-    typer.Option(help="Hollow the solid to a wall of this thickness, measured inward.", rich_help_panel=Panel.MESH),
+    valued_option(
+        help="Hollow the solid to a wall of this thickness, measured inward, in file units.",
+        panel=Panel.MESH,
+        limits="above 0",
+        default="off",
+        metavar="LENGTH",
+    ),
 ]
 UnitsOption = Annotated[
     str | None,
-    typer.Option(
+    valued_option(
         help="Unit of the file (um, mm, cm, m, km, in, ft); lengths may then have a unit, such as 2mm.",
-        rich_help_panel=Panel.MESH,
+        panel=Panel.MESH,
+        default="unknown",
     ),
 ]
 KeepHandlesOption = Annotated[bool, table_option("keep_handles")]
@@ -55,10 +69,10 @@ FacesOption = Annotated[int | None, table_option("faces")]
 FeatureAngleOption = Annotated[float, table_option("feature_angle")]
 AttributesOption = Annotated[
     str,
-    typer.Option(help="auto (the distance to the model's points) or none.", rich_help_panel=Panel.MESH),
+    valued_option(help="auto (the distance to the model's points) or none.", panel=Panel.MESH, default="auto"),
 ]
 DeviceOption = Annotated[
-    str, typer.Option(help="Where the field is evaluated: cpu or cuda.", rich_help_panel=Panel.MESH)
+    str, valued_option(help="Where the field is evaluated: cpu or cuda.", panel=Panel.MESH, default="cpu")
 ]
 
 
@@ -85,6 +99,7 @@ def mesh_command(
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
+    help_all: HelpAllOption = False,
 ) -> None:
     """Mesh a fitted field again, without refitting: at another resolution, cropped, offset, or as a hollow shell."""
     import numpy as np
@@ -93,7 +108,7 @@ def mesh_command(
     from gnrecon.geometry.units import parse_box, parse_length
     from gnrecon.solid import Shape
 
-    del debug
+    del help_all, debug
     shape = Shape(
         parse_length(offset, units),
         None if shell is None else parse_length(shell, units),

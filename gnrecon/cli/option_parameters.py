@@ -28,6 +28,22 @@ def table_option(name: str) -> Any:
     )
 
 
+def valued_option(
+    *flags: str, help: str, panel: Panel, default: str, limits: str = "", metavar: str | None = None
+) -> Any:
+    """Return the typer option of a parameter that is no row of the table.
+
+    Parameters
+    ----------
+    flags : spellings, where they differ from the parameter's name
+    help, panel, metavar : as of a row
+    default, limits : default and range of the value in words, which follow the help text
+    """
+    ends = "; ".join(part for part in (limits, f"default: {default}") if part)
+    shown = rf"{help} \[{ends}]"  # typer reads rich's markup
+    return typer.Option(*flags, help=shown, show_default=False, rich_help_panel=panel.value, metavar=metavar)
+
+
 def _completion(row: OptionRow) -> Callable[[str], list[str]]:
     def complete(incomplete: str) -> list[str]:
         return [choice for choice in row.choices if choice.startswith(incomplete)]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gnrecon.cli.option_parameters import table_option
+from gnrecon.cli.option_parameters import table_option, valued_option
 from gnrecon.option_table import Panel
 
 OutputOption = Annotated[
@@ -18,9 +18,7 @@ OutputOption = Annotated[
 ]
 FormatOption = Annotated[
     str | None,
-    typer.Option(
-        help="Format of the scan, such as ply; by default its file's extension.", rich_help_panel=Panel.POINTS
-    ),
+    valued_option(help="Format of the scan, such as ply.", panel=Panel.POINTS, default="its file's extension"),
 ]
 ColumnsOption = Annotated[str | None, table_option("columns")]
 CurvatureOption = Annotated[bool, table_option("curvature")]
@@ -55,5 +53,11 @@ DebugOption = Annotated[
 ]
 MemoryOption = Annotated[
     str | None,
-    typer.Option(metavar="SIZE", help="Limit of resident memory for a scan: 800MB, 4GB.", rich_help_panel=Panel.FIT),
+    valued_option(
+        metavar="SIZE",
+        help="Limit of resident memory for a scan: 800MB, 4GB.",
+        panel=Panel.FIT,
+        limits="above 0",
+        default="none",
+    ),
 ]

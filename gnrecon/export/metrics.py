@@ -21,6 +21,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
+from gnrecon.runtime.quiet_imports import import_open3d
 
 
 def measure(
@@ -301,7 +302,7 @@ def vertex_error(mesh: Mesh, reference: Mesh | PointCloud) -> Float:
 
 def ray_scene(vertices: Float, faces: Int) -> Any:
     """open3d's tree over triangles, whose vertices of shape (V, 3) should be about one in size."""
-    import open3d
+    open3d = import_open3d()
 
     scene: Any = open3d.t.geometry.RaycastingScene()
     tensor = open3d.core.Tensor.from_numpy

@@ -9,6 +9,7 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.ingest.point_spacing import mean_distances
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.quiet_imports import import_open3d
 
 
 def propagate_orientation(
@@ -38,7 +39,7 @@ def propagate_orientation(
     InputError
         When the points cannot be triangulated, for example fewer than four.
     """
-    import open3d
+    open3d = import_open3d()
 
     jitter = jitter_extents * np.abs(points).max() * np.random.default_rng(0).normal(size=points.shape)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points + jitter))

@@ -27,6 +27,7 @@ from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.ingest_parameters import DensityOutlierParameters
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.runtime.errors import UsageError
+from gnrecon.runtime.quiet_imports import import_open3d
 
 REMOVAL_MODES = ("auto", "on", "off")
 """When outliers or clusters are removed: unless they are many, always, never."""
@@ -133,7 +134,7 @@ def outliers_by_rule(points: Float, rule: OutlierRule, units: str | None, *, nei
     units : the points' unit, where it is known
     neighbours : of the statistical rule, as in `find_outliers`
     """
-    import open3d
+    open3d = import_open3d()
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     if rule.name == "statistical":

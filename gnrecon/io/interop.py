@@ -21,6 +21,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import from_columns, no_faces
 from gnrecon.io.interop_grids import meshio_parts, pyvista_parts
 from gnrecon.runtime.errors import InputError, UsageError
+from gnrecon.runtime.quiet_imports import import_open3d
 
 
 def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
@@ -263,7 +264,7 @@ def to_open3d(shape: Mesh | PointCloud, *, tensor: bool = False) -> Any:
     shape : Mesh or PointCloud
     tensor : whether to return one of ``open3d.t.geometry``, which keeps all attributes, instead of a legacy one
     """
-    import open3d
+    open3d = import_open3d()
 
     if tensor:
         return _to_open3d_tensor(shape)
@@ -320,7 +321,7 @@ def _add_attribute(mesh: Any, name: str, values: Values) -> None:
 
 
 def _to_open3d_tensor(shape: Mesh | PointCloud) -> Any:
-    import open3d
+    open3d = import_open3d()
 
     core: Any = open3d.core
     geometry: Any = open3d.t.geometry

@@ -297,7 +297,7 @@ def test_what_is_wrong_is_told_before_the_work(tmp_path: Path, capsys: pytest.Ca
 
 def test_a_small_run_from_cases_to_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures, picture = tmp_path / "figures.json", tmp_path / "sheet.png"
-    options = {"resolution": 32}
+    options = {"resolution": 32, "quality": "draft"}
     protocol = Protocol(threads=1, samples=2_000, depths=(5,), options=options, limit=300.0)
     wanted = ["--cases", "sphere, 100 points", "--methods", "gnrecon", "Poisson", "ball pivoting"]
     assert main([*wanted, "--json", str(figures), "--picture", str(picture)], protocol) == 0

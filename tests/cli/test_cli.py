@@ -14,17 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import CommandLine
 from made_shapes import sphere
 from markupsafe import escape
-from scan_files import FAST_WORDS, TORUS_VOLUME, gnrecon, start, torus, wait_for, write_scan
+from scan_files import FAST_WORDS, TORUS_VOLUME, start, torus, wait_for, write_scan
 
-from gnrecon.cli.app import main
-from gnrecon.export import verify_file
+from gnrecon.export import mesh_field, verify_file
+from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh
+from gnrecon.io.format_registry import WRITERS
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.version import __version__
-
-Here = Callable[..., subprocess.CompletedProcess[str]]
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -59,19 +59,9 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: ExitCode, words
 
 
 @pytest.fixture
-def here(capfd: pytest.CaptureFixture[str]) -> Iterator[Here]:
-    """The command line within this process, for the many failures that come before any work."""
-
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
-        arguments = [str(word) for word in words]
-        with pytest.raises(SystemExit) as end:
-            main(arguments)
-        stdout, stderr = capfd.readouterr()
-        return subprocess.CompletedProcess(arguments, int(end.value.code or 0), stdout, stderr)
-
-    handler = signal.getsignal(signal.SIGTERM)
-    yield run
-    signal.signal(signal.SIGTERM, handler)
+def here(capfd: pytest.CaptureFixture[str]) -> CommandLine:
+    """The command line within this process, where no signal and no fault of a stage needs a process of its own."""
+    return CommandLine(capfd)
 
 
 def rows(points: np.ndarray) -> str:
@@ -92,21 +82,21 @@ BAD_SCANS = {
 
 
 @pytest.mark.parametrize("name", BAD_SCANS)
-def test_scans_that_cannot_be_reconstructed(tmp_path: Path, out: Path, here: Here, name: str) -> None:
+def test_scans_that_cannot_be_reconstructed(tmp_path: Path, out: Path, here: CommandLine, name: str) -> None:
     content, words = BAD_SCANS[name]
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     assert_refused(here(tmp_path / name, "-o", out / "mesh.obj", "--report", out / "r.json"), ExitCode.INPUT, words)
     assert names(out) == []
 
 
-def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -> None:
+def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path, here: CommandLine) -> None:
     missing = tmp_path / "missing.ply"
-    assert_refused(gnrecon(missing, "-o", out / "a.obj"), ExitCode.INPUT, f"There is no file {missing}.")
+    assert_refused(here(missing, "-o", out / "a.obj"), ExitCode.INPUT, f"There is no file {missing}.")
     torn = tmp_path / "torn.ply"
     torn.write_bytes(scan.read_bytes()[:-10])
-    assert_refused(gnrecon(torn, "-o", out / "a.obj"), ExitCode.INPUT, "declares 1200 vertex rows")
+    assert_refused(here(torn, "-o", out / "a.obj"), ExitCode.INPUT, "declares 1200 vertex rows")
     assert_refused(
-        gnrecon(scan, "-o", out / "a.obj", "--reference", missing), ExitCode.INPUT, f"There is no file {missing}."
+        here(scan, "-o", out / "a.obj", "--reference", missing), ExitCode.INPUT, f"There is no file {missing}."
     )
     assert names(out) == []
 
@@ -133,7 +123,7 @@ def test_scans_that_are_missing_or_torn(tmp_path: Path, out: Path, scan: Path) -
     ],
     ids=lambda value: " ".join(value[2:] or value) if isinstance(value, tuple) else "",
 )
-def test_usage(out: Path, scan: Path, here: Here, words: tuple[str, ...], sentence: str) -> None:
+def test_usage(out: Path, scan: Path, here: CommandLine, words: tuple[str, ...], sentence: str) -> None:
     before = scan.read_bytes()
     assert_refused(here(scan, *(w.format(out=out, scan=scan) for w in words)), ExitCode.USAGE, sentence)
     assert names(out) == []
@@ -141,7 +131,7 @@ def test_usage(out: Path, scan: Path, here: Here, words: tuple[str, ...], senten
 
 
 @pytest.mark.parametrize("linked", [False, True])
-def test_a_scan_that_a_conf_names_is_never_written(out: Path, scan: Path, here: Here, linked: bool) -> None:
+def test_a_scan_that_a_conf_names_is_never_written(out: Path, scan: Path, here: CommandLine, linked: bool) -> None:
     part, poses = out / "part.ply", out / "poses.txt"
     part.write_bytes(scan.read_bytes())
     poses.write_text("bmesh part.ply 0 0 0 0 0 0 1\n")
@@ -157,7 +147,7 @@ def test_a_scan_that_a_conf_names_is_never_written(out: Path, scan: Path, here: 
     assert part.read_bytes() == scan.read_bytes()
 
 
-def test_a_buffer_that_a_gltf_names_is_never_written(out: Path, here: Here) -> None:
+def test_a_buffer_that_a_gltf_names_is_never_written(out: Path, here: CommandLine) -> None:
     scene, buffer = out / "scene.gltf", out / "points.ply"
     buffer.write_bytes(np.zeros((3, 3), np.float32).tobytes())
     scene.write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": "points.ply", "byteLength": 36}]}))
@@ -166,7 +156,7 @@ def test_a_buffer_that_a_gltf_names_is_never_written(out: Path, here: Here) -> N
     assert buffer.read_bytes() == bytes(36)
 
 
-def test_a_configuration_that_is_read_is_never_written(out: Path, scan: Path, here: Here) -> None:
+def test_a_configuration_that_is_read_is_never_written(out: Path, scan: Path, here: CommandLine) -> None:
     config = out / "c.toml"
     config.write_text("seed = 3\n")
     words = (scan, "-o", out / "mesh.obj", "--config", config, "--save-config", config, "--overwrite")
@@ -176,17 +166,17 @@ def test_a_configuration_that_is_read_is_never_written(out: Path, scan: Path, he
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-def test_a_gpu_that_is_not_there(out: Path, scan: Path) -> None:
-    assert_refused(gnrecon(scan, "-o", out / "a.obj", "--device", "cuda"), ExitCode.USAGE, "no CUDA GPU")
+def test_a_gpu_that_is_not_there(out: Path, scan: Path, here: CommandLine) -> None:
+    assert_refused(here(scan, "-o", out / "a.obj", "--device", "cuda"), ExitCode.USAGE, "no CUDA GPU")
     assert names(out) == []
 
 
-def test_targets_that_cannot_be_written(out: Path, scan: Path) -> None:
+def test_targets_that_cannot_be_written(out: Path, scan: Path, here: CommandLine) -> None:
     (out / "taken.obj").write_text("somebody's work")
-    assert_refused(gnrecon(scan, "-o", out / "taken.obj"), ExitCode.OUTPUT, "--overwrite")
-    done = gnrecon(scan, "-o", out / "mesh.obj", "--report", out / "taken.obj")
+    assert_refused(here(scan, "-o", out / "taken.obj"), ExitCode.OUTPUT, "--overwrite")
+    done = here(scan, "-o", out / "mesh.obj", "--report", out / "taken.obj")
     assert_refused(done, ExitCode.OUTPUT, "taken.obj exists already")
-    assert_refused(gnrecon(scan, "-o", out / "no" / "mesh.obj"), ExitCode.OUTPUT, "does not exist")
+    assert_refused(here(scan, "-o", out / "no" / "mesh.obj"), ExitCode.OUTPUT, "does not exist")
     assert names(out) == ["taken.obj"]
     assert (out / "taken.obj").read_text() == "somebody's work"
 
@@ -203,15 +193,15 @@ def assert_torus(path: Path) -> None:
     assert mesh.volume == pytest.approx(facts.volume, rel=1e-5)
 
 
-def test_a_trimmed_mesh_is_open_and_said_to_be(out: Path, tmp_path: Path) -> None:
+def test_a_trimmed_mesh_is_open_and_said_to_be(out: Path, tmp_path: Path, here: CommandLine) -> None:
     points, normals = sphere(2000, np.random.default_rng(3))
     half = points[:, 0] > 0
     scan = write_scan(tmp_path / "half.ply", points[half], normals[half])
     words = ("-o", out / "mesh.ply", "--report", out / "report.json", "--widths", "300", "--steps", "0")
-    closed = gnrecon(scan, *words, "--resolution", "32")
+    closed = here(scan, *words, "--resolution", "32")
     assert closed.returncode == 0, closed.stderr
     assert "of the surface is invented" in closed.stderr
-    done = gnrecon(scan, *words, "--resolution", "32", "--trim", "3s", "--overwrite")
+    done = here(scan, *words, "--resolution", "32", "--trim", "3s", "--overwrite")
     assert done.returncode == 0, done.stderr
     assert "Cut off" in done.stderr
     assert "The mesh is open: an oriented edge-manifold with borders" in done.stderr
@@ -221,17 +211,17 @@ def test_a_trimmed_mesh_is_open_and_said_to_be(out: Path, tmp_path: Path) -> Non
     assert report["mesh"]["volume"] is None
     assert report["trim"]["distance"] == report["mesh"]["invented_beyond"]
     assert report["mesh"]["invented_area_share"] < 0.05
-    checked = gnrecon("check", out / "mesh.ply")
+    checked = here("check", out / "mesh.ply")
     assert checked.returncode == ExitCode.MESH
-    refused = gnrecon(scan, "-o", out / "none.ply", "--trim", "0")
+    refused = here(scan, "-o", out / "none.ply", "--trim", "0")
     assert_refused(refused, ExitCode.USAGE, "not a positive distance")
 
 
-def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path) -> None:
+def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path, here: CommandLine) -> None:
     points, normals = torus(1200, np.random.default_rng(3))
     place = np.array([500_000.25, 4_000_000.25, 100.25])
     scan = write_scan(tmp_path / "far.ply", points + place, normals)
-    done = gnrecon(scan, "-o", out / "far.stl", "--report", out / "report.json", *FAST_WORDS)
+    done = here(scan, "-o", out / "far.stl", "--report", out / "report.json", *FAST_WORDS)
     assert done.returncode == 0, done.stderr
     assert "relative to the origin 500000 4000000 100. The file's header states it" in done.stderr
     assert json.loads((out / "report.json").read_text())["origin"] == [500_000, 4_000_000, 100]
@@ -243,12 +233,12 @@ def test_an_stl_at_map_coordinates_names_its_origin(out: Path, tmp_path: Path) -
     assert (corners.min(axis=0) + corners.max(axis=0)) / 2 == pytest.approx(place, rel=0, abs=0.05)
 
 
-def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> None:
+def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path, here: CommandLine) -> None:
     from PIL import Image
 
     files = ("--report", out / "report.json", "--preview", out / "picture.png", "--html", out / "page.html")
     words = (scan, "-o", out / "mesh.ply", "--reference", scan, *files, *FAST_WORDS)
-    done = gnrecon(*words)
+    done = here(*words)
     assert done.returncode == 0, done.stderr
     assert_torus(out / "mesh.ply")
     report = json.loads((out / "report.json").read_text())
@@ -271,10 +261,10 @@ def test_a_mesh_with_report_picture_and_measurement(out: Path, scan: Path) -> No
 
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "stl", "glb"])
-def test_formats_written_quietly_over_older_files(out: Path, scan: Path, suffix: str) -> None:
+def test_formats_written_quietly_over_older_files(out: Path, scan: Path, suffix: str, here: CommandLine) -> None:
     mesh = out / f"mesh.{suffix}"
     mesh.write_text("an older mesh")
-    done = gnrecon("reconstruct", scan, "-o", mesh, "--overwrite", "--quiet", *FAST_WORDS)
+    done = here("reconstruct", scan, "-o", mesh, "--overwrite", "--quiet", *FAST_WORDS)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert_torus(mesh)
     assert names(out) == [mesh.name]
@@ -315,23 +305,45 @@ def test_an_interrupt_during_the_fit_keeps_the_best_mesh(out: Path, scan: Path) 
     assert json.loads((out / "report.json").read_text())["fit"]["interrupted"]
 
 
+@pytest.fixture
+def ended_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, signal.Signals], None]]:
+    """Make this process get a signal in place of a stage of the pipeline."""
+
+    def end_at(stage: str, number: signal.Signals) -> None:
+        def ended(*_: object, **__: object) -> None:
+            signal.raise_signal(number)
+            raise AssertionError(f"{number.name} does nothing")
+
+        monkeypatch.setattr(f"gnrecon.pipeline.{stage}", ended)
+
+    # Where the tests run in the background, SIGINT arrives ignored; under nohup, SIGHUP.
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGHUP)}
+    yield end_at
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("stage", ["read_scans", "prepare"])
-def test_an_interrupt_before_the_fit_writes_nothing(out: Path, scan: Path, stage: str) -> None:
-    with started(scan, "-o", out / "mesh.obj", before=pause_at(f"gnrecon.pipeline.{stage}")) as process:
-        wait_for(process, "paused")
-        process.send_signal(signal.SIGINT)
-        code, stderr = end(process)
-    assert (code, stderr) == (ExitCode.INTERRUPTED, "gnrecon: Interrupted; nothing was written.\n")
+def test_an_interrupt_before_the_fit_writes_nothing(
+    out: Path, scan: Path, here: CommandLine, ended_by: Callable[[str, signal.Signals], None], stage: str
+) -> None:
+    ended_by(stage, signal.SIGINT)
+    done = here(scan, "-o", out / "mesh.obj")
+    assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "gnrecon: Interrupted; nothing was written.\n")
     assert names(out) == []
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_polite_end_while_writing_leaves_nothing(out: Path, scan: Path, signal_number: signal.Signals) -> None:
-    files = ("-o", out / "mesh.obj", "--report", out / "report.json")
-    with started(scan, *files, *FAST_WORDS, before=pause_at("gnrecon.pipeline.verify_file")) as process:
-        wait_for(process, "paused")
-        process.send_signal(signal_number)
-        assert end(process)[0] == ExitCode.INTERRUPTED
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_polite_end_while_writing_leaves_nothing(
+    out: Path,
+    scan: Path,
+    here: CommandLine,
+    ended_by: Callable[[str, signal.Signals], None],
+    number: signal.Signals,
+) -> None:
+    ended_by("verify_file", number)
+    done = here(scan, "-o", out / "mesh.obj", "--report", out / "report.json", *FAST_WORDS)
+    assert done.returncode == ExitCode.INTERRUPTED, done.stderr
     assert names(out) == []
 
 
@@ -344,53 +356,56 @@ def test_a_kill_leaves_nothing_under_the_targets_name(out: Path, scan: Path, pla
     assert not (out / "mesh.obj").exists()
 
 
-TORN_BY_REPAIR = """
-import gnrecon.export.mesh_field
-from gnrecon.geometry.mesh import Mesh
-gnrecon.export.mesh_field.repair = lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), [])
-"""
-TORN_BY_WRITING = """
-import gnrecon.io.format_registry
-from gnrecon.geometry.mesh import Mesh
-write = gnrecon.io.format_registry.WRITERS[".obj"]
-gnrecon.io.format_registry.WRITERS[".obj"] = lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path)
-"""
+def torn_by_repair(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_field, "repair", lambda mesh: (Mesh(mesh.vertices, mesh.faces[1:]), []))
 
 
-@pytest.mark.parametrize("torn", [TORN_BY_REPAIR, TORN_BY_WRITING], ids=["by repair", "by writing"])
-def test_an_open_mesh_is_not_written(out: Path, scan: Path, torn: str) -> None:
-    with started(scan, "-o", out / "mesh.obj", "--report", out / "report.json", *FAST_WORDS, before=torn) as process:
-        code, stderr = end(process)
-    assert code == ExitCode.MESH
-    assert "is open: 3 edges have only one face." in stderr.splitlines()[-1]
+def torn_by_writing(monkeypatch: pytest.MonkeyPatch) -> None:
+    write = WRITERS[".obj"]
+    monkeypatch.setitem(WRITERS, ".obj", lambda mesh, path: write(Mesh(mesh.vertices, mesh.faces[1:]), path))
+
+
+@pytest.mark.parametrize("tear", [torn_by_repair, torn_by_writing])
+def test_an_open_mesh_is_not_written(
+    out: Path,
+    scan: Path,
+    here: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
+    tear: Callable[[pytest.MonkeyPatch], None],
+) -> None:
+    tear(monkeypatch)
+    done = here(scan, "-o", out / "mesh.obj", "--report", out / "report.json", *FAST_WORDS)
+    assert done.returncode == ExitCode.MESH
+    assert "is open: 3 edges have only one face." in done.stderr.splitlines()[-1]
     assert names(out) == []
 
 
-def test_debug_shows_a_traceback(out: Path, scan: Path) -> None:
-    done = gnrecon(scan, "-o", out / "mesh.obj", "--resolution", "3", "--debug")
+def test_debug_shows_a_traceback(out: Path, scan: Path, here: CommandLine) -> None:
+    done = here(scan, "-o", out / "mesh.obj", "--resolution", "3", "--debug")
     assert done.returncode == ExitCode.USAGE
     assert done.stderr.startswith("Traceback (most recent call last)")
     assert done.stderr.splitlines()[-1].startswith("gnrecon: The resolution must be")
 
 
-def test_a_fault_of_our_own_still_ends_in_one_sentence(out: Path, scan: Path) -> None:
-    fault = "import gnrecon.pipeline\ngnrecon.pipeline.prepare = None"
-    with started(scan, "-o", out / "mesh.obj", before=fault) as process:
-        code, stderr = end(process)
-    assert code == ExitCode.UNFORESEEN
-    assert stderr.count("\n") == 1
-    assert "Unforeseen TypeError" in stderr
-    assert "--debug" in stderr
+def test_a_fault_of_our_own_still_ends_in_one_sentence(
+    out: Path, scan: Path, here: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gnrecon.pipeline.prepare", None)
+    done = here(scan, "-o", out / "mesh.obj")
+    assert done.returncode == ExitCode.UNFORESEEN
+    assert done.stderr.count("\n") == 1
+    assert "Unforeseen TypeError" in done.stderr
+    assert "--debug" in done.stderr
 
 
-def test_version_and_help() -> None:
-    version = gnrecon("--version")
+def test_version_and_help(here: CommandLine) -> None:
+    version = here("--version")
     assert (version.returncode, version.stdout, version.stderr) == (0, f"gnrecon {__version__}\n", "")
-    top = gnrecon("--help")
+    top = here("--help")
     assert top.returncode == 0
     for word in ("reconstruct", "batch", "doctor", "Exit codes"):
         assert word in top.stdout
-    details = gnrecon("reconstruct", "--help-all")
+    details = here("reconstruct", "--help-all")
     assert details.returncode == 0
     for option in ("--output", "--fraction", "--widths", "--resolution", "--reference", "--overwrite", "--debug"):
         assert option in details.stdout
@@ -413,5 +428,5 @@ def test_a_scan_from_standard_input_makes_all_files(scan: Path, out: Path) -> No
     assert names(out) == ["a.html", "a.ply"]
 
 
-def test_standard_input_needs_a_format(here: Here, out: Path) -> None:
+def test_standard_input_needs_a_format(here: CommandLine, out: Path) -> None:
     assert_refused(here("-", "-o", out / "a.ply"), ExitCode.USAGE, "say with --format how to read it")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 from command_line import CommandLine, cube
 from scan_files import torus, write_scan
+from typer.main import get_command
 
+from gnrecon.cli.app import command_line_app
+from gnrecon.cli.command_classes import EVERYDAY
 from gnrecon.cli.reconstruct_command import reconstruct_command
 from gnrecon.io import write_mesh
 from gnrecon.option_table import option_rows
@@ -174,6 +178,41 @@ def test_help_lists_everyday_options_and_all_on_demand(
             assert " ".join(row.described.split()[-3:]) in plain, row.name
             assert "default: " in row.described
     assert "[at least 16; default: 128 to 1,024, from the points' spacing]" in plain
+
+
+FILES = [
+    "output",
+    "report",
+    "preview",
+    "save",
+    "html",
+    "config",
+    "words",
+    "save_config",
+    "log",
+    "reference",
+    "lists",
+    "reference_dir",
+]
+
+
+@pytest.mark.parametrize("name", EVERYDAY)
+def test_help_of_each_command_is_short_and_its_help_all_complete(
+    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    everyday, everything = (command_line(name, word).stdout for word in ("--help", "--help-all"))
+    parameters = {parameter.name: parameter for parameter in get_command(command_line_app()).commands[name].params}
+    assert set(EVERYDAY[name].split()) <= set(parameters)
+    options = [one for one in parameters.values() if one.param_type_name == "option" and one.name != "help"]
+    assert {flag for one in options for flag in (*one.opts, *one.secondary_opts) if flag[:2] == "--"} <= flags(
+        everything
+    )
+    listed = {flag for flag in flags(everyday) if flag in {flag for one in options for flag in one.opts}}
+    assert 10 <= len(listed) <= 16
+    # Files that a run writes or reads have no default, flags are off by default, all else says what holds.
+    valued = [one for one in options if not one.is_flag and one.name not in FILES]
+    assert [one.name for one in valued if not re.search(r"\[.*default: .+\]$", one.help)] == []
 
 
 def test_ranges_are_in_the_help() -> None:

@@ -52,7 +52,7 @@ def ball(count: int, ripple: float = 0.0) -> PointCloud:
 
 
 def test_a_minimal_film_has_little_mean_curvature() -> None:
-    whole = ball(1000)
+    whole = ball(700)
     kept = np.linalg.norm(whole.points - [0, 0, 1], axis=1) > 0.6
     cloud = PointCloud(whole.points[kept], whole.normals[kept])  # type: ignore[index]
     film = fitted(cloud, fill="minimal")
@@ -81,10 +81,10 @@ def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
     monkeypatch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
     monkeypatch.setattr(sharp, "resample_primitives", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
-    smooth = [off(seed) for seed in range(3)]
-    assert min(smooth) > 0.01
+    smooth = off()
+    assert smooth > 0.01
     # One fit in some ends in a worse minimum, and which one depends on the order of sums: the median does not.
-    assert np.median(np.divide(developable, smooth)) < 0.4
+    assert np.median(developable) < 0.4 * smooth
 
 
 def test_strain_smooths() -> None:
@@ -100,8 +100,8 @@ def test_strain_smooths() -> None:
 
 
 def test_the_same_again_is_the_same() -> None:
-    cloud = Can().scan(0.25, 0.45)
-    one, other = (fitted(cloud, fill="minimal", prior="developable", smooth="strain=1e-5") for _ in range(2))
+    cloud = Can().scan(0.2, 0.45)
+    one, other = (fitted(cloud, prior="developable", smooth="strain=1e-5") for _ in range(2))
     assert one.theta.equal(other.theta)
     assert one.detail is not None
     assert other.detail is not None

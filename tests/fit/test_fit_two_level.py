@@ -95,10 +95,12 @@ def test_ten_points_are_enough() -> None:
 
 
 def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:
-    samples, sdf = clean
-    again = fit(samples, FitOptions(quality="draft"))[0]
+    samples = clean[0]
+    few = Samples(samples.points[::4], samples.normals[::4], FRAME)
+    one, other = (fit(few, FitOptions(quality="draft"))[0] for _ in range(2))
     x = FRAME.to_world(samples.points)
-    np.testing.assert_array_equal(again.sdf(x), sdf.sdf(x))
+    assert one.detail is not None
+    np.testing.assert_array_equal(one.sdf(x), other.sdf(x))
 
 
 def test_a_field_with_detail_is_saved_and_read(clean: tuple[Samples, NeuralSDF], tmp_path: Path) -> None:
@@ -144,7 +146,7 @@ def test_derivatives_of_the_whole_field(clean: tuple[Samples, NeuralSDF]) -> Non
 
 
 def test_uncertainty_grows_where_there_is_no_data() -> None:
-    samples = torus(3000, np.random.default_rng(5))
+    samples = torus(1500, np.random.default_rng(5))
     hole = np.linalg.norm(samples.points - [0.7, 0.0, 0.25], axis=1) < 0.1
     holed = Samples(samples.points[~hole], samples.normals[~hole], FRAME)
     sdf = fit(holed, FitOptions(quality="draft"))[0]
@@ -230,7 +232,7 @@ def test_an_interrupt_leaves_the_global_field(monkeypatch: pytest.MonkeyPatch) -
         raise KeyboardInterrupt
 
     monkeypatch.setattr(adaptive, "fit_detail", interrupted)
-    sdf, solution = fit(torus(600, np.random.default_rng(5)))
+    sdf, solution = fit(torus(600, np.random.default_rng(5)), FitOptions(quality="draft"))
     assert solution.interrupted
     assert sdf.detail is None
     assert "Interrupted" in solution.status

@@ -24,6 +24,7 @@ from gnrecon.export.remeshing.remesh import move_vertices, with_creases
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.quiet_imports import import_open3d
 
 
 def decimate(mesh: Mesh, field: SignedDistance, faces: int, *, angle: float = 30.0) -> Mesh:
@@ -154,7 +155,7 @@ def _clustered(mesh: Mesh, faces: int, *, faces_per_square: float = 2.3) -> tupl
 
     The first cube's width follows from about how many faces clustering leaves for each square of surface of its width.
     """
-    import open3d
+    open3d = import_open3d()
 
     centre, size = centre_and_size(mesh)
     places = open3d.utility.Vector3dVector((mesh.vertices - centre) / size)

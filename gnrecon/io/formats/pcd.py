@@ -18,6 +18,7 @@ from gnrecon.geometry.arrays import Values
 from gnrecon.io.contents import Contents, decoded_normals, no_faces
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
+from gnrecon.runtime.quiet_imports import import_open3d
 
 Header = dict[str, list[str]]
 
@@ -30,7 +31,7 @@ def read_pcd(path: Path) -> Contents:
     InputError
         When the header is malformed or fewer points than it declares can be read.
     """
-    import open3d
+    open3d = import_open3d()
 
     header, body = _split(path.read_bytes())
     header = _plain(header)

@@ -9,6 +9,7 @@ from typing import Any
 
 from gnrecon.export import DISTANCES
 from gnrecon.ingest import Layers
+from gnrecon.option_table import option_rows
 from gnrecon.report.html.scales import count, figure, memory, seconds, share
 
 Report = Mapping[str, Any]
@@ -178,7 +179,11 @@ def stages(report: Report) -> list[Bar]:
 
 def options(report: Report) -> list[Fact]:
     """Every option with its value."""
-    return [Fact(f"--{name.replace('_', '-')}", _value(value)) for name, value in (report.get("options") or {}).items()]
+    rows = option_rows()
+    return [
+        Fact(rows[name].flag if name in rows else f"--{name.replace('_', '-')}", _value(value))
+        for name, value in (report.get("options") or {}).items()
+    ]
 
 
 def versions(report: Report) -> list[Fact]:
@@ -193,10 +198,12 @@ def versions(report: Report) -> list[Fact]:
 
 
 def _value(value: Any) -> str:
-    if value is None:
+    if value is None or value in ((), []):
         return "not given"
     if isinstance(value, bool):
         return _yes_or_no(value)
+    if isinstance(value, int):
+        return count(value)
     return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.accuracy.problem import Case, Problem
-from benchmarks.accuracy.scans import PAPER_SCANS, AnalyticScan, RangeScan, ShapeFile, UnorientedScan
+from benchmarks.accuracy.scans import PAPER_SCANS, AnalyticScan, RangeScan, SampleScan, ShapeFile, UnorientedScan
 from benchmarks.accuracy.stored_peers import StoredName
 from benchmarks.accuracy.surface_scans import Cut, OpenScan, Sampling, SurfaceScan
 from gnrecon.runtime.errors import UsageError
@@ -162,8 +162,15 @@ def _groups() -> dict[str, dict[str, Case]]:
         "sphere, hole": AnalyticScan("sphere", 1000, hole=0.5),
         "block, hole": AnalyticScan("block", 3000, hole=0.3),
     }
+    samples: dict[str, Case] = {
+        "bracket_dense": SampleScan("bracket_dense.ply", "bracket_reference.ply", genus=8),
+        "bracket_sparse": SampleScan("bracket_sparse.ply", "bracket_reference.ply", genus=8),
+        "knot_noisy": SampleScan("knot_noisy.ply", "knot_reference.ply", genus=2, outliers=True),
+        "knot_unoriented": SampleScan("knot_unoriented.xyz", "knot_reference.ply", genus=2),
+    }
     stored = _stored_names()
     return {
+        "samples": samples,
         "paper": {name: Within("paper", case, stored.get(name)) for name, case in PAPER_SCANS.items()},
         "srb": {name: Within("srb", case, stored.get(name)) for name, case in srb.items()},
         "vipss": {name: Within("vipss500", case, stored.get(name)) for name, case in vipss.items()},

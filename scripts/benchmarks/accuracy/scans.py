@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.accuracy.analytic_solids import SOLIDS, Solid
 from benchmarks.accuracy.problem import Problem
+from benchmarks.harness.command_line import REPOSITORY
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import Frame, PointCloud
@@ -140,6 +141,35 @@ class UnorientedScan:
         frame = Frame.of(truth.vertices)
         scan = PointCloud(frame.to_unit(read_cloud(_required(data / self.file)).points))
         return Problem(scan, Mesh(frame.to_unit(truth.vertices), truth.faces), self.genus, up=self.up, view=self.view)
+
+
+@dataclass(frozen=True)
+class SampleScan:
+    """A scan of the repository's folder sample_data, compared in millimetres.
+
+    Parameters
+    ----------
+    file, truth : of the scan and of the true surface
+    genus : of the true surface
+    outliers : whether the scan holds points far off the surface
+    """
+
+    file: str
+    truth: str
+    genus: int
+    outliers: bool = False
+
+    def problem(self, data: Path, seed: int) -> Problem:  # noqa: ARG002 - the repository has it, and it is as it is
+        """Return the scan and its truth.
+
+        Raises
+        ------
+        InputError
+            When a file cannot be read.
+        """
+        folder = REPOSITORY / "sample_data"
+        scan, truth = read_cloud(folder / self.file), read_mesh(folder / self.truth)
+        return Problem(scan, truth, self.genus, None, outliers=self.outliers, view=(-55.0, 28.0))
 
 
 def _required(path: Path) -> Path:
