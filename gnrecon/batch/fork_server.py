@@ -12,7 +12,6 @@ When standard input ends, because the parent of this process has gone, all child
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import json
 import os
@@ -26,6 +25,8 @@ from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
+
+from gnrecon.runtime.interrupts import die_with_parent
 
 
 class ForkServer:
@@ -169,15 +170,6 @@ def detach_child(log: str, environment: Mapping[str, str], parent: int) -> None:
     tempfile.tempdir = None  # so that TMPDIR is read again
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-
-
-def die_with_parent(parent: int) -> None:
-    """Let the system kill this process when its parent ends; where the parent has already ended, exit now."""
-    pr_set_pdeathsig = 1  # from linux/prctl.h
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _redirect(descriptor: int, target: int) -> None:

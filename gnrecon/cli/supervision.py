@@ -14,8 +14,8 @@ import time
 from contextlib import suppress
 from types import FrameType
 
-from gnrecon.batch.fork_server import die_with_parent
 from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.interrupts import die_with_parent
 
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

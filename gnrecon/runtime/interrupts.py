@@ -7,6 +7,9 @@ are counted, and `reraised` raises one again that a block of third-party code ha
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -55,3 +58,12 @@ def reraised() -> Iterator[None]:
         raise
     if _Received.count > before:
         raise KeyboardInterrupt
+
+
+def die_with_parent(parent: int) -> None:
+    """Let the system kill this process when its parent ends; where the parent has already ended, exit now."""
+    pr_set_pdeathsig = 1  # from linux/prctl.h
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
