@@ -79,8 +79,10 @@ def prepare(
         outer, normals = outer_surface(centred)
         cleaned = cleaned.select(outer).with_normals(normals)
         counts = replace(counts, inner=int((~outer).sum()))
-    if arrangement == "lines":
-        cleaned, orientation, half = _along_lines(cleaned, orient, parameters)
+    along = _along_lines(cleaned, orient, parameters) if arrangement == "lines" else None
+    # Lines so far apart that hardly a point would be left are none of a scan's.
+    if along is not None and len(along[0]) >= parameters.least_points:
+        cleaned, orientation, half = along
         counts = replace(counts, along_lines=len(centred) - len(cleaned), half_line_distance=half)
         oriented = cleaned.with_normals(orientation.normals)
     else:
