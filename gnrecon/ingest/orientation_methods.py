@@ -223,7 +223,7 @@ Single = npt.NDArray[np.float32]
 
 
 def consistent_normals(
-    points: Float, normals: Float, *, width_spacings: float = 0.75, least_width: float = 1e-5, rounds: int = 10
+    points: Float, normals: Float, *, width_spacings: float = 0.6, least_width: float = 1e-5, rounds: int = 10
 ) -> Float:
     """Return outward unit normals, of shape (N, 3).
 
