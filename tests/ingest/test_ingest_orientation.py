@@ -150,3 +150,35 @@ def test_two_opposite_layers_show_the_thickness_of_a_sheet(rng: np.random.Genera
     assert sheet_thickness(flat, np.abs(normals)) is None
     assert sheet_thickness(flat, -normals) is None  # the layers face each other: nothing is between them
     assert sheet_thickness(*sphere(3000)) is None
+
+
+def body_on_thin_legs(count: int, noise: float, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Points of a capsule on four thinner ones, and their normals."""
+    legs = [([x, y, 0.0], [x, y, -1.0], 0.04) for x in (-0.5, 0.5) for y in (-0.15, 0.15)]
+    capsules = [(np.array(a), np.array(b), r) for a, b, r in [([-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], 0.3), *legs]]
+    points, normals = [], []
+    for start, end, radius in capsules:
+        axis = end - start
+        some = int(16_000 * radius * (1 + 2 * radius))
+        side = rng.standard_normal((some, 3))
+        side -= (side @ axis)[:, None] * axis
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        along = rng.uniform(-radius, 1 + radius, some)
+        cap = (along - along.clip(0, 1)) / radius
+        normals.append(cap[:, None] * axis + np.sqrt(1 - cap**2)[:, None] * side)
+        points.append(start + along.clip(0, 1)[:, None] * axis + radius * normals[-1])
+    x, n = np.concatenate(points), np.concatenate(normals)
+    outer = np.ones(len(x), bool)
+    for start, end, radius in capsules:
+        nearest = start + ((x - start) @ (end - start)).clip(0, 1)[:, None] * (end - start)
+        outer &= np.linalg.norm(x - nearest, axis=1) > radius - 1e-6
+    rows = rng.permutation(np.flatnonzero(outer))[:count]
+    return x[rows] + noise * rng.standard_normal((count, 3)), n[rows]
+
+
+@pytest.mark.parametrize(("count", "noise", "seed"), [(400, 0.0, 1), (3000, 0.008, 0)])
+def test_thin_legs_of_a_closed_surface_have_outward_normals(count: int, noise: float, seed: int) -> None:
+    """Neighbours in noise, or on the other side of a leg, seem to contradict right signs: propagation has 9 % wrong."""
+    points, normals = body_on_thin_legs(count, noise, np.random.default_rng(seed))
+    found = oriented_normals(points).normals
+    assert (np.einsum("ij,ij->i", found, normals) < 0).mean() < 0.04
