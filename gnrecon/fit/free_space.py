@@ -13,7 +13,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from gnrecon.field.networks import Siren
 from gnrecon.fit.parameters import FreeSpaceParameters
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.octree import DipoleTree
@@ -92,7 +95,7 @@ class CubeSpace:
     points : of the cube and its margin, of shape (N, 3)
     tree, disks : of these and of all around them: a k-d tree, and the radius of the disk of each of its points
     dipoles : of all points
-    field : returns the global field, of shape (Q,), at places of shape (Q, 3), unit coordinates
+    network, theta : the global field in unit coordinates
     rng : draws the samples
     parameters : FreeSpaceParameters
     signed_by : returns other signed distances than the coarse ones, for places and these, where a penalty fills holes
@@ -105,7 +108,8 @@ class CubeSpace:
     tree: Any
     disks: Float
     dipoles: DipoleTree
-    field: Callable[[Float], Float]
+    network: Siren
+    theta: Tensor
     rng: np.random.Generator
     parameters: FreeSpaceParameters = FreeSpaceParameters()
     signed_by: Callable[[Float, Float], Float] | None = None
@@ -147,4 +151,5 @@ class CubeSpace:
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
-        return Volume.around(x, self.field(x), signed, is_sign_certain(winding), distance, parameters=self.parameters)
+        value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
+        return Volume.around(x, value, signed, is_sign_certain(winding), distance, parameters=self.parameters)

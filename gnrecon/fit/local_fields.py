@@ -200,7 +200,8 @@ class _Cubes:
             density.tree,
             density.disks,
             self.dipoles,
-            lambda x: sdf.field.value(sdf.theta, torch.as_tensor(x).to(sdf.theta)).double().cpu().numpy(),
+            sdf.field,
+            sdf.theta,
             cube_generator(self.seed, key),
             signed_by=None if self.penalties is None else self.penalties.volume_distances,
         )

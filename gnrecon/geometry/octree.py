@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import winding_number
 
 MORTON_BITS = 21
 """Bits of a cell's number along an axis: three of them fit a code of 64 bits."""
@@ -172,10 +171,6 @@ class DipoleTree:
                 rows = ranges(level.first[split], level.first[split + 1])
         places, moments, radii = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return places, moments, radii
-
-    def winding_number(self, x: Float, center: Float, reach: float) -> Float:
-        """Return the winding number, of shape (Q,), at x, of shape (Q, 3), within a box of half an edge `reach`."""
-        return winding_number(x, *self.dipoles_for(center, reach))
 
 
 def ranges(first: Int, end: Int) -> Int:

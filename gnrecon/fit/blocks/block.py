@@ -25,7 +25,7 @@ from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.octree import Codes, DipoleTree, morton_codes
+from gnrecon.geometry.octree import Codes, DipoleTree, morton_codes, ranges
 from gnrecon.geometry.signed_distance import Box
 
 
@@ -138,12 +138,11 @@ class BlockSolver:
         # Cells without points have no code among the occupied ones.
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
-        runs = [np.arange(self.first[cell], self.first[cell + 1]) for cell in at]
-        return np.concatenate([np.zeros(0, dtype=np.int64), *runs])
+        return ranges(self.first[at], self.first[at + 1])
 
     def _space(self, key: Int, center: Float, rows: Int, nearby: Int) -> CubeSpace:
         """Return the space of a cube, the points of which have these rows, with others nearby."""
-        points, theta = self.residuals.points, self.theta
+        points = self.residuals.points
         return CubeSpace(
             center,
             self.partition.reach,
@@ -152,6 +151,7 @@ class BlockSolver:
             cKDTree(points[nearby]),
             self.disks[nearby],
             self.dipoles,
-            lambda x: self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy(),
+            self.network,
+            self.theta,
             cube_generator(self.seed, key),
         )
