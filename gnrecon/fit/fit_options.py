@@ -201,5 +201,5 @@ def network_starts(points: int, *, parameters: NetworkLadderParameters = Network
 def network_steps(points: int, *, parameters: NetworkLadderParameters = NetworkLadderParameters()) -> int:
     """Return the most steps of all global networks of so many seen points."""
     starts = network_starts(points, parameters=parameters)
-    each = starts * parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
+    each = (starts + 1) * parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
     return network_count(points, parameters=parameters) * each

@@ -349,16 +349,24 @@ class NetworkLadder:
         return field, replace(solution, theta=theta), score
 
     def _started(self, width: int) -> tuple[Siren, Solution]:
-        """Return the best network of one width from random starts, after the first steps."""
+        """Return the best network of one width from random starts, after the first steps.
+
+        All starts take some steps, and the best one as many again, as in successive halving (Jamieson and Talwalkar,
+        *Non-stochastic Best Arm Identification and Hyperparameter Optimization*, 2016).
+        """
         field, found = Siren((width,) * self.parameters.depth), list[Solution]()
         scene, rng, share = self.terms.scene, self.rng, InitialisationParameters.hidden_weight_share
+        steps = self.parameters.first_steps
         for _ in range(network_starts(len(scene.points), parameters=self.parameters)):
             theta = spectral_start(field, scene, partial(start_terms, scene, self.options, rng), rng, share)
-            found.append(self._fitted(field, theta, self.parameters.first_steps))
+            # The score rises before it falls, as the damping finds its size: no patience ends these steps.
+            found.append(self._fitted(field, theta, steps, patience=steps))
             if found[-1].interrupted:
                 break
         best = min(found, key=lambda one: self.terms.score(field, one.theta))
-        return field, replace(found[-1], theta=best.theta)
+        if found[-1].interrupted:
+            return field, replace(found[-1], theta=best.theta)
+        return field, self._fitted(field, best.theta, steps)
 
     def _widths(self) -> list[int]:
         """Return the first width, and those of networks with no more parameters than the data has rows."""
@@ -366,7 +374,7 @@ class NetworkLadder:
         rows = 4 * len(self.terms.scene.points)
         return [first, *(w for w in wider if Siren((w,) * self.parameters.depth).layout.count <= rows)]
 
-    def _fitted(self, field: Siren, theta: Tensor, steps: int) -> Solution:
+    def _fitted(self, field: Siren, theta: Tensor, steps: int, *, patience: int | None = None) -> Solution:
         """Take at most so many steps of Gauss-Newton; return the parameters of the least score."""
         noise = self.terms.noise(field, theta)
         done, seconds = len(self.history), self.history[-1].seconds if self.history else 0.0
@@ -395,6 +403,6 @@ class NetworkLadder:
                 self.callback(found)
 
         search = GainRatioDamping(initial_damping=self.parameters.damping, metric=layer_scaled, geodesic=True)
-        patience = self.parameters.patience_steps
+        patience = self.parameters.patience_steps if patience is None else patience
         stop = StopRule(steps, tolerance=self.parameters.least_gain, patience=steps + 1, held_out_patience=patience)
         return GaussNewton(search, Cholesky()).run(problem_at, theta, stop, record, score)

@@ -109,8 +109,8 @@ class NetworkLadderParameters:
 
     depth: int = 3  # hidden layers
     widths: tuple[int, ...] = (16, 24, 32)
-    starts: int = 3  # of the first width, of which the best is widened
-    first_steps: int = 30  # most Gauss-Newton steps of each
+    starts: int = 3  # of the first width, of which the best is fitted further, and widened
+    first_steps: int = 15  # Gauss-Newton steps of each, and most further ones of the best
     steps: int = 15  # of each further width
     patience_steps: int = 8  # without a better score
     least_gain: float = 0.01  # share of the score whose loss ends the steps

@@ -210,7 +210,8 @@ def test_a_summary_is_written_and_printed(tmp_path: Path, capfd: pytest.CaptureF
     (scans / "d.ply").unlink()
     assert run_batch(replace(request, quiet=True)) == ExitCode.OK
     assert capfd.readouterr() == ("", "")
-    assert notes(scans, "ended") == ["a", "c", "b"]
+    *first, second = notes(scans, "ended")
+    assert (sorted(first), second) == (["a", "c"], "b")  # two jobs end in any order
 
 
 @pytest.mark.usefixtures("errand_runs")

