@@ -170,7 +170,7 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
 ) -> None:
     made: list[tuple[int, ...]] = []
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> networks.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> networks.Solution:
         del self, steps
         made.append(field.widths)
         return networks.Solution(theta, "", ())
@@ -180,18 +180,18 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     monkeypatch.setattr(Prediction, "is_better_than", lambda *_, **__: True)
     parameters = NetworkLadderParameters(widths=(4, 24, 32), points_per_member=600, most_members=4)
     NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, parameters=parameters).fit()
-    assert made == [(4,) * 3] * 2, "1,321 parameters are more than the 1,200 rows of 300 points"
+    assert made == [(4,) * 3] * 4, "1,321 parameters are more than the 1,200 rows of 300 points"
     made.clear()
     NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, parameters=parameters).fit()
-    assert made == [(4,) * 3] * 3 + [(24,) * 3, (32,) * 3], "one network has three starts"
+    assert made == [(4,) * 3] * 4 + [(24,) * 3, (32,) * 3], "one network has three starts, and the best goes on"
 
 
 def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
-    ends = iter([False, False, False, True])  # two members of two widths; Ctrl-C in the last one
+    ends = iter([False] * 5 + [True])  # two members, each started, continued and widened; Ctrl-C in the last one
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> networks.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> networks.Solution:
         del self, field, steps
         return networks.Solution(theta, "Interrupted.", (), interrupted=next(ends))
 
@@ -268,7 +268,7 @@ def test_an_outlier_is_a_point_that_no_field_explains(network: tuple[GlobalField
 def test_the_best_of_the_starts_is_the_network(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     starts: list[torch.Tensor] = []
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int) -> networks.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> networks.Solution:
         del self, field, steps
         starts.append(theta)
         return networks.Solution(theta, "", ())
@@ -285,3 +285,4 @@ def test_the_best_of_the_starts_is_the_network(monkeypatch: pytest.MonkeyPatch, 
     assert least == 1.0
     assert solution.theta is starts[1]
     assert not torch.equal(starts[0], starts[1])
+    assert starts[3:] == [starts[1]], "it alone goes on"
