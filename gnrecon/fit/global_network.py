@@ -133,8 +133,7 @@ class NetworkTerms:
         # Medians of the absolute value of a normal variable, and of the length of a normal vector in space.
         values, normals = float(distance.median()) / 0.6745, float(angle.median()) / 1.538
         # The errors of estimated normals are alike among neighbours, so that validation points do not show them.
-        estimated = self.scene.samples.estimated
-        least_angle = self.parameters.least_estimated_deviation if estimated else least
+        least_angle = self.parameters.least_estimated_deviation if self.scene.samples.estimated else least
         return Deviations(max(values, least * radius), max(normals, least_angle))
 
     def prediction(self, field: Siren, theta: Tensor) -> Prediction:
@@ -177,10 +176,8 @@ class NetworkTerms:
         self, field: Siren, theta: Tensor, noise: Deviations, rng: np.random.Generator
     ) -> tuple[ObjectiveTerm, ObjectiveTerm]:
         """Return values and normals at a random part of the points, with robust weights."""
-        freedom, rows = (
-            self.parameters.robust_degrees_of_freedom,
-            self._part(len(self.scene.points), self.parameters.data_rows, rng),
-        )
+        freedom = self.parameters.robust_degrees_of_freedom
+        rows = self._part(len(self.scene.points), self.parameters.data_rows, rng)
         points, normals = self.scene.points[rows], self.scene.normals[rows]
         value, gradient = field.value_and_gradient(theta, points)
         off = (value / noise.values).square()
@@ -281,8 +278,7 @@ class NetworkLadder:
         field, theta, score = found[0][0], found[0][1].theta, found[0][2]
         for member in found[1:]:
             tried = mean_of([(one, solution.theta) for one, solution, _ in (*members, member)])
-            of_mean = self.terms.score(*tried)
-            if of_mean < score:
+            if (of_mean := self.terms.score(*tried)) < score:
                 members.append(member)
                 (field, theta), score = tried, of_mean
         self.members = [(one, solution.theta) for one, solution, _ in members]
@@ -299,12 +295,6 @@ class NetworkLadder:
             On Ctrl-C during the steps; the networks are unchanged.
         """
         terms = replace(self.terms, scene=scene)
-        search = GainRatioDamping(
-            initial_damping=self.parameters.damping,
-            metric=layer_scaled,
-            geodesic=True,
-            length=self.parameters.refit_length,
-        )
         found = []
         for field, theta in self.members:
             noise = self.terms.noise(field, theta)
@@ -314,7 +304,7 @@ class NetworkLadder:
                 return terms.problem(field, theta, noise, self.rng)
 
             steps = StopRule(self.parameters.refit_steps, patience=self.parameters.refit_steps + 1)
-            solution = GaussNewton(search, Cholesky()).run(problem_at, theta, steps)
+            solution = self._optimiser(self.parameters.refit_length).run(problem_at, theta, steps)
             if solution.interrupted:
                 raise KeyboardInterrupt
             found.append((field, solution.theta))
@@ -351,22 +341,20 @@ class NetworkLadder:
     def _started(self, width: int) -> tuple[Siren, Solution]:
         """Return the best network of one width from random starts, after the first steps.
 
-        All starts take some steps, and the best one as many again, as in successive halving (Jamieson and Talwalkar,
-        *Non-stochastic Best Arm Identification and Hyperparameter Optimization*, 2016).
+        The best start takes as many again, as in successive halving (Jamieson and Talwalkar, *Non-stochastic Best Arm
+        Identification and Hyperparameter Optimization*, 2016).
         """
         field, found = Siren((width,) * self.parameters.depth), list[Solution]()
-        scene, rng, share = self.terms.scene, self.rng, InitialisationParameters.hidden_weight_share
-        steps = self.parameters.first_steps
+        scene, rng, steps = self.terms.scene, self.rng, self.parameters.first_steps
         for _ in range(network_starts(len(scene.points), parameters=self.parameters)):
-            theta = spectral_start(field, scene, partial(start_terms, scene, self.options, rng), rng, share)
+            share, start = InitialisationParameters.hidden_weight_share, partial(start_terms, scene, self.options, rng)
+            theta = spectral_start(field, scene, start, rng, share)
             # The score rises before it falls, as the damping finds its size: no patience ends these steps.
             found.append(self._fitted(field, theta, steps, patience=steps))
             if found[-1].interrupted:
                 break
-        best = min(found, key=lambda one: self.terms.score(field, one.theta))
-        if found[-1].interrupted:
-            return field, replace(found[-1], theta=best.theta)
-        return field, self._fitted(field, best.theta, steps)
+        best = min(found, key=lambda one: self.terms.score(field, one.theta)).theta
+        return field, replace(found[-1], theta=best) if found[-1].interrupted else self._fitted(field, best, steps)
 
     def _widths(self) -> list[int]:
         """Return the first width, and those of networks with no more parameters than the data has rows."""
@@ -402,7 +390,10 @@ class NetworkLadder:
             if self.callback is not None:
                 self.callback(found)
 
-        search = GainRatioDamping(initial_damping=self.parameters.damping, metric=layer_scaled, geodesic=True)
         patience = self.parameters.patience_steps if patience is None else patience
         stop = StopRule(steps, tolerance=self.parameters.least_gain, patience=steps + 1, held_out_patience=patience)
-        return GaussNewton(search, Cholesky()).run(problem_at, theta, stop, record, score)
+        return self._optimiser().run(problem_at, theta, stop, record, score)
+
+    def _optimiser(self, length: float = 1.0) -> GaussNewton:
+        damping = self.parameters.damping
+        return GaussNewton(GainRatioDamping(damping, metric=layer_scaled, geodesic=True, length=length), Cholesky())

@@ -351,4 +351,5 @@ class FitParameters:
     shape_priors: ShapePriorParameters = ShapePriorParameters()
     global_field: GlobalFieldParameters = GlobalFieldParameters()
     outliers: OutlierParameters = OutlierParameters()
+    denoising: DenoisingParameters = DenoisingParameters()
     local_fields: LocalFieldParameters = LocalFieldParameters()

@@ -244,15 +244,16 @@ class _Steps:
         if data.sharp is not None:
             local = LocalData.of_faces(sdf, data.sharp)
         else:
-            samples, held_out, device = data.samples, data.held_out, options.device
-            local = choose_local_data(sdf, samples, held_out, options.features, rng, device, outliers=outliers)
+            samples, chosen = data.samples, (options.features, rng, options.device)
+            limits = self.parameters.denoising
+            local = choose_local_data(sdf, samples, data.held_out, *chosen, outliers=outliers, parameters=limits)
             # The validation points have chosen everything, and may be fitted, too.
             if first.ladder is not None and len(samples) <= self.parameters.two_level.most_refitted_points:
                 sdf = first.refitted(data.samples)
                 local = replace(local, residuals=FieldResiduals.of(sdf, local.samples))
-        limits = self.parameters.local_fields
-        advance(limits.selection_time_share)
-        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=limits)
+        cubes = self.parameters.local_fields
+        advance(cubes.selection_time_share)
+        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=cubes)
         return sdf, detail, None if local.averaging is None else local.averaging.width_radii
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:

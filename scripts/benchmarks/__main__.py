@@ -21,6 +21,7 @@ class Benchmark:
 BENCHMARKS = {
     "paper": Benchmark("accuracy.paper_shapes", "the paper's two shapes, gnrecon compared with screened Poisson"),
     "accuracy": Benchmark("accuracy.many_scans", "gnrecon compared with its peers on clean, noisy and sparse scans"),
+    "ablation": Benchmark("accuracy.ablation", "the default fit without one of its parts at a time"),
     "uncertainty": Benchmark("uncertainty", "sigma compared with the true error, on known shapes"),
     "engine": Benchmark("engine.measurements", "Gauss-Newton compared with a plain version of the paper's algorithm"),
     "learn": Benchmark("shape_learning", "shape learning by three optimisers, and one step's time"),

@@ -30,7 +30,7 @@ def test_noise_is_as_large_as_it_says() -> None:
 
 def test_the_benchmark_measures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report, picture = tmp_path / "blocks.json", tmp_path / "blocks.png"
-    words = ["--counts", "1500", "--quality", "draft", "--resolution", "24"]
+    words = ["--counts", "1000", "--quality", "draft", "--resolution", "24"]
     assert blocks([*words, "--json", str(report), "--picture", str(picture)]) == ExitCode.OK
     whole, run = json.loads(report.read_text())["runs"]
     assert (whole["blocks"], run["blocks"]) == (False, True)

@@ -12,10 +12,14 @@ method. With `outliers`, scattered points are first removed by open3d's statisti
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.accuracy.parts import PARTS
+from gnrecon.fit.parameters import FitParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 
@@ -24,16 +28,19 @@ Method = Callable[..., Answer]
 
 
 def load_gnrecon() -> Method:
-    """Load gnrecon; its settings are the options of `gnrecon.reconstruct`."""
+    """Load gnrecon; its settings are the options of `gnrecon.reconstruct`, and a part to leave out of the fit."""
     # gnrecon itself imports these on first use.
     import manifold3d  # noqa: F401
     import open3d  # noqa: F401
     import skimage.measure  # noqa: F401
 
+    from gnrecon.fit import fit
     from gnrecon.pipeline import reconstruct
 
-    def run(points: Float, normals: Float | None, **options: Any) -> Answer:
-        result = reconstruct(points, normals=normals, **options)
+    def run(points: Float, normals: Float | None, without: str | None = None, **options: Any) -> Answer:
+        parameters = FitParameters() if without is None else PARTS[without]
+        with patch("gnrecon.pipeline.fit", partial(fit, parameters=parameters)):
+            result = reconstruct(points, normals=normals, **options)
         return result.mesh, {"stages": result.report["stages"], "status": result.report["fit"]["status"]}
 
     return run
