@@ -229,9 +229,10 @@ def _certain(scene: Scene, x: Float) -> tuple[Float, Float]:
 # A ladder of widths, climbed while validation points gain by it.
 #
 # A small network is fast and smooth, and finds the shape as a whole. The best of some starts is widened with its
-# function kept (`field.widening`) and fitted further, until a width gains no more. A step costs a multiple of the
-# fourth power of the width. Sparse points leave much freedom, so that each start ends in another field: the mean of
-# those networks that score best together is nearer to the surface, as their deviations between points are independent.
+# function kept (`field.widening`) and fitted further, until a width gains no more; only to widths with a parameter for
+# each point, because local fields resolve more of denser scans. Sparse points leave much freedom, so that each start
+# ends in another field: the mean of those networks that score best together is nearer to the surface, as their
+# deviations between points are independent.
 # Source: Caruana et al., *Ensemble Selection from Libraries of Models* (2004), for the choice of members.
 
 
@@ -357,10 +358,10 @@ class NetworkLadder:
         return field, replace(found[-1], theta=best) if found[-1].interrupted else self._fitted(field, best, steps)
 
     def _widths(self) -> list[int]:
-        """Return the first width, and those of networks with no more parameters than the data has rows."""
-        first, *wider = self.parameters.widths
-        rows = 4 * len(self.terms.scene.points)
-        return [first, *(w for w in wider if Siren((w,) * self.parameters.depth).layout.count <= rows)]
+        """Return the first width, and wider ones with a parameter for each point, and no more of them than rows."""
+        (first, *wider), points = self.parameters.widths, len(self.terms.scene.points)
+        counts = {width: Siren((width,) * self.parameters.depth).layout.count for width in wider}
+        return [first, *(width for width, count in counts.items() if points <= count <= 4 * points)]
 
     def _fitted(self, field: Siren, theta: Tensor, steps: int, *, patience: int | None = None) -> Solution:
         """Take at most so many steps of Gauss-Newton; return the parameters of the least score."""

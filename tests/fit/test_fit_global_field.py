@@ -184,6 +184,9 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     made.clear()
     NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, parameters=parameters).fit()
     assert made == [(4,) * 3] * 4 + [(24,) * 3, (32,) * 3], "one network has three starts, and the best goes on"
+    made.clear()
+    NetworkLadder(terms_of(capsule(1700, 0), rng), FitOptions(), rng, parameters=parameters).fit()
+    assert made == [(4,) * 3] * 4 + [(32,) * 3], "1,321 parameters are fewer than the 1,416 points"
 
 
 def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
@@ -198,7 +201,7 @@ def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
     scores = itertools.count(1)  # each network is worse than the one before
     monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
     monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0 if next(scores) % 2 else 0.98)
-    parameters = NetworkLadderParameters(widths=(4, 6), points_per_member=600, most_members=2)
+    parameters = NetworkLadderParameters(widths=(4, 12), points_per_member=600, most_members=2)
     ladder = NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, parameters=parameters)
     assert ladder.fit()[1].interrupted
 
