@@ -63,10 +63,10 @@ def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Gen
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene, field = Scene.of(seen, options.device, rng), Siren((units,))
 
-    def terms(x: torch.Tensor, distance: torch.Tensor, most: int) -> list[ObjectiveTerm]:
+    def terms(x: torch.Tensor, distance: torch.Tensor, most: int, counts: torch.Tensor | None) -> list[ObjectiveTerm]:
         return [
             ObjectiveTerm("interface", interface, scene.points[:most], None, 1.0),
-            distance_term(scene, x, distance),
+            distance_term(scene, x, distance, counts),
         ]
 
     theta = wide_start(field, scene, terms, rng, smooth_spectrum(min(LinearFieldParameters.length_scales_radii), scene))

@@ -34,8 +34,8 @@ from gnrecon.least_squares.system import identity
 from gnrecon.runtime.errors import FitError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
-TermsOf = Callable[[Tensor, Tensor, int], Sequence[ObjectiveTerm]]
-"""Terms of volume samples x, their coarse distances, and at most so many data points."""
+TermsOf = Callable[[Tensor, Tensor, int, Tensor | None], Sequence[ObjectiveTerm]]
+"""Terms of volume samples x, their coarse distances, at most so many data points, and how often each sample counts."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +80,20 @@ def wide_start(
     frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
     x, distance = scene.volume(scene.volume_count, rng)
-    search = WrongSignSearch(scene.coarse, x, np.sign(distance))
+    search, counts = WrongSignSearch(scene.coarse, x, np.sign(distance)), np.ones(len(x))
     for round_number in range(parameters.rounds):
         last = round_number + 1 == parameters.rounds
         most_points = parameters.final_points if last else parameters.search_points
-        terms = terms_of(scene.tensor(x), scene.tensor(distance), most_points)
+        terms = terms_of(scene.tensor(x), scene.tensor(distance), most_points, scene.tensor(counts))
         theta = solve_last_layer(field, terms, theta)
         advance((round_number + 1) / parameters.rounds)
         if not last:
             trial = scene.places(parameters.trial_factor * scene.volume_count, rng)
             wrong, expected = search.wrong_signs(trial, partial(_value, field, theta, scene))
-            some = np.repeat(rng.permutation(len(wrong))[: scene.volume_count // 2], parameters.wrong_sign_repeats)
+            some = rng.permutation(len(wrong))[: scene.volume_count // 2]
             x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
+            # A row that counts several times costs as much as one.
+            counts = np.concatenate([counts, np.full(len(some), float(parameters.wrong_sign_repeats))])
     return theta
 
 
@@ -122,7 +124,7 @@ def spectral_start(
     theta = random_network(field, rng, scene.points, hidden_weight_share)
     count = parameters.spectral_samples
     x, distance = scene.volume(count, rng)
-    terms = terms_of(scene.tensor(x), scene.tensor(distance), count)
+    terms = terms_of(scene.tensor(x), scene.tensor(distance), count, None)
     total = sum(float(torch.as_tensor(term.weight).mean()) for term in terms)
     return solve_last_layer(field, terms, theta, parameters.spectral_ridge * total)
 

@@ -230,12 +230,18 @@ def groups(terms: Sequence[ObjectiveTerm]) -> list[list[ObjectiveTerm]]:
 
 
 def start_terms(
-    scene: Scene, options: FitOptions, rng: np.random.Generator, x: Tensor, distance: Tensor, most: int
+    scene: Scene,
+    options: FitOptions,
+    rng: np.random.Generator,
+    x: Tensor,
+    distance: Tensor,
+    most: int,
+    counts: Tensor | None = None,
 ) -> list[ObjectiveTerm]:
-    """Return the terms of a linear start: at most `most` data points, and volume samples x with their distances."""
+    """Return the terms of a linear start: at most `most` data points, and those of `distance_term`."""
     # The start is a linear solve, and other residuals than these two are not linear in f, or not known to be.
     linear = options if options.normals in ("vector", "projection") else replace(options, normals="vector")
-    return [*data_terms(scene, linear, rng, most), distance_term(scene, x, distance)]
+    return [*data_terms(scene, linear, rng, most), distance_term(scene, x, distance, counts)]
 
 
 def step_terms(
@@ -294,11 +300,24 @@ def normal_weight(
 
 
 def distance_term(
-    scene: Scene, x: Tensor, distance: Tensor, *, parameters: ObjectiveParameters = ObjectiveParameters()
+    scene: Scene,
+    x: Tensor,
+    distance: Tensor,
+    counts: Tensor | None = None,
+    *,
+    parameters: ObjectiveParameters = ObjectiveParameters(),
 ) -> ObjectiveTerm:
-    """Return the term of coarse distances at volume samples; it weighs more where data is sparse."""
-    weight = max(parameters.distance_weight_per_sample * len(x) / len(scene.points), parameters.least_distance_weight)
-    return ObjectiveTerm("distance", signed_distance, x, distance, weight)
+    """Return the term of coarse distances at volume samples; it weighs more where data is sparse.
+
+    Parameters
+    ----------
+    x, distance : of shape (Q, 3) and (Q,)
+    counts : how often each sample counts, of shape (Q,); by default once
+    """
+    total = len(x) if counts is None else float(counts.sum())
+    weight = max(parameters.distance_weight_per_sample * total / len(scene.points), parameters.least_distance_weight)
+    by_sample = weight if counts is None else weight * len(x) / total * counts
+    return ObjectiveTerm("distance", signed_distance, x, distance, by_sample)
 
 
 # What a fit is made in: the samples as tensors, their coarse distance, and the box around them.

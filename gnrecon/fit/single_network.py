@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -82,7 +83,7 @@ def fit_deep(
     """Fit a network of several hidden layers; `advance` is called when the start is solved."""
     steps = options.steps_for(len(scene.points))
     fitted, held = hold_out(scene, rng, parameters=parameters)
-    theta = spectral_start(field, fitted, lambda x, d, n: start_terms(fitted, options, rng, x, d, n), rng)
+    theta = spectral_start(field, fitted, partial(start_terms, fitted, options, rng), rng)
     advance(1.0)
     # Signing volume samples takes as long as a step, so that one pool serves for all of them.
     pool = tuple(scene.tensor(values) for values in fitted.volume(parameters.pool_samples, rng))
@@ -172,7 +173,7 @@ def fit_wide(
     parameters: SingleNetworkParameters = SingleNetworkParameters(),
 ) -> Solution:
     """Fit a network of one hidden layer; `advance` is called with the share of the start that is done."""
-    theta = wide_start(field, scene, lambda x, d, n: start_terms(scene, options, rng, x, d, n), rng, spectrum, advance)
+    theta = wide_start(field, scene, partial(start_terms, scene, options, rng), rng, spectrum, advance)
     whole = options.optimiser != "gn"
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:

@@ -22,15 +22,14 @@ def test_each_part_is_left_out_by_parameters_of_its_own() -> None:
 
 def test_the_benchmark_writes_and_prints_what_a_part_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tmp_path / "ablation.json"
-    tiny = Protocol(threads=1, samples=2000, options={"resolution": 32, "quality": "draft"})
-    words = ["--cases", "sphere, 100 points", "--without", "ball", "Gauss-Newton", "--json", str(report)]
+    tiny = Protocol(threads=1, samples=2000, options={"resolution": 24, "quality": "draft"})
+    words = ["--cases", "sphere, 100 points", "--without", "ball", "--json", str(report)]
     assert main(words, tiny) == ExitCode.OK
     (case,) = json.loads(report.read_text())["cases"]
-    whole, ball, network = (case["fits"][part] for part in (WHOLE, "ball", "Gauss-Newton"))
+    whole, ball = (case["fits"][part] for part in (WHOLE, "ball"))
     assert "ball" in whole["status"]
     assert "ball" not in ball["status"]
     assert ball["chamfer_mean"] > 1.5 * whole["chamfer_mean"]
-    assert network["chamfer_mean"] == whole["chamfer_mean"], "a draft fits no network"
     assert f"{ball['chamfer_mean'] / whole['chamfer_mean']:.2f} / " in capsys.readouterr().out
 
 
