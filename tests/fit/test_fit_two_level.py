@@ -146,7 +146,7 @@ def test_derivatives_of_the_whole_field(clean: tuple[Samples, NeuralSDF]) -> Non
 
 
 def test_uncertainty_grows_where_there_is_no_data() -> None:
-    samples = torus(1500, np.random.default_rng(5))
+    samples = torus(1000, np.random.default_rng(5))
     hole = np.linalg.norm(samples.points - [0.7, 0.0, 0.25], axis=1) < 0.1
     holed = Samples(samples.points[~hole], samples.normals[~hole], FRAME)
     sdf = fit(holed, FitOptions(quality="draft"))[0]
