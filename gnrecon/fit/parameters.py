@@ -153,9 +153,7 @@ class InitialisationParameters:
     ridge: float = 1e-8  # over the number of points: as little as rounding allows
     rounds: int = 3  # solves, each with samples where the last one had the wrong sign
     trial_factor: int = 3  # volume samples that are searched for wrong signs, over those of a solve
-    wrong_sign_repeats: int = (
-        5  # how often such a sample counts in the next solves; without it, horns grow on sparse scans
-    )
+    wrong_sign_repeats: int = 5  # how often such a sample counts in the next solves: once, and horns grow
     ridge_attempts: int = 6  # each with ten times the ridge
     first_layer_frequency: float = 4.0  # standard deviation, per radius, in networks of several layers
     # Share of Sitzmann's bound that weights between layers start with: with all of it, the last layer's features are so
