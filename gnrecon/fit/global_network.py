@@ -347,9 +347,9 @@ class NetworkLadder:
         """
         field, found = Siren((width,) * self.parameters.depth), list[Solution]()
         scene, rng, steps = self.terms.scene, self.rng, self.parameters.first_steps
+        start = partial(start_terms, scene, self.options, rng)
         for _ in range(network_starts(len(scene.points), parameters=self.parameters)):
-            share, start = InitialisationParameters.hidden_weight_share, partial(start_terms, scene, self.options, rng)
-            theta = spectral_start(field, scene, start, rng, share)
+            theta = spectral_start(field, scene, start, rng, InitialisationParameters.hidden_weight_share)
             # The score rises before it falls, as the damping finds its size: no patience ends these steps.
             found.append(self._fitted(field, theta, steps, patience=steps))
             if found[-1].interrupted:

