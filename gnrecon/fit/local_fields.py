@@ -22,7 +22,7 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import CubeSpace
-from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
+from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem
 from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
@@ -107,25 +107,65 @@ def solve_cube(
     hyperparameters: Hyperparameters,
     device: str,
     penalties: SurfacePenalties | None = None,
-) -> Tensor:
-    """Return the amplitudes of a cube, of shape (m,).
+    *,
+    parameters: LocalFieldParameters = LocalFieldParameters(),
+) -> tuple[float, Tensor]:
+    """Return the length of a cube's features and their amplitudes, of shape (m,).
 
     Parameters
     ----------
     residuals, rows : of the global field at all points, and the rows of those that the cube is fitted to
-    length : of its features
+    length : of its features, from which its own may differ if the hyperparameters say so
     space : around it
     features : of all cubes
     hyperparameters : of the whole scan
     device : a torch device
-    penalties : of the surface's curvature
+    penalties : of the surface's curvature, for features of the length as it is
     """
     patch = residuals.patch(rows, space.center, space.far(), device)
-    system = PatchSystem(patch, features, length, patch.size)
-    draw = partial(space.near, length, hyperparameters.position)
-    if penalties is None:
-        return system.solve_with_bounds(hyperparameters.position, hyperparameters.angle, draw)
-    return penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
+    position, angle = hyperparameters.position, hyperparameters.angle
+    if penalties is not None:
+        system = PatchSystem(patch, features, length, patch.size)
+        draw = partial(space.near, length, position)
+        solved = penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
+        return length, solved
+    features = _precise_enough(features, patch, length, hyperparameters, parameters)
+    if hyperparameters.by_place:
+        # Errors of estimated normals are alike among neighbours: as many facts as points they are not.
+        noise = position, None if residuals.estimated else angle
+        length, system = _likeliest_system(patch, features, length, noise, parameters)
+    else:
+        system = PatchSystem(patch, features, length, patch.size)
+    return length, system.solve_with_bounds(position, angle, partial(space.near, length, position))
+
+
+def _precise_enough(
+    features: Features, patch: Patch, length: float, hyperparameters: Hyperparameters, parameters: LocalFieldParameters
+) -> Features:
+    """Return the features in single precision where rounding is far less than the ones that the prior adds to J^T J."""
+    position, angle = patch.size / hyperparameters.position, patch.size / length / hyperparameters.angle
+    # A row of J has mean squares of one for a value and for each of a normal's three components, for features of
+    # variance one; the largest eigenvalue is at most the trace.
+    largest = len(patch.value) * (position**2 + 3 * angle**2)
+    return features.to(torch.float32) if largest < parameters.most_single_eigenvalue else features
+
+
+def _likeliest_system(
+    patch: Patch, features: Features, length: float, noise: tuple[float, float | None], parameters: LocalFieldParameters
+) -> tuple[float, PatchSystem]:
+    """Return the length near a given one of which the cube's own data is most likely, and its system."""
+    best = PatchSystem(patch, features, length, patch.size)
+    most = best.log_evidence(*noise)
+    for factor in (1 / parameters.length_step, parameters.length_step):
+        start = length
+        for _ in range(parameters.most_length_steps):
+            system = PatchSystem(patch, features, factor * length, patch.size)
+            if not (found := system.log_evidence(*noise)) > most:
+                break
+            length, best, most = factor * length, system, found
+        if length != start:
+            break
+    return length, best
 
 
 @dataclass(frozen=True)
@@ -180,7 +220,7 @@ class _Cubes:
             length = cube_length(hyperparameters, disks, density.radius, most_length_stretch=stretch)
             space = self._space(keys[number], center, rows)
             cube = self.residuals, rows, length, space, self.features, hyperparameters, self.device
-            return length, solve_cube(*cube, self.penalties)
+            return solve_cube(*cube, self.penalties, parameters=limits)
 
         cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
         kept = [number for number, cube in enumerate(cubes) if cube is not None]

@@ -12,8 +12,10 @@ and Recht (2007) and observations of the gradient.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -35,11 +37,13 @@ class Hyperparameters:
     length : over which the surface's shape varies, unit coordinates
     position : of the points' noise along the normal, unit coordinates
     angle : of the normals' noise, radians
+    by_place : whether the length is that of the scan on the whole, from which each cube's own may differ
     """
 
     length: float
     position: float
     angle: float
+    by_place: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,23 +89,56 @@ class PatchSystem:
     Parameters
     ----------
     patch : Patch
-    features : Features
+    features : of lower precision than the patch, they make assembly faster; sums over rows keep that of the patch
     length : of the features, unit coordinates
     size : standard deviation of the function, unit coordinates
     """
 
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         self._scale = size * (2.0 / len(features)) ** 0.5
-        like, count = patch.value, len(features)
-        parts = [
-            _data_sums(patch, features, length, rows) for rows in slices(len(like), LocalSolveParameters.chunk_points)
-        ]
-        positions, of_positions, angles, of_angles = (_summed(part) for part in zip(*parts, strict=True))
-        self._positions, self._angles = (positions, of_positions), (angles, of_angles)
         self._patch, self._features, self._length = patch, features, length
-        self._sines = features.phase(patch.volume, patch.center, length).sin()
-        free = self._sines / patch.deviation[:, None]
-        self._volume = gram([free], count, like), free.T @ (patch.wanted / patch.deviation)
+
+    @cached_property
+    def _positions(self) -> tuple[Tensor, Tensor]:
+        """J^T J and J^T y of the values."""
+        values = self._patch.value
+        return self._sums((z.sin(), values[rows]) for rows, z in self._phases())
+
+    @cached_property
+    def _angles(self) -> tuple[Tensor, Tensor]:
+        """J^T J and J^T y of the gradients."""
+        wanted, slopes = self._patch.gradient, self._features.frequencies / self._length
+        cosines = ((rows, z.cos()) for rows, z in self._phases())
+        return self._sums((c * slopes[:, axis], wanted[rows, axis]) for rows, c in cosines for axis in range(3))
+
+    @cached_property
+    def _sines(self) -> Tensor:
+        """The features at the samples of the volume."""
+        return self._features.phase(self._patch.volume, self._patch.center, self._length).sin()
+
+    @cached_property
+    def _volume(self) -> tuple[Tensor, Tensor]:
+        """J^T J and J^T y of the samples of the volume."""
+        wanted, deviation = self._patch.wanted, self._patch.deviation
+        return self._sums([(self._sines / deviation[:, None].to(self._sines), wanted / deviation)])
+
+    def _phases(self) -> Iterator[tuple[slice, Tensor]]:
+        """Yield rows of points with the features' phases there, of shape (N, m)."""
+        patch = self._patch
+        for rows in slices(len(patch.value), LocalSolveParameters.chunk_points):
+            yield rows, self._features.phase(patch.points[rows], patch.center, self._length)
+
+    def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+        """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y."""
+        like, count = self._patch.value, len(self._features)
+        right = like.new_zeros(count)
+
+        def rows() -> Iterator[Tensor]:
+            for chunk, wanted in chunks:
+                right.add_(chunk.T @ wanted.to(chunk))
+                yield chunk
+
+        return gram(rows(), count, like), right
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.
@@ -141,18 +178,37 @@ class PatchSystem:
             lower, upper, zero, distance = (
                 torch.cat(pair) for pair in zip((lower, upper, zero, distance), others, strict=True)
             )
-            value = sines @ amplitudes
+            value = (sines @ amplitudes.to(sines)).to(lower)
             low, high = value < (lower + zero) / 2, value > (upper + zero) / 2
             beyond = low | high
             if not beyond.any():
                 break
             deviation = parameters.bound_deviation_share * distance[beyond]
-            rows = sines[beyond] / deviation[:, None]
+            rows = sines[beyond] / deviation[:, None].to(sines)
             wanted = torch.where(low, lower, upper)[beyond] / deviation
             product, right = self._volume
-            self._volume = product.addmm_(rows.T, rows), right + rows.T @ wanted
+            self._volume = product.add_(rows.T @ rows), right.add_(rows.T @ wanted.to(rows))
             amplitudes = self.solve(position, angle)
         return amplitudes
+
+    def log_evidence(self, position: float, angle: float | None) -> float:
+        """Return the log marginal likelihood of the data, but for a term that no length changes.
+
+        It is (|A^-1/2 b|^2 - log det A) / 2 with A = 1 + s^2 J^T D^-1 J and b = s J^T D^-1 y; of an indefinite system
+        it is -infinity. Here the prior deviation is the RMS of the values: a wide prior, which leaves amplitudes free,
+        would favour long features. Samples of free space are no data, nor are normals without an angle.
+        Source: Rasmussen and Williams (2006), equation 2.30 in the space of the weights.
+        """
+        scale = self._scale / LocalSolveParameters.correction_rms_factor
+        product, right = self._positions[0] * (scale / position) ** 2, self._positions[1] * scale / position**2
+        if angle is not None:
+            product.add_(self._angles[0], alpha=(scale / angle) ** 2)
+            right = right + self._angles[1] * scale / angle**2
+        factor = damped_factor(product, torch.ones_like(right), overwrite=True)
+        if factor is None:
+            return -math.inf
+        white = torch.linalg.solve_triangular(factor, right[:, None], upper=False)
+        return 0.5 * float(white.square().sum()) - float(factor.diagonal().log().sum())
 
     def equations(self, position: float, angle: float) -> tuple[Tensor, Tensor] | None:
         """Return L, of shape (m, m), and b, of shape (m,), of that system L L^T a = b; None where it is indefinite."""
@@ -226,14 +282,6 @@ def _factor(
     return None
 
 
-def _data_sums(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return matrix and right-hand side of some rows' positions, and those of their normals."""
-    sines, slopes = _data_rows(patch, features, length, rows)
-    like, count, wanted = patch.value, len(features), patch.gradient[rows].T
-    right = sum((s.T @ target for s, target in zip(slopes, wanted, strict=True)), torch.zeros(count).to(like))
-    return gram([sines], count, like), sines.T @ patch.value[rows], gram(slopes, count, like), right
-
-
 def _data_rows(patch: Patch, features: Features, length: float, rows: slice) -> tuple[Tensor, list[Tensor]]:
     """Return the features at some points, of shape (N, m), and their derivatives along each axis."""
     z = features.phase(patch.points[rows], patch.center, length)
@@ -245,8 +293,3 @@ def _volume_rows(patch: Patch, features: Features, length: float) -> tuple[Tenso
     """Return the features at the samples of the volume, of shape (Q, m), and their targets, over their deviation."""
     deviation = patch.deviation
     return features.phase(patch.volume, patch.center, length).sin() / deviation[:, None], patch.wanted / deviation
-
-
-def _summed(parts: tuple[Tensor, ...]) -> Tensor:
-    """Return the sum of tensors, of which there is at least one."""
-    return sum(parts[1:], start=parts[0])

@@ -273,15 +273,21 @@ class CrossValidation:
     def _belief(self, number: int, noise: int) -> Hyperparameters:
         """Return the hyperparameters with the numbers of a length and of one of its noises."""
         length = self._length(number)
-        return Hyperparameters(length, *self.noises(length)[noise])
+        # Averaged points have neither; their errors are alike among neighbours, as those of dense scans are.
+        independent = self.likelihood is not None or self.residuals.estimated
+        by_place = independent and len(self.residuals) <= self.parameters.sparse_points
+        return Hyperparameters(length, *self.noises(length)[noise], by_place)
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
         return self.parameters.lengths_disk_radii[number] * self.radius
 
     def _clearly_better(self, number: int, than: int) -> bool:
-        """Return whether a length's score is better than another's by more than the standard error."""
-        gain = self.scores(self._length(than))[:, 0] - self.scores(self._length(number))[:, 0]
+        """Return whether a length's score is better than another's by more than the standard error.
+
+        Logarithms are compared: one patch where both lengths are far off would outweigh all others.
+        """
+        gain = np.log(self.scores(self._length(than))[:, 0]) - np.log(self.scores(self._length(number))[:, 0])
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:

@@ -31,6 +31,9 @@ class LocalFieldParameters:
     data_margin_disk_radii: float = 2.0  # a cube is also fitted to data so far beyond it
     least_points: int = 4  # of a cube; fewer do not define a surface
     most_length_stretch: float = 4.0  # most a cube's length scale may exceed the scan's where points are sparse
+    length_step: float = 2.0**0.5  # between the lengths of which a cube's own data chooses
+    most_length_steps: int = 2  # from the scan's length
+    most_single_eigenvalue: float = 1e5  # of J^T J over the prior's; single precision suffices below
     selection_time_share: float = 0.2  # of the local fit, until length and noise are chosen, for the progress bar
 
 
@@ -227,8 +230,9 @@ class ModelSelectionParameters:
     patch_validation_points: int = 20  # that each patch predicts
     # Points from which patches are more, of fewer features; those of smaller scans would share what they predict.
     dense_points: int = 8000
-    # Points up to which estimated normals are ignored. Those of denser scans are means over little of the surface; and
-    # where many scans do not quite match, distances alone are least for a field that winds through all of them.
+    # Points up to which estimated normals are ignored, and the errors of points are taken for independent. Normals of
+    # denser scans are means over little of the surface; and where many scans do not quite match, a field that winds
+    # through all of them has the least distances and the largest evidence.
     sparse_points: int = 20_000
     most_patch_points: int = 2500  # more change no score, and time grows with the square of the length
     features: int = 700

@@ -102,11 +102,13 @@ def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: p
     validation = CrossValidation.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
     even = np.linspace(-1.0, 1.0, 10)[:, None]
     lengths = ModelSelectionParameters.lengths_disk_radii
+    # In one patch all lengths are far off, and which of them by more is chance.
+    astray = 1000.0 * (np.arange(10) == 4)[:, None]
     scores = {
-        lengths[0]: 3.0 + even,
-        lengths[1]: 2.0 + even,
-        lengths[2]: 1.99 - even,
-        lengths[3]: 0.0 * even,
+        lengths[0]: 3.0 + even + astray,
+        lengths[1]: 2.0 + even + 1.1 * astray,
+        lengths[2]: 1.99 - even + 1.1 * astray,
+        lengths[3]: 1e-3 + 0.0 * even,
     }
     monkeypatch.setattr(CrossValidation, "scores", lambda _, length: scores[length])
     hyperparameters = validation.clean()

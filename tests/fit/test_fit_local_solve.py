@@ -148,3 +148,36 @@ def test_what_rounding_makes_indefinite_is_damped_more(patch: Patch, features: F
     for system in (PatchSystem, LocalRowSystem):
         amplitudes = system(patch, features, LENGTH, 1e12).solve(1e-9, 1e-9)
         assert bool(torch.isfinite(amplitudes).all())
+
+
+@pytest.mark.parametrize("angle", [ANGLE, None])
+def test_the_evidence_is_the_density_of_the_data(patch: Patch, features: Features, angle: float | None) -> None:
+    """Up to what no length changes: the density of y under s^2 J J^T + D, with all matrices held whole."""
+    size = patch.size / LocalSolveParameters.correction_rms_factor
+
+    def density(length: float) -> float:
+        z = (patch.points - patch.center) @ features.frequencies.T / length + features.phases
+        slopes = z.cos()[:, None, :] * features.frequencies.T / length
+        J, y = z.sin(), patch.value
+        deviation = torch.full((len(y),), POSITION).double()
+        if angle is not None:
+            J = torch.cat([J, slopes.reshape(-1, len(features))])
+            y = torch.cat([y, patch.gradient.reshape(-1)])
+            deviation = torch.cat([deviation, torch.full((len(J) - len(deviation),), angle).double()])
+        covariance = size**2 * 2 / len(features) * J @ J.T + torch.diag(deviation**2)
+        normal = torch.distributions.MultivariateNormal(torch.zeros_like(y), covariance)
+        return float(normal.log_prob(y))
+
+    systems = [PatchSystem(patch, features, length, patch.size) for length in (LENGTH, 2 * LENGTH)]
+    one, other = (system.log_evidence(POSITION, angle) for system in systems)
+    assert other - one == pytest.approx(density(2 * LENGTH) - density(LENGTH), rel=1e-6)
+
+
+def test_features_of_single_precision_give_nearly_the_same(patch: Patch, features: Features) -> None:
+    noise = 0.3, 1.0
+    exact, single = (
+        PatchSystem(patch, each, LENGTH, patch.size).solve_with_bounds(*noise)
+        for each in (features, features.to(torch.float32))
+    )
+    assert single.dtype == torch.float64
+    assert 0 < float((single - exact).norm()) < 1e-4 * float(exact.norm())

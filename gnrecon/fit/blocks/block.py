@@ -128,7 +128,8 @@ class BlockSolver:
         length = cube_length(self.hyperparameters, self.disks[rows], self.radius)
         space = self._space(key, center, rows, nearby)
         cube = self.residuals, rows, length, space, self.features, self.hyperparameters, self.device
-        return length, solve_cube(*cube).cpu().numpy()
+        length, amplitudes = solve_cube(*cube)
+        return length, amplitudes.cpu().numpy()
 
     def _nearby_points(self, key: Int) -> Int:
         """Return the rows of the points in a cell and its neighbours, in order: all points of the cube."""

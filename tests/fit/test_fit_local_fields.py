@@ -1,0 +1,67 @@
+"""Local fields: each cube takes the length that its own data is most likely with."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from gnrecon.field.random_features import Features
+from gnrecon.fit.free_space import Volume
+from gnrecon.fit.local_fields import solve_cube
+from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import FieldResiduals
+
+Float = npt.NDArray[np.float64]
+NOISE = Hyperparameters(0.4, 0.01, 0.1, by_place=True)
+
+
+class NoSpace:
+    """A cube about the origin around which nothing is known of free space."""
+
+    center, reach = np.zeros(3), 1.0
+
+    def far(self) -> Volume:
+        return Volume.none()
+
+    def near(self, *_: float) -> Volume:
+        return Volume.none()
+
+
+def sheet(wavelength: float, rng: np.random.Generator, estimated: bool = False) -> FieldResiduals:
+    """The plane z = 0 as a global field, and points of waves on it of this length, with noise."""
+    count = 300
+    x, y = rng.uniform(-1, 1, (2, count))
+    wave = 2 * np.pi / wavelength
+    height, slope = 0.1 * wavelength * np.sin(wave * x), 0.1 * wavelength * wave * np.cos(wave * x)
+    points = np.stack([x, y, height + NOISE.position * rng.standard_normal(count)], axis=1)
+    normals = np.stack([-slope, np.zeros(count), np.ones(count)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    if estimated:
+        # As wrong as they can be: nothing of the length may come from them.
+        normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    flat = np.tile([0.0, 0.0, 1.0], (count, 1))
+    return FieldResiduals(points, normals, points[:, 2], flat, estimated)
+
+
+def length_of(residuals: FieldResiduals, hyperparameters: Hyperparameters) -> float:
+    features = Features.draw(400, np.random.default_rng(0), torch.zeros(0, dtype=torch.float64))
+    rows = np.arange(len(residuals))
+    solved = partial(solve_cube, residuals, rows, hyperparameters.length, NoSpace(), features)  # type: ignore[arg-type]
+    length, amplitudes = solved(hyperparameters, "cpu")
+    assert amplitudes.shape == (400,)
+    return length
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_short_waves_get_a_shorter_length_than_long_ones(rng: np.random.Generator, estimated: bool) -> None:
+    short, long = (length_of(sheet(wave, rng, estimated), NOISE) for wave in (0.6, 4.0))
+    assert short < NOISE.length < long
+
+
+def test_the_length_of_the_scan_is_kept_where_evidence_says_nothing(rng: np.random.Generator) -> None:
+    kept = Hyperparameters(NOISE.length, NOISE.position, NOISE.angle)
+    assert length_of(sheet(0.6, rng), kept) == NOISE.length
