@@ -14,14 +14,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.initialisation import wide_start
 from gnrecon.fit.linear_field import smooth_spectrum
-from gnrecon.fit.objective import ObjectiveTerm, Scene, distance_term
+from gnrecon.fit.objective import ObjectiveTerm, Scene
 from gnrecon.fit.parameters import LinearFieldParameters, OutlierParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -63,13 +62,8 @@ def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Gen
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene, field = Scene.of(seen, options.device, rng), Siren((units,))
 
-    def terms(x: torch.Tensor, distance: torch.Tensor, most: int, counts: torch.Tensor | None) -> list[ObjectiveTerm]:
-        return [
-            ObjectiveTerm("interface", interface, scene.points[:most], None, 1.0),
-            distance_term(scene, x, distance, counts),
-        ]
-
-    theta = wide_start(field, scene, terms, rng, smooth_spectrum(min(LinearFieldParameters.length_scales_radii), scene))
+    data = [ObjectiveTerm("interface", interface, scene.points)]
+    theta = wide_start(field, scene, data, rng, smooth_spectrum(min(LinearFieldParameters.length_scales_radii), scene))
     sdf = NeuralSDF(field, theta, samples.frame, scene.box)
     slopes: Float = np.einsum("ij,ij->i", sdf.gradient(samples.frame.to_world(samples.points)), samples.normals)
     return slopes

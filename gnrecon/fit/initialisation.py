@@ -6,7 +6,8 @@ frequencies w follow the spectral density of a Matern kernel, a Student t distri
 normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of
 kernel interpolation with Hermite data.
 Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
-Where the solution's sign disagrees with the coarse distance, samples are added and the solve is repeated.
+Where the solution's sign disagrees with the coarse distance, samples are added and the solve is repeated. As the
+features stay, so does J^T J of the data, and new samples only add to that of the volume.
 
 *Spectral.* Deeper networks begin with normal frequencies of fixed standard deviation in the first layer, hidden weights
 that keep the variance of sines (Sitzmann et al. 2020, theorem 1.8), uniform phases, and one exact solve of the last
@@ -16,7 +17,7 @@ layer, with a ridge that keeps its weights small: from large weights every direc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -25,17 +26,17 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, distance_weight
 from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
-from gnrecon.least_squares.direct import Cholesky
-from gnrecon.least_squares.system import identity
+from gnrecon.least_squares.direct import damped_factor, solve_factored
+from gnrecon.residuals.constraints import signed_distance
 from gnrecon.runtime.errors import FitError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
-TermsOf = Callable[[Tensor, Tensor, int, Tensor | None], Sequence[ObjectiveTerm]]
-"""Terms of volume samples x, their coarse distances, at most so many data points, and how often each sample counts."""
+TermsOf = Callable[[Tensor, Tensor, int], Sequence[ObjectiveTerm]]
+"""Terms of volume samples x, their coarse distances, and at most so many data points."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,14 @@ def random_features(
 def wide_start(
     field: Siren,
     scene: Scene,
-    terms_of: TermsOf,
+    data: Sequence[ObjectiveTerm],
     rng: np.random.Generator,
     spectrum: Spectrum = Spectrum(),
     advance: ProgressCallback = ignore_progress,
     *,
     parameters: InitialisationParameters = InitialisationParameters(),
 ) -> Tensor:
-    """Return parameters, of shape (p,), of the one-layer network that solves `terms_of` its volume samples.
+    """Return parameters, of shape (p,), of the one-layer network that solves terms of the data and coarse distances.
 
     `advance` is called with the share of the rounds that is done.
 
@@ -79,22 +80,30 @@ def wide_start(
     like = scene.points
     frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
     theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
+
+    def of_volume(x: Float, distance: Float, repeats: int) -> LastLayer:
+        """Return the equations of coarse distances that count so often each, at a weight of one."""
+        weight = float(repeats * len(x))
+        term = ObjectiveTerm("distance", signed_distance, scene.tensor(x), scene.tensor(distance), weight)
+        return LastLayer.of(field, [term], theta)
+
     x, distance = scene.volume(scene.volume_count, rng)
-    search, counts = WrongSignSearch(scene.coarse, x, np.sign(distance)), np.ones(len(x))
+    search, total = WrongSignSearch(scene.coarse, x, np.sign(distance)), len(x)
+    of_data, volume = LastLayer.of(field, data, theta), of_volume(x, distance, 1)
+    ridge = parameters.ridge / max(len(x), *map(len, data))
     for round_number in range(parameters.rounds):
-        last = round_number + 1 == parameters.rounds
-        most_points = parameters.final_points if last else parameters.search_points
-        terms = terms_of(scene.tensor(x), scene.tensor(distance), most_points, scene.tensor(counts))
-        theta = solve_last_layer(field, terms, theta)
+        weight = distance_weight(total, len(scene.points)) / total
+        solved = of_data.plus(volume, weight).solved(ridge, parameters=parameters)
         advance((round_number + 1) / parameters.rounds)
-        if not last:
+        if round_number + 1 < parameters.rounds:
             trial = scene.places(parameters.trial_factor * scene.volume_count, rng)
-            wrong, expected = search.wrong_signs(trial, partial(_value, field, theta, scene))
+            wrong, expected = search.wrong_signs(trial, partial(_value, field, solved, scene))
             some = rng.permutation(len(wrong))[: scene.volume_count // 2]
-            x, distance = np.concatenate([x, wrong[some]]), np.concatenate([distance, expected[some]])
-            # A row that counts several times costs as much as one.
-            counts = np.concatenate([counts, np.full(len(some), float(parameters.wrong_sign_repeats))])
-    return theta
+            if not len(some):
+                break
+            volume = volume.plus(of_volume(wrong[some], expected[some], parameters.wrong_sign_repeats))
+            total += parameters.wrong_sign_repeats * len(some)
+    return solved
 
 
 def _value(field: Siren, theta: Tensor, scene: Scene, x: Float) -> Float:
@@ -124,7 +133,7 @@ def spectral_start(
     theta = random_network(field, rng, scene.points, hidden_weight_share)
     count = parameters.spectral_samples
     x, distance = scene.volume(count, rng)
-    terms = terms_of(scene.tensor(x), scene.tensor(distance), count, None)
+    terms = terms_of(scene.tensor(x), scene.tensor(distance), count)
     total = sum(float(torch.as_tensor(term.weight).mean()) for term in terms)
     return solve_last_layer(field, terms, theta, parameters.spectral_ridge * total)
 
@@ -156,6 +165,59 @@ def random_network(
     return field.layout.flatten(layers)
 
 
+@dataclass(frozen=True)
+class LastLayer:
+    """The normal equations of the last layer, in which the network is linear.
+
+    Parameters
+    ----------
+    field : Siren
+    theta : all parameters, of shape (p,), where the equations were made
+    product, gradient : J^T J and J^T r of terms that are linear in f, by the last layer's parameters
+    """
+
+    field: Siren
+    theta: Tensor
+    product: Tensor
+    gradient: Tensor
+
+    @classmethod
+    def of(cls, field: Siren, terms: Sequence[ObjectiveTerm], theta: Tensor) -> LastLayer:
+        """Assemble the equations of some terms."""
+        problem = _last_layer_problem(field, terms, theta)
+        jacobian, residual = problem.linearise(problem.free())
+        return cls(field, theta, jacobian.gram(), jacobian.tmv(residual))
+
+    def plus(self, other: LastLayer, weight: float = 1.0) -> LastLayer:
+        """Return the equations of both, the other's with a weight."""
+        product, gradient = self.product.add(other.product, alpha=weight), self.gradient + weight * other.gradient
+        return replace(self, product=product, gradient=gradient)
+
+    def solved(self, ridge: float, *, parameters: InitialisationParameters = InitialisationParameters()) -> Tensor:
+        """Return theta, of shape (p,), with its last layer solved; the ridge damps the layer's change.
+
+        Raises
+        ------
+        FitError
+            When the system is not finite.
+        """
+        for _ in range(parameters.ridge_attempts):
+            factor = damped_factor(self.product, torch.full_like(self.gradient, ridge))
+            if factor is not None and bool(torch.isfinite(self.gradient).all()):
+                problem = _last_layer_problem(self.field, (), self.theta)
+                return problem.whole(problem.free() - solve_factored(factor, self.gradient))
+            # Features that nearly depend on each other: what rounding takes from the smallest eigenvalue, the ridge
+            # gives.
+            ridge *= 10
+        raise FitError("The linear start could not be solved: the system holds values that are not finite.")
+
+
+def _last_layer_problem(field: Siren, terms: Sequence[ObjectiveTerm], theta: Tensor) -> FieldProblem:
+    """Return the problem of which the last layer's parameters alone are free."""
+    none = torch.zeros(0, dtype=torch.long, device=theta.device)
+    return FieldProblem(field, terms, theta, (*(none for _ in field.widths), None))
+
+
 def solve_last_layer(
     field: Siren,
     terms: Sequence[ObjectiveTerm],
@@ -173,19 +235,8 @@ def solve_last_layer(
     FitError
         When the system is not finite.
     """
-    none = torch.zeros(0, dtype=torch.long, device=theta.device)
-    units = (*(none for _ in field.widths), None)
-    problem = FieldProblem(field, terms, theta, units)
-    free = problem.free()
-    system = Cholesky().linearise(*problem.linearise(free), identity)
     ridge = parameters.ridge / max(len(term) for term in terms) if ridge is None else ridge
-    for _ in range(parameters.ridge_attempts):
-        step = system.solve(ridge)
-        if step.failure is None:
-            return problem.whole(free + step.direction)
-        # Features that nearly depend on each other: what rounding takes from the smallest eigenvalue, the ridge gives.
-        ridge *= 10
-    raise FitError("The linear start could not be solved: the system holds values that are not finite.")
+    return LastLayer.of(field, terms, theta).solved(ridge, parameters=parameters)
 
 
 # Places in free space where a field has the wrong sign. They cause detached sheets and spikes in the mesh.

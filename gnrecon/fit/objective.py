@@ -236,12 +236,16 @@ def start_terms(
     x: Tensor,
     distance: Tensor,
     most: int,
-    counts: Tensor | None = None,
 ) -> list[ObjectiveTerm]:
-    """Return the terms of a linear start: at most `most` data points, and those of `distance_term`."""
-    # The start is a linear solve, and other residuals than these two are not linear in f, or not known to be.
+    """Return the terms of a linear start: those of `linear_data_terms`, and of `distance_term`."""
+    return [*linear_data_terms(scene, options, rng, most), distance_term(scene, x, distance)]
+
+
+def linear_data_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, most: int) -> list[ObjectiveTerm]:
+    """Return the terms of at most `most` data points, of which other residuals of normals become linear ones."""
+    # Other residuals than these two are not linear in f, or not known to be.
     linear = options if options.normals in ("vector", "projection") else replace(options, normals="vector")
-    return [*data_terms(scene, linear, rng, most), distance_term(scene, x, distance, counts)]
+    return data_terms(scene, linear, rng, most)
 
 
 def step_terms(
@@ -299,25 +303,14 @@ def normal_weight(
     return max(reach * spacing, least_reach_radii) ** 2
 
 
-def distance_term(
-    scene: Scene,
-    x: Tensor,
-    distance: Tensor,
-    counts: Tensor | None = None,
-    *,
-    parameters: ObjectiveParameters = ObjectiveParameters(),
-) -> ObjectiveTerm:
-    """Return the term of coarse distances at volume samples; it weighs more where data is sparse.
+def distance_term(scene: Scene, x: Tensor, distance: Tensor) -> ObjectiveTerm:
+    """Return the term of coarse distances, of shape (Q,), at volume samples, of shape (Q, 3)."""
+    return ObjectiveTerm("distance", signed_distance, x, distance, distance_weight(len(x), len(scene.points)))
 
-    Parameters
-    ----------
-    x, distance : of shape (Q, 3) and (Q,)
-    counts : how often each sample counts, of shape (Q,); by default once
-    """
-    total = len(x) if counts is None else float(counts.sum())
-    weight = max(parameters.distance_weight_per_sample * total / len(scene.points), parameters.least_distance_weight)
-    by_sample = weight if counts is None else weight * len(x) / total * counts
-    return ObjectiveTerm("distance", signed_distance, x, distance, by_sample)
+
+def distance_weight(samples: int, points: int, *, parameters: ObjectiveParameters = ObjectiveParameters()) -> float:
+    """Return the weight of so many volume samples for so many data points: more where data is sparse."""
+    return max(parameters.distance_weight_per_sample * samples / points, parameters.least_distance_weight)
 
 
 # What a fit is made in: the samples as tensors, their coarse distance, and the box around them.

@@ -164,8 +164,6 @@ class InitialisationParameters:
     hidden_weight_share: float = 0.5
     spectral_ridge: float = 1e-4  # of their last layer, per unit of the terms' weight
     spectral_samples: int = 4000  # points and volume samples of that solve
-    search_points: int = 5000  # most data points of all rounds but the last
-    final_points: int = 20_000  # most data points of the last round
 
 
 @dataclass(frozen=True)
@@ -273,6 +271,7 @@ class SingleNetworkParameters:
     points_per_unit: int = 4  # more units than data rows only make it slower and less smooth
     most_sparse_units: int = 2000
     most_units: int = 3000
+    start_points: int = 20_000  # most data points of the linear start of one wide layer
     wide_start_time_share: float = 0.4  # of the fit, measured, for the progress bar
     deep_start_time_share: float = 0.05
     pool_samples: int = 30_000  # volume samples of a deep fit: signing them takes as long as a step

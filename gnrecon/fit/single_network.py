@@ -23,7 +23,7 @@ from torch import Tensor
 from gnrecon.field.networks import Siren
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.initialisation import Spectrum, spectral_start, wide_start
-from gnrecon.fit.objective import FieldProblem, Scene, data_terms, start_terms, step_terms
+from gnrecon.fit.objective import FieldProblem, Scene, data_terms, linear_data_terms, start_terms, step_terms
 from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import (
@@ -173,7 +173,8 @@ def fit_wide(
     parameters: SingleNetworkParameters = SingleNetworkParameters(),
 ) -> Solution:
     """Fit a network of one hidden layer; `advance` is called with the share of the start that is done."""
-    theta = wide_start(field, scene, partial(start_terms, scene, options, rng), rng, spectrum, advance)
+    data = linear_data_terms(scene, options, rng, parameters.start_points)
+    theta = wide_start(field, scene, data, rng, spectrum, advance)
     whole = options.optimiser != "gn"
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:

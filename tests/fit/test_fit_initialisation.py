@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from gnrecon.field import Siren
 from gnrecon.field.field_parameters import FieldParameters
-from gnrecon.fit.initialisation import Spectrum, random_features, solve_last_layer
+from gnrecon.fit.initialisation import LastLayer, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
@@ -65,6 +67,20 @@ def test_solve_finds_a_field_that_the_features_can_express(widths: tuple[int, ..
     blank = theta.clone()
     blank[field.layout.offsets[-1] :] = 0.0
     torch.testing.assert_close(solve_last_layer(field, terms, blank), theta, rtol=0, atol=1e-4)
+
+
+def test_equations_add_and_what_counts_several_times_is_as_many_rows() -> None:
+    field, terms, theta = draw((20,))
+    last = terms[-1]
+    assert last.target is not None
+    twice = replace(last, points=last.points.repeat(2, 1), target=last.target.repeat(2))
+    whole = LastLayer.of(field, [*terms[:2], twice], theta)
+    # A term is a mean: its weight times the number of its points is that of each one.
+    once = LastLayer.of(field, [replace(last, weight=2.0 * len(last))], theta)
+    sum_ = LastLayer.of(field, terms[:2], theta).plus(once, 0.1 / (2 * len(last)))
+    torch.testing.assert_close(sum_.product.tril(), whole.product.tril())
+    torch.testing.assert_close(sum_.gradient, whole.gradient)
+    torch.testing.assert_close(sum_.solved(1e-9), solve_last_layer(field, [*terms[:2], twice], theta, 1e-9))
 
 
 def test_values_that_are_not_finite_end_with_a_sentence() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import example, given, settings
@@ -13,8 +12,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
-from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, distance_term, groups
-from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, groups
 from gnrecon.residuals import (
     eikonal,
     interface,
@@ -181,21 +179,3 @@ def test_terms_are_grouped_by_their_tensor_of_points() -> None:
     _, terms, _, _ = draw(0, (4,))
     names = [[term.name for term in group] for group in groups(terms)]
     assert names == [["interface", "normal", "cosine"], ["distance"], ["eikonal", "projection"]]
-
-
-@pytest.mark.parametrize("points", [20, 20_000], ids=["few points", "many points"])
-def test_a_sample_that_counts_several_times_is_as_many_rows(points: int) -> None:
-    """Also where many points leave the distances their least weight."""
-    x = np.random.default_rng(1).standard_normal((points, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    scene = Scene.of(Samples(x, x, Frame(np.zeros(3), 1.0)), "cpu", np.random.default_rng(0))
-    field, _, theta, generator = draw(3, (4,))
-    volume = torch.randn(30, 3, generator=generator, dtype=torch.float64)
-    distance, counts = volume.norm(dim=1) - 1, torch.tensor([1.0] * 20 + [5.0] * 10)
-    times = counts.long()
-    repeated = distance_term(scene, volume.repeat_interleave(times, 0), distance.repeat_interleave(times))
-    losses = [
-        weighted(field, [term], theta).square().sum()
-        for term in (repeated, distance_term(scene, volume, distance, counts))
-    ]
-    torch.testing.assert_close(losses[0], losses[1])

@@ -28,7 +28,7 @@ from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
-from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters
+from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters, SingleNetworkParameters
 from gnrecon.fit.penalties.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.signed_distance import Density, free_space_bounds
@@ -213,7 +213,7 @@ def penalise_global(
     x, wanted = _volume(penalties, scene, scene.volume_count, rng)
     for left in reversed(range(parameters.rounds)):
         volume = scene.tensor(x), scene.tensor(wanted)
-        data = [*data_terms(scene, options, rng, InitialisationParameters.final_points), distance_term(scene, *volume)]
+        data = [*data_terms(scene, options, rng, SingleNetworkParameters.start_points), distance_term(scene, *volume)]
         sines, amplitudes = as_sines(sdf)
         problem, factor, right = _linear_part(sdf, data, amplitudes)
         sdf = replace(
