@@ -131,9 +131,7 @@ def solve_cube(
         return length, solved
     features = _precise_enough(features, patch, length, hyperparameters, parameters)
     if hyperparameters.by_place:
-        # Errors of estimated normals are alike among neighbours: as many facts as points they are not.
-        noise = position, None if residuals.estimated else angle
-        length, system = _likeliest_system(patch, features, length, noise, parameters)
+        length, system = _likeliest_system(patch, features, length, (position, angle), parameters)
     else:
         system = PatchSystem(patch, features, length, patch.size)
     return length, system.solve_with_bounds(position, angle, partial(space.near, length, position))
@@ -151,7 +149,7 @@ def _precise_enough(
 
 
 def _likeliest_system(
-    patch: Patch, features: Features, length: float, noise: tuple[float, float | None], parameters: LocalFieldParameters
+    patch: Patch, features: Features, length: float, noise: tuple[float, float], parameters: LocalFieldParameters
 ) -> tuple[float, PatchSystem]:
     """Return the length near a given one of which the cube's own data is most likely, and its system."""
     best = PatchSystem(patch, features, length, patch.size)

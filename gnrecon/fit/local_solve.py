@@ -191,19 +191,18 @@ class PatchSystem:
             amplitudes = self.solve(position, angle)
         return amplitudes
 
-    def log_evidence(self, position: float, angle: float | None) -> float:
+    def log_evidence(self, position: float, angle: float) -> float:
         """Return the log marginal likelihood of the data, but for a term that no length changes.
 
         It is (|A^-1/2 b|^2 - log det A) / 2 with A = 1 + s^2 J^T D^-1 J and b = s J^T D^-1 y; of an indefinite system
         it is -infinity. Here the prior deviation is the RMS of the values: a wide prior, which leaves amplitudes free,
-        would favour long features. Samples of free space are no data, nor are normals without an angle.
+        would favour long features. Samples of free space are no data.
         Source: Rasmussen and Williams (2006), equation 2.30 in the space of the weights.
         """
         scale = self._scale / LocalSolveParameters.correction_rms_factor
-        product, right = self._positions[0] * (scale / position) ** 2, self._positions[1] * scale / position**2
-        if angle is not None:
-            product.add_(self._angles[0], alpha=(scale / angle) ** 2)
-            right = right + self._angles[1] * scale / angle**2
+        product = self._positions[0] * (scale / position) ** 2
+        product.add_(self._angles[0], alpha=(scale / angle) ** 2)
+        right = scale * (self._positions[1] / position**2 + self._angles[1] / angle**2)
         factor = damped_factor(product, torch.ones_like(right), overwrite=True)
         if factor is None:
             return -math.inf

@@ -273,9 +273,8 @@ class CrossValidation:
     def _belief(self, number: int, noise: int) -> Hyperparameters:
         """Return the hyperparameters with the numbers of a length and of one of its noises."""
         length = self._length(number)
-        # Averaged points have neither; their errors are alike among neighbours, as those of dense scans are.
-        independent = self.likelihood is not None or self.residuals.estimated
-        by_place = independent and len(self.residuals) <= self.parameters.sparse_points
+        # Errors of dense scans are alike among neighbours, as those of averaged points and of estimated normals are.
+        by_place = self.likelihood is not None and len(self.residuals) <= self.parameters.sparse_points
         return Hyperparameters(length, *self.noises(length)[noise], by_place)
 
     def _length(self, number: int) -> float:
