@@ -78,28 +78,11 @@ CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
 """Writers of points without faces."""
 
 
-def _is_color(name: str, values: Values) -> bool:
-    del values
-    return name == "colors"
-
-
-def _is_numeric(name: str, values: Values) -> bool:
-    del name
-    return values.dtype.kind in "biuf"
-
-
-def _never(name: str, values: Values) -> bool:
-    del name, values
-    return False
-
-
 ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
-    ".obj": _is_color,
-    ".ply": _is_numeric,
-    ".stl": _never,
-    ".off": _is_color,
+    **dict.fromkeys((".obj", ".off", ".3mf"), lambda name, _: name == "colors"),
+    ".ply": lambda _, values: values.dtype.kind in "biuf",
+    ".stl": lambda _, __: False,
     ".glb": glb_supports,
-    ".3mf": _is_color,
 }
 """Whether a format can store a vertex attribute, by its name and values."""
 
