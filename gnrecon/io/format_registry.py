@@ -21,7 +21,7 @@ from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats.e57 import read_e57
-from gnrecon.io.formats.gltf import glb_supports, read_glb, read_gltf, write_glb
+from gnrecon.io.formats.gltf import glb_supports, read_gltf, write_glb
 from gnrecon.io.formats.las import read_las
 from gnrecon.io.formats.npy import read_npy
 from gnrecon.io.formats.obj import read_obj, write_obj
@@ -48,7 +48,7 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".obj": read_obj,
     ".off": read_off,
     ".stl": read_stl,
-    ".glb": read_glb,
+    ".glb": read_gltf,
     ".gltf": read_gltf,
     ".3mf": read_3mf,
     ".las": read_las,

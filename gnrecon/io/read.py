@@ -43,7 +43,8 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     """
     contents = read_contents(Path(path), format)
     with input_errors_for(Path(path)):
-        return without_faces(contents).shape()
+        found = without_faces(contents)
+    return PointCloud(found.points, found.normals, found.attributes, found.origins)
 
 
 def read_mesh(path: str | Path) -> Mesh:
