@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.mesh import Mesh
@@ -131,11 +130,9 @@ def reader_of(extension: str) -> Callable[[Path], Contents] | None:
     UsageError
         When several packages offer it, or the one that does cannot be loaded.
     """
-    if extension in READERS:
-        return READERS[extension]
-    plugin = find("reader", extension.removeprefix("."))
+    plugin = None if extension in READERS else find("reader", extension.removeprefix("."))
     if plugin is None:
-        return None
+        return READERS.get(extension)
     read = plugin.load()
     return lambda path: _read_with_plugin(plugin, read, path)
 
@@ -148,11 +145,9 @@ def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
     UsageError
         When several packages offer it, or the one that does cannot be loaded.
     """
-    if extension in WRITERS:
-        return WRITERS[extension]
-    plugin = find("writer", extension.removeprefix("."))
+    plugin = None if extension in WRITERS else find("writer", extension.removeprefix("."))
     if plugin is None:
-        return None
+        return WRITERS.get(extension)
     write = plugin.load()
     return lambda mesh, path: _write_with_plugin(plugin, write, mesh, path)
 
@@ -195,13 +190,11 @@ def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh:
 
 def _read_only(mesh: Mesh) -> Mesh:
     """The same mesh in read-only arrays, because the caller still uses the mesh after it was written."""
-    normals = None if mesh.normals is None else _locked_view(mesh.normals)
-    attributes = {name: _locked_view(values) for name, values in mesh.attributes.items()}
-    vertices, faces = _locked_view(mesh.vertices), _locked_view(mesh.faces)
-    return replace(mesh, vertices=vertices, faces=faces, normals=normals, attributes=attributes)
-
-
-def _locked_view(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    view = values.view()
-    view.flags.writeable = False
-    return view
+    attributes = {name: values.view() for name, values in mesh.attributes.items()}
+    normals = None if mesh.normals is None else mesh.normals.view()
+    locked = replace(
+        mesh, vertices=mesh.vertices.view(), faces=mesh.faces.view(), normals=normals, attributes=attributes
+    )
+    for values in (locked.vertices, locked.faces, *attributes.values(), *([] if normals is None else [normals])):
+        values.flags.writeable = False
+    return locked

@@ -15,11 +15,12 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.io.contents import without_faces
+from gnrecon.io.formats.las import drop_unused_attributes
 from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.parse import read_text, sibling_path
 from gnrecon.io.read import check_file, extension_of, input_errors_for, reader_extension
-from gnrecon.io.streaming import VoxelThinning, drop_unused, read_chunks
+from gnrecon.io.streaming import VoxelThinning, read_chunks
 from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, UsageError
 
@@ -109,7 +110,10 @@ def read_scans(
         _read_into(thinning, sums, Path(path), format, columns, parameters)
         for path, sums in zip(paths, moments, strict=True)
     ]
-    found = drop_unused(thinning.result(), extensions)
+    found = thinning.result()
+    if {".las", ".laz"} & set(extensions):
+        # A chunk cannot say which attributes were never filled in; only all of its points can.
+        found = drop_unused_attributes(found)
     cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
     require_points_in_region(cloud, thinning.seen)
     files = tuple(str(path) for path in paths)

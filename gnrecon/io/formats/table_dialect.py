@@ -147,11 +147,13 @@ def find_dialect(lines: list[str]) -> Dialect:
 
 def _best(texts: list[str]) -> tuple[Dialect, list[tuple[int, list[str]]]]:
     """Return the dialect in which most lines are rows, with those rows and their places."""
-    common = (("D", "E"), ("d", "e")) if any(re.search(r"\d[Dd][+-]?\d", text) for text in texts) else ()
-    common += (
-        tuple((mark, "") for mark in "()[]") if any(re.match(r"\s*[\[(]+\s*[-+.\d]", text) for text in texts) else ()
+    habits = (
+        (r"\d[Dd][+-]?\d", (("D", "E"), ("d", "e"))),  # Fortran's exponents
+        (r"^\s*[\[(]+\s*[-+.\d]", (("(", ""), (")", ""), ("[", ""), ("]", ""))),
+        (r"'[-+.\d][^'\s]*'", (("'", ""),)),
     )
-    common += (("'", ""),) if any(re.search(r"'[-+.\d][^'\s]*'", text) for text in texts) else ()
+    shown = [pairs for pattern, pairs in habits if any(re.search(pattern, text) for text in texts)]
+    common = tuple(pair for pairs in shown for pair in pairs)
     blanks = ((",", " "), (";", " "))
     candidates = [Dialect(separator, decimal) for separator in "\t;|" for decimal in ".,"]
     candidates += [Dialect("\t", ",", replaced=((", ", "\t"),)), Dialect(","), Dialect(",", ",")]
