@@ -16,7 +16,7 @@ from gnrecon.ingest.ingest_parameters import IngestParameters
 from gnrecon.ingest.line_scans import lie_on_lines, normals_across_lines, rows_along_lines, thinned_along_lines
 from gnrecon.ingest.noise import estimate_noise
 from gnrecon.ingest.normals import unoriented_normals
-from gnrecon.ingest.orientation import are_inconsistent, require_orientation, with_outward_normals
+from gnrecon.ingest.orientation import Orientation, are_inconsistent, require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
 from gnrecon.ingest.smooth import smooth_points
 from gnrecon.ingest.subsample import subsample as thin
@@ -80,11 +80,13 @@ def prepare(
         outer, normals = outer_surface(centred)
         cleaned = cleaned.select(outer).with_normals(normals)
         counts = replace(counts, inner=int((~outer).sum()))
-    axes = None
+    axes, clear = None, None
     if arrangement == "lines":
-        cleaned, axes, half = _along_lines(cleaned, orient, parameters)
-        counts = replace(counts, along_lines=len(centred) - len(cleaned), half_line_distance=half)
-    oriented, orientation = with_outward_normals(cleaned, orient, axes, parameters=parameters)
+        clear = _clear_of_few(cleaned, orient, parameters)
+        if clear is None:
+            cleaned, axes, half = _along_lines(cleaned, orient, parameters)
+            counts = replace(counts, along_lines=len(centred) - len(cleaned), half_line_distance=half)
+    oriented, orientation = clear or with_outward_normals(cleaned, orient, axes, parameters=parameters)
     if counts.inner:
         orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
@@ -101,6 +103,20 @@ def prepare(
     message = "Kept %d of %d points, %d for validation; normals: %s."
     _log.info(message, len(kept), len(cloud), len(held_out), orientation.how)
     return _in_unit_ball(kept, held_out, orientation.estimated), counts
+
+
+def _clear_of_few(
+    cloud: PointCloud, orient: str, parameters: IngestParameters
+) -> tuple[PointCloud, Orientation] | None:
+    """Return few points with normals by their winding number where that is clearly of a closed surface; else None.
+
+    All points then serve the fit, and no neighbours, which lie on one line, the normals.
+    """
+    if len(cloud) > parameters.orientation.gauss_points or (cloud.normals is not None and orient != "estimate"):
+        return None
+    found = with_outward_normals(cloud, orient, parameters=parameters)
+    closed = found[1].how == "estimated"  # and neither upward nor uncertain
+    return found if closed and (found[1].confidence or 0.0) >= parameters.lines.least_confidence else None
 
 
 def _along_lines(

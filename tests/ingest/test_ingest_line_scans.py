@@ -66,7 +66,16 @@ def test_good_given_normals_keep_more_points() -> None:
     assert given.along_lines < 0.4 * len(points) < 0.6 * len(points) < estimated.along_lines
 
 
-def test_normals_of_few_points_come_from_the_lines_too() -> None:
+def test_sparse_clouds_whose_winding_number_is_clear_are_not_thinned() -> None:
+    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(-0.9, 0.9, 7))
+    radius = np.sqrt(1 - height**2)
+    points = np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel(), height.ravel()])
+    samples, counts = prepare(PointCloud(points))
+    assert (counts.arrangement, counts.half_line_distance, len(samples)) == ("lines", None, len(points))
+    assert (np.einsum("ij,ij->i", samples.normals, points) > 0.9).all()
+
+
+def test_sheets_of_few_points_get_normals_from_the_lines() -> None:
     """Those of all points by their winding number are off by more than 30 degrees at most points of this terrain."""
     y, x = (axis.ravel() for axis in np.meshgrid(np.arange(-1, 1, 0.25), np.arange(-1, 1, 0.25 / 8), indexing="ij"))
     points = np.column_stack([x, y, 0.2 * np.sin(3 * x) + 0.2 * np.cos(4 * y)])
