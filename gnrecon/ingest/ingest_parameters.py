@@ -85,6 +85,8 @@ class LineParameters:
     own_line_weight: float = 2.0  # on the distances of points of the same line
     least_opposite_cosine: float = 0.3  # of the turn between both sides, at least 107 degrees
     most_second_ratio: float = 3.0  # of the distances of the points on both sides; beyond, only the nearer one counts
+    least_confidence: float = 0.9  # of the winding number of few points that decides alone: 0.86 and more on tori and
+    # spheres, 0.3 to 0.94 on boxes, whose edges it rounds, and below 0.6, or that of an open surface, on terrain
     chunk_points: int = 50_000  # handled at a time, which bounds memory
 
 

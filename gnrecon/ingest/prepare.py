@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.geometry.units import parse_reach
 from gnrecon.ingest.clean import clean
@@ -79,14 +80,13 @@ def prepare(
         outer, normals = outer_surface(centred)
         cleaned = cleaned.select(outer).with_normals(normals)
         counts = replace(counts, inner=int((~outer).sum()))
-    along = _along_lines(cleaned, orient, parameters) if arrangement == "lines" else None
-    # Lines so far apart that hardly a point would be left are none of a scan's.
-    if along is not None and len(along[0]) >= parameters.least_points:
-        cleaned, orientation, half = along
-        counts = replace(counts, along_lines=len(centred) - len(cleaned), half_line_distance=half)
-        oriented = cleaned.with_normals(orientation.normals)
-    else:
-        oriented, orientation = with_outward_normals(cleaned, orient, parameters=parameters)
+    axes, clear = None, None
+    if arrangement == "lines":
+        clear = _clear_of_few(cleaned, orient, parameters)
+        if clear is None:
+            cleaned, axes, half = _along_lines(cleaned, orient, parameters)
+            counts = replace(counts, along_lines=len(centred) - len(cleaned), half_line_distance=half)
+    oriented, orientation = clear or with_outward_normals(cleaned, orient, axes, parameters=parameters)
     if counts.inner:
         orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
@@ -105,28 +105,38 @@ def prepare(
     return _in_unit_ball(kept, held_out, orientation.estimated), counts
 
 
+def _clear_of_few(
+    cloud: PointCloud, orient: str, parameters: IngestParameters
+) -> tuple[PointCloud, Orientation] | None:
+    """Return few points with normals by their winding number where that is clearly of a closed surface; else None.
+
+    All points then serve the fit, and no neighbours, which lie on one line, the normals.
+    """
+    if len(cloud) > parameters.orientation.gauss_points or (cloud.normals is not None and orient != "estimate"):
+        return None
+    found = with_outward_normals(cloud, orient, parameters=parameters)
+    closed = found[1].how == "estimated"  # and neither upward nor uncertain
+    return found if closed and (found[1].confidence or 0.0) >= parameters.lines.least_confidence else None
+
+
 def _along_lines(
     cloud: PointCloud, orient: str, parameters: IngestParameters
-) -> tuple[PointCloud, Orientation, float | None]:
-    """Return a cloud of points along lines, thinned, its normals, and about half of the distance of the lines.
+) -> tuple[PointCloud, Float | None, float | None]:
+    """Return a cloud of points along lines, thinned, its normals of either sign, and about half of the lines' distance.
 
-    In sparse clouds, normals by the winding number of all points need no neighbours, and may be better (None then).
+    Where normals are given, there are none of these.
     """
     points, limits = cloud.points - cloud.points.mean(axis=0), parameters.lines
     rows, side = thinned_along_lines(points, parameters=limits)
-    given = cloud.normals is not None and orient != "estimate"
-    if given and cloud.normals is not None and not (orient == "auto" and are_inconsistent(points, cloud.normals)):
-        fewer = cloud.select(rows_along_lines(points, limits.given_side_share * side))
-        return fewer, with_outward_normals(fewer, orient, parameters=parameters)[1], side
-    axes, found = normals_across_lines(points, rows, side, parameters=limits)
-    axes[~found] = unoriented_normals(points[rows], parameters=parameters.normals)[~found]
-    fewer = cloud.select(rows)
-    orientation = with_outward_normals(fewer, orient, axes, parameters=parameters)[1]
-    if len(cloud) <= parameters.orientation.gauss_points:
-        plain = with_outward_normals(cloud, orient, parameters=parameters)[1]
-        if (plain.confidence or 0.0) >= (orientation.confidence or 0.0):
-            return cloud, plain, None
-    return fewer, orientation, side
+    if cloud.normals is not None and (
+        orient in ("given", "signs") or (orient == "auto" and not are_inconsistent(points, cloud.normals))
+    ):
+        rows, axes = rows_along_lines(points, limits.given_side_share * side), None
+    else:
+        axes, found = normals_across_lines(points, rows, side, parameters=limits)
+        axes[~found] = unoriented_normals(points[rows], parameters=parameters.normals)[~found]
+    # Lines so far apart that hardly a point would be left are none of a scan's.
+    return (cloud, None, None) if len(rows) < parameters.least_points else (cloud.select(rows), axes, side)
 
 
 def _hold_out(cloud: PointCloud, share: float | None, seed: int) -> tuple[PointCloud, PointCloud]:

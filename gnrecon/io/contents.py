@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
+from gnrecon.geometry.colors import as_bytes
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.column_names import COLOR, NORMAL, columns_of_role, require_position
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.plugins import describe_error, guarded
@@ -47,24 +50,63 @@ class Contents:
     origins: Float | None = None
     remarks: tuple[str, ...] = ()
 
+    def shape(self) -> Mesh | PointCloud:
+        """Return a mesh, with colours in 8 bits, where there are faces; else a cloud.
 
-def from_columns(columns: Columns, faces: Int | None = None) -> Contents:
-    """Sort named columns, each of shape (N,), into positions, normals, ``colors`` and other attributes.
+        Raises
+        ------
+        InputError
+            When the arrays do not fit each other.
+        """
+        attributes = dict(self.attributes)
+        if not len(self.faces):
+            return PointCloud(self.points, self.normals, attributes, self.origins)
+        if "colors" in attributes:
+            attributes["colors"] = as_bytes(attributes["colors"])
+        return Mesh(self.points, self.faces, self.normals, attributes)
+
+
+def from_columns(columns: Columns, faces: Int | None = None, points: Values | None = None) -> Contents:
+    """Sort named columns, of shape (N,) or (N, C), into positions, normals, ``colors`` and other attributes.
+
+    Columns of shape (N, 3) named ``normals`` are normals, and those of three or four named ``colors``, ``rgb`` or the
+    like are colours.
+
+    Parameters
+    ----------
+    columns : by name; see `gnrecon.io.column_names` for the names that positions, normals and colours may have
+    faces : integer array of shape (F, 3); by default none
+    points : array of shape (N, 3); by default the columns x, y and z
 
     Raises
     ------
     InputError
-        When x, y or z is missing; see `gnrecon.io.column_names` for the names that they may have.
+        When x, y or z is missing, or columns differ in their number of rows.
     """
     rest = dict(columns)
-    position = [rest.pop(name) for name in require_position(rest)]
-    normal = [rest.pop(name) for name in columns_of_role(rest, NORMAL) or []]
-    names = columns_of_role(rest, (*COLOR, "alpha")) or columns_of_role(rest, COLOR) or []
-    if names:
-        rest["colors"] = np.column_stack([rest.pop(name) for name in names])
-    normals, unread = decoded_normals(np.column_stack(normal)) if normal else (None, ())
-    points = np.column_stack([values.astype(np.float64) for values in position])
-    return Contents(points, normals, no_faces() if faces is None else faces, rest, unread)
+    if points is None:
+        points = np.column_stack([rest.pop(name).astype(np.float64) for name in require_position(rest)])
+    for name, values in rest.items():
+        if len(values) != len(points):
+            raise InputError(f"{name!r} has {len(values)} values, but there are {len(points)} points.")
+    normal = _taken(rest, ("normals", "normal"), NORMAL, (3,))
+    names = (*COLOR, "alpha") if columns_of_role(rest, (*COLOR, "alpha")) else COLOR
+    color = _taken(rest, ("colors", "colours", "rgb", "rgba"), names, (3, 4))
+    normals, unread = (None, ()) if normal is None else decoded_normals(normal)
+    rest |= {} if color is None else {"colors": color}
+    return Contents(points.astype(np.float64), normals, no_faces() if faces is None else faces, rest, unread)
+
+
+def _taken(
+    rest: dict[str, Values], titles: tuple[str, ...], role: tuple[str, ...], widths: Sequence[int]
+) -> Values | None:
+    """Remove the array of one of these titles, or the single columns of a role, from the rest, and return it."""
+    for name, values in rest.items():
+        if name.lower() in titles and values.ndim == 2 and values.shape[1] in widths:
+            return rest.pop(name)
+    single = {name: values for name, values in rest.items() if values.ndim == 1}
+    names = columns_of_role(single, role)
+    return np.column_stack([rest.pop(name) for name in names]) if names else None
 
 
 def decoded_normals(
@@ -114,41 +156,39 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
         return pieces[0]
     starts = np.cumsum([0, *(len(piece.points) for piece in pieces[:-1])])
     normals = [piece.normals for piece in pieces if piece.normals is not None]
-    names = dict.fromkeys(name for piece in pieces for name in piece.attributes)
-    shared = {name: values for name in names if (values := _shared(name, pieces)) is not None}
+    found: dict[str, list[Values]] = {}
+    for name, values in (item for piece in pieces for item in piece.attributes.items()):
+        found.setdefault(name, []).append(values)
     # Dropped rather than filled up, because later stages cannot tell made-up values from measured ones.
-    lost = [f"{name} of some of the scans" for name in names if name not in shared]
-    if 0 < len(normals) < len(pieces):
-        lost.append("normals of some of the scans")
+    kinds = {name: {one.shape[1:] for one in values} for name, values in found.items()}
+    lost = [name for name, values in found.items() if len(values) < len(pieces) or len(kinds[name]) > 1]
+    lost += ["normals"] if 0 < len(normals) < len(pieces) else []
+    rest = [f"{name} of some of the scans" for name in lost]
+    unknown = [np.full((len(piece.points), 3), np.nan) if piece.origins is None else piece.origins for piece in pieces]
     return Contents(
         np.concatenate([piece.points for piece in pieces]),
         np.concatenate(normals) if len(normals) == len(pieces) else None,
         np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]),
-        {name: np.concatenate(values) for name, values in shared.items()},
-        tuple(dict.fromkeys([*(words for piece in pieces for words in piece.unread), *lost])),
-        _origins(pieces),
+        {name: np.concatenate(values) for name, values in found.items() if name not in lost},
+        tuple(dict.fromkeys([*(words for piece in pieces for words in piece.unread), *rest])),
+        None if all(piece.origins is None for piece in pieces) else np.concatenate(unknown),
         tuple(dict.fromkeys(sentence for piece in pieces for sentence in piece.remarks)),
     )
 
 
-def _shared(name: str, pieces: Sequence[Contents]) -> list[Values] | None:
-    """The values of an attribute in each piece, or None where they are missing or differ in shape."""
-    values = [piece.attributes[name] for piece in pieces if name in piece.attributes]
-    same = len(values) == len(pieces) and len({one.shape[1:] for one in values}) == 1
-    return values if same else None
+def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:
+    """Return contents without faces; where they have no normals, and at least a share of the points is a corner of a
+    face, with the area-weighted normals of the faces.
 
-
-def _origins(pieces: Sequence[Contents]) -> Float | None:
-    if all(piece.origins is None for piece in pieces):
-        return None
-    return np.concatenate(
-        [np.full((len(piece.points), 3), np.nan) if piece.origins is None else piece.origins for piece in pieces]
-    )
-
-
-def faces_cover(contents: Contents, *, least_share: float = 0.5) -> bool:
-    """Whether there are faces, and at least a share of the points is a corner of one and gets a normal from it."""
-    return len(contents.faces) > 0 and len(np.unique(contents.faces)) >= least_share * len(contents.points)
+    Raises
+    ------
+    InputError
+        When a face names a point that does not exist.
+    """
+    normals, faces = contents.normals, contents.faces
+    if normals is None and len(faces) and len(np.unique(faces)) >= least_share * len(contents.points):
+        normals = Mesh(contents.points, faces).vertex_normals()
+    return replace(contents, normals=normals, faces=no_faces())
 
 
 def fan_triangles(counts: Int, corners: Int) -> Int:

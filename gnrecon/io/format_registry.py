@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents
 from gnrecon.io.formats.e57 import read_e57
-from gnrecon.io.formats.gltf import glb_supports, read_glb, read_gltf, write_glb
+from gnrecon.io.formats.gltf import glb_supports, read_gltf, write_glb
 from gnrecon.io.formats.las import read_las
 from gnrecon.io.formats.npy import read_npy
 from gnrecon.io.formats.obj import read_obj, write_obj
@@ -48,7 +47,7 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".obj": read_obj,
     ".off": read_off,
     ".stl": read_stl,
-    ".glb": read_glb,
+    ".glb": read_gltf,
     ".gltf": read_gltf,
     ".3mf": read_3mf,
     ".las": read_las,
@@ -78,28 +77,11 @@ CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
 """Writers of points without faces."""
 
 
-def _is_color(name: str, values: Values) -> bool:
-    del values
-    return name == "colors"
-
-
-def _is_numeric(name: str, values: Values) -> bool:
-    del name
-    return values.dtype.kind in "biuf"
-
-
-def _never(name: str, values: Values) -> bool:
-    del name, values
-    return False
-
-
 ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
-    ".obj": _is_color,
-    ".ply": _is_numeric,
-    ".stl": _never,
-    ".off": _is_color,
+    **dict.fromkeys((".obj", ".off", ".3mf"), lambda name, _: name == "colors"),
+    ".ply": lambda _, values: values.dtype.kind in "biuf",
+    ".stl": lambda _, __: False,
     ".glb": glb_supports,
-    ".3mf": _is_color,
 }
 """Whether a format can store a vertex attribute, by its name and values."""
 
@@ -148,11 +130,9 @@ def reader_of(extension: str) -> Callable[[Path], Contents] | None:
     UsageError
         When several packages offer it, or the one that does cannot be loaded.
     """
-    if extension in READERS:
-        return READERS[extension]
-    plugin = find("reader", extension.removeprefix("."))
+    plugin = None if extension in READERS else find("reader", extension.removeprefix("."))
     if plugin is None:
-        return None
+        return READERS.get(extension)
     read = plugin.load()
     return lambda path: _read_with_plugin(plugin, read, path)
 
@@ -165,11 +145,9 @@ def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
     UsageError
         When several packages offer it, or the one that does cannot be loaded.
     """
-    if extension in WRITERS:
-        return WRITERS[extension]
-    plugin = find("writer", extension.removeprefix("."))
+    plugin = None if extension in WRITERS else find("writer", extension.removeprefix("."))
     if plugin is None:
-        return None
+        return WRITERS.get(extension)
     write = plugin.load()
     return lambda mesh, path: _write_with_plugin(plugin, write, mesh, path)
 
@@ -212,13 +190,11 @@ def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh:
 
 def _read_only(mesh: Mesh) -> Mesh:
     """The same mesh in read-only arrays, because the caller still uses the mesh after it was written."""
-    normals = None if mesh.normals is None else _locked_view(mesh.normals)
-    attributes = {name: _locked_view(values) for name, values in mesh.attributes.items()}
-    vertices, faces = _locked_view(mesh.vertices), _locked_view(mesh.faces)
-    return replace(mesh, vertices=vertices, faces=faces, normals=normals, attributes=attributes)
-
-
-def _locked_view(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    view = values.view()
-    view.flags.writeable = False
-    return view
+    attributes = {name: values.view() for name, values in mesh.attributes.items()}
+    normals = None if mesh.normals is None else mesh.normals.view()
+    locked = replace(
+        mesh, vertices=mesh.vertices.view(), faces=mesh.faces.view(), normals=normals, attributes=attributes
+    )
+    for values in (locked.vertices, locked.faces, *attributes.values(), *([] if normals is None else [normals])):
+        values.flags.writeable = False
+    return locked

@@ -8,6 +8,7 @@ loaded. Nothing is processed: vertices and faces stay the same, in the same orde
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,9 +108,7 @@ def _from_library(obj: Any) -> Mesh | PointCloud | None:
         return obj
     # All base classes count, so that subclasses of a library's types are recognised.
     libraries = {kind.__module__.partition(".")[0] for kind in type(obj).__mro__}
-    if "open3d" in libraries and (hasattr(obj, "point") or hasattr(obj, "vertex")):
-        return _from_open3d_tensor(obj)
-    if "open3d" in libraries and (hasattr(obj, "points") or hasattr(obj, "triangles")):
+    if "open3d" in libraries and any(hasattr(obj, name) for name in ("point", "vertex", "points", "triangles")):
         return _from_open3d(obj)
     if "trimesh" in libraries and hasattr(obj, "vertices"):
         return _from_trimesh(obj)
@@ -122,45 +121,36 @@ def _from_library(obj: Any) -> Mesh | PointCloud | None:
     return None
 
 
-def _mesh_or_cloud(
-    points: Any, faces: Any, normals: Any = None, attributes: dict[str, npt.NDArray[Any]] | None = None
-) -> Mesh | PointCloud:
-    """A mesh where there are faces, with colours as 8-bit numbers, else a cloud."""
-    held = attributes or {}
-    if faces is None or not len(faces):
-        return PointCloud(points, normals, held)
-    return Mesh(points, faces, normals, held | ({"colors": as_bytes(held["colors"])} if "colors" in held else {}))
+def _mesh_or_cloud(points: Any, faces: Any, attributes: dict[str, npt.NDArray[Any]]) -> Mesh | PointCloud:
+    """A mesh where there are faces, else a cloud, with the attributes as `from_columns` sorts them."""
+    normals = attributes.pop("normals", None)
+    indices = no_faces() if faces is None else np.asarray(faces, np.int64)
+    found = from_columns(attributes, indices, np.asarray(points))
+    return (found if normals is None else replace(found, normals=normals)).shape()
 
 
 def _from_open3d(obj: Any) -> Mesh | PointCloud:
-    if hasattr(obj, "points"):
-        colors = {"colors": np.array(obj.colors)} if obj.has_colors() else {}
-        return _mesh_or_cloud(np.array(obj.points), None, np.array(obj.normals) if obj.has_normals() else None, colors)
-    colors = {"colors": np.array(obj.vertex_colors)} if obj.has_vertex_colors() else {}
-    normals = np.array(obj.vertex_normals) if obj.has_vertex_normals() else None
-    return _mesh_or_cloud(np.array(obj.vertices), np.array(obj.triangles), normals, colors)
-
-
-def _from_open3d_tensor(obj: Any) -> Mesh | PointCloud:
+    """A tensor geometry; legacy ones are converted to one, in double precision."""
+    if not (hasattr(obj, "point") or hasattr(obj, "vertex")):
+        geometry = import_open3d().t.geometry
+        kind = geometry.PointCloud if hasattr(obj, "points") else geometry.TriangleMesh
+        obj = kind.from_legacy(obj, import_open3d().core.float64)
     carrier = obj.point if hasattr(obj, "point") else obj.vertex
-    arrays = {name: carrier[name].cpu().numpy() for name in carrier}
+    arrays = {name: carrier[name].cpu().numpy().copy() for name in carrier}
     if "positions" not in arrays:
         raise InputError("The open3d point cloud or mesh holds no positions.")
-    points = arrays.pop("positions")
-    indexed = hasattr(obj, "triangle") and "indices" in obj.triangle
-    faces = obj.triangle.indices.cpu().numpy() if indexed else None
-    return _mesh_or_cloud(points, faces, arrays.pop("normals", None), arrays)
+    faces = obj.triangle.indices.cpu().numpy() if hasattr(obj, "triangle") and "indices" in obj.triangle else None
+    return _mesh_or_cloud(arrays.pop("positions"), faces, arrays)
 
 
 def _from_trimesh(obj: Any) -> Mesh | PointCloud:
-    has_faces = hasattr(obj, "faces") and len(obj.faces) > 0
     colors = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
+    faces = np.array(getattr(obj, "faces", no_faces()))
+    normals = np.array(obj.vertex_normals) if len(faces) else _trimesh_normals(obj)
+    held = {name: np.array(values) for name, values in obj.vertex_attributes.items()} if len(faces) else {}
     # trimesh may report vertex colours for a cloud that has none.
-    held = {"colors": colors} if len(colors) else {}
-    if not has_faces:
-        return _mesh_or_cloud(np.array(obj.vertices), None, _trimesh_normals(obj), held)
-    held = {name: np.array(values) for name, values in obj.vertex_attributes.items()} | held
-    return _mesh_or_cloud(np.array(obj.vertices), np.array(obj.faces), np.array(obj.vertex_normals), held)
+    held |= ({"colors": colors} if len(colors) else {}) | ({} if normals is None else {"normals": normals})
+    return _mesh_or_cloud(np.array(obj.vertices), faces, held)
 
 
 def _trimesh_normals(cloud: Any) -> Float | None:
@@ -190,14 +180,15 @@ def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
     held = {} if (colors == 1).all() else {"colors": np.rint(255 * colors).astype(np.uint8)}
     held |= {"quality": values} if values.any() else {}
     linear = obj.transform_matrix()[:3, :3]
-    own = np.linalg.solve(linear.T, normals.T).T if normals.any() and not len(faces) else None
-    return _mesh_or_cloud(points, faces, own, held)
+    held |= {"normals": np.linalg.solve(linear.T, normals.T).T} if normals.any() and not len(faces) else {}
+    return _mesh_or_cloud(points, faces, held)
 
 
 def _columns(obj: Any) -> PointCloud:
     """A cloud from named columns of a structured array, a mapping or a data frame."""
-    contents = from_columns({name: _column(obj[name]) for name in _names(obj)})
-    return PointCloud(contents.points, contents.normals, contents.attributes)
+    shape = from_columns({name: _column(obj[name]) for name in _names(obj)}).shape()
+    assert isinstance(shape, PointCloud), "columns hold no faces"
+    return shape
 
 
 def _names(obj: Any) -> list[str]:
@@ -264,25 +255,22 @@ def to_open3d(shape: Mesh | PointCloud, *, tensor: bool = False) -> Any:
     shape : Mesh or PointCloud
     tensor : whether to return one of ``open3d.t.geometry``, which keeps all attributes, instead of a legacy one
     """
-    open3d = import_open3d()
-
-    if tensor:
-        return _to_open3d_tensor(shape)
-    vectors, colors = open3d.utility.Vector3dVector, _colors(shape)
-    shares = None if colors is None else vectors(colors[:, :3] / 255)
+    core: Any = import_open3d().core
+    geometry: Any = import_open3d().t.geometry
+    held, colors = dict(shape.attributes), _colors(shape)
+    if not tensor:
+        held = {} if colors is None else {"colors": colors[:, :3] / 255}
     if isinstance(shape, PointCloud):
-        cloud = open3d.geometry.PointCloud(vectors(shape.points))
-        if shape.normals is not None:
-            cloud.normals = vectors(shape.normals)
-        if shares is not None:
-            cloud.colors = shares
-        return cloud
-    faces = open3d.utility.Vector3iVector(shape.faces.astype(np.int32))
-    mesh = open3d.geometry.TriangleMesh(vectors(shape.vertices), faces)
-    mesh.vertex_normals = vectors(shape.vertex_normals())
-    if shares is not None:
-        mesh.vertex_colors = shares
-    return mesh
+        made, carrier, normals = geometry.PointCloud(core.Tensor(shape.points)), "point", shape.normals
+    else:
+        made = geometry.TriangleMesh(core.Tensor(shape.vertices), core.Tensor(shape.faces))
+        carrier, normals = "vertex", shape.vertex_normals()
+    held |= {} if normals is None else {"normals": normals}
+    for name, values in held.items():
+        # Attributes of open3d tensors need two dimensions.
+        rows = values if values.ndim > 1 else values[:, None]
+        getattr(made, carrier)[name] = core.Tensor(np.ascontiguousarray(rows))
+    return made if tensor else made.to_legacy()
 
 
 def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
@@ -318,27 +306,6 @@ def _add_attribute(mesh: Any, name: str, values: Values) -> None:
         mesh.add_vertex_custom_scalar_attribute(values, name)
     elif values.shape[1] == 3:
         mesh.add_vertex_custom_point_attribute(values, name)
-
-
-def _to_open3d_tensor(shape: Mesh | PointCloud) -> Any:
-    open3d = import_open3d()
-
-    core: Any = open3d.core
-    geometry: Any = open3d.t.geometry
-
-    def tensor(values: Values) -> Any:
-        return core.Tensor(np.ascontiguousarray(values))
-
-    if isinstance(shape, PointCloud):
-        made, carrier = geometry.PointCloud(tensor(shape.points)), "point"
-    else:
-        made, carrier = geometry.TriangleMesh(tensor(shape.vertices), tensor(shape.faces)), "vertex"
-    normals = shape.normals if isinstance(shape, PointCloud) else shape.vertex_normals()
-    held = dict(shape.attributes) | ({} if normals is None else {"normals": normals})
-    for name, values in held.items():
-        # Attributes of open3d tensors need two dimensions.
-        getattr(made, carrier)[name] = tensor(values if values.ndim > 1 else values[:, None])
-    return made
 
 
 def _colors(shape: Mesh | PointCloud) -> npt.NDArray[np.uint8] | None:

@@ -16,10 +16,11 @@ from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.io.contents import fan_triangles
 from gnrecon.runtime.errors import InputError
 
-Parts = tuple[Float, Int | None, Float | None, dict[str, npt.NDArray[Any]]]
-"""Points of shape (N, 3), faces of shape (F, 3), normals of shape (N, 3), and attributes of N rows."""
+Parts = tuple[Float, Int | None, dict[str, npt.NDArray[Any]]]
+"""Points of shape (N, 3), faces of shape (F, 3), and arrays of N rows, normals and colours among them."""
 
 
 def pyvista_parts(obj: Any) -> Parts:
@@ -41,8 +42,9 @@ def pyvista_parts(obj: Any) -> Parts:
     if hasattr(obj, "faces") and (len(obj.faces) or len(getattr(obj, "strips", ()))):
         faces = np.array(obj.triangulate().faces, np.int64).reshape(-1, 4)[:, 1:]
     held = {name: np.array(values) for name, values in obj.point_data.items() if not name.startswith("vtkOriginal")}
-    normals = held.pop(obj.point_data.active_normals_name or "Normals", None)
-    return np.array(obj.points, np.float64), faces, normals, _attributes(held)
+    if (name := obj.point_data.active_normals_name) is not None:
+        held["normals"] = held.pop(name)
+    return np.array(obj.points, np.float64), faces, _numbers(held)
 
 
 def _surface(grid: Any) -> Any:
@@ -65,28 +67,15 @@ def meshio_parts(obj: Any) -> Parts:
     points = np.array(obj.points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"The meshio mesh has points of shape {points.shape}, but (N, 3) was expected.")
-    fans = []
-    for block in obj.cells:
-        if block.type in ("triangle", "quad", "polygon"):
-            for corners in (
-                (np.asarray(block.data),) if hasattr(block.data, "shape") else map(np.atleast_2d, block.data)
-            ):
-                rest = range(1, corners.shape[1] - 1)
-                fans += [corners[:, [0, corner, corner + 1]] for corner in rest]
-    faces = np.concatenate(fans).astype(np.int64) if fans else None
-    held = {name: np.array(values) for name, values in obj.point_data.items()}
-    normals = next((held.pop(name) for name in ("normals", "Normals") if name in held), None)
-    return points, faces, normals, _attributes(held)
+    cells = [cell for block in obj.cells if block.type in ("triangle", "quad", "polygon") for cell in block.data]
+    counts = np.array([len(cell) for cell in cells], np.int64)
+    faces = fan_triangles(counts, np.concatenate(cells).astype(np.int64)) if cells else None
+    return points, faces, _numbers({name: np.array(values) for name, values in obj.point_data.items()})
 
 
-def _attributes(held: Mapping[str, Values]) -> dict[str, npt.NDArray[Any]]:
-    """Attributes of one value or of a row at each point, with colours under the name that gnrecon uses."""
-    found: dict[str, npt.NDArray[Any]] = {}
-    for name, values in held.items():
-        if values.dtype.kind in "biuf" and values.ndim <= 2:
-            is_color = name.lower() in ("rgb", "rgba", "colors") and values.ndim == 2 and values.shape[1] in (3, 4)
-            found["colors" if is_color else name] = values
-    return found
+def _numbers(held: Mapping[str, Values]) -> dict[str, npt.NDArray[Any]]:
+    """The arrays that have a number or a row of numbers at each point."""
+    return {name: values for name, values in held.items() if values.dtype.kind in "biuf" and values.ndim <= 2}
 
 
 def to_pyvista(shape: Mesh | PointCloud) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -13,14 +13,14 @@ from urllib.parse import unquote
 import numpy as np
 
 from gnrecon.geometry.arrays import Float
-from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.io.contents import Contents, faces_cover
+from gnrecon.io.contents import without_faces
+from gnrecon.io.formats.las import drop_unused_attributes
 from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.parse import read_text, sibling_path
 from gnrecon.io.read import check_file, extension_of, input_errors_for, reader_extension
-from gnrecon.io.streaming import VoxelThinning, drop_unused, read_chunks
+from gnrecon.io.streaming import VoxelThinning, read_chunks
 from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, UsageError
 
@@ -110,7 +110,10 @@ def read_scans(
         _read_into(thinning, sums, Path(path), format, columns, parameters)
         for path, sums in zip(paths, moments, strict=True)
     ]
-    found = drop_unused(thinning.result(), extensions)
+    found = thinning.result()
+    if {".las", ".laz"} & set(extensions):
+        # A chunk cannot say which attributes were never filled in; only all of its points can.
+        found = drop_unused_attributes(found)
     cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
     require_points_in_region(cloud, thinning.seen)
     files = tuple(str(path) for path in paths)
@@ -157,18 +160,11 @@ def _read_into(
         check_file(file, extension)
         for chunk in read_chunks(file, extension, columns, parameters=parameters):
             moments.add(chunk.points)
-            thinning.add(_with_normals(chunk))
+            thinning.add(without_faces(chunk))
         if thinning.seen == before:
             raise InputError("the file holds no points.")
     _log.info("Read %d points of %s as %s.", thinning.seen - before, path, extension)
     return extension
-
-
-def _with_normals(contents: Contents) -> Contents:
-    """Contents without faces; the vertices of a mesh get the normals of its faces where they have none."""
-    if contents.normals is None and faces_cover(contents):
-        contents = replace(contents, normals=Mesh(contents.points, contents.faces).vertex_normals())
-    return replace(contents, faces=contents.faces[:0])
 
 
 class Moments:

@@ -36,8 +36,9 @@ def parse_numbers(words: Sequence[str]) -> Float:
     """
     try:
         return np.fromiter(map(float, words), np.float64, len(words))
-    except ValueError:
-        raise InputError(f"{_first_non_number(words)!r} is not a number.") from None
+    except ValueError as error:
+        word = str(error).partition(": ")[2].strip("'")
+        raise InputError(f"{word[:40]!r} is not a number.") from None
 
 
 def parse_rows(lines: Sequence[str], what: str) -> Float:
@@ -57,15 +58,6 @@ def parse_rows(lines: Sequence[str], what: str) -> Float:
     return values.reshape(-1, columns)
 
 
-def _first_non_number(words: Sequence[str]) -> str:
-    for word in words:
-        try:
-            float(word)
-        except ValueError:
-            return word[:40]
-    raise AssertionError("called for words of which all are numbers")
-
-
 def format_rows(template: str, rows: Values, *, block_rows: int = 100_000) -> list[str]:
     """Return text blocks in which `template`, such as ``"v %r %r %r\\n"``, is filled in once for each row.
 
@@ -81,11 +73,7 @@ def format_rows(template: str, rows: Values, *, block_rows: int = 100_000) -> li
 
 def content_lines(text: str, comment: str = "#") -> list[str]:
     """Return the lines that are neither blank nor comments, without trailing comments."""
-    if comment in text:
-        stripped = (line.partition(comment)[0].strip() for line in text.splitlines())
-    else:
-        stripped = (line.strip() for line in text.splitlines())
-    return [line for line in stripped if line]
+    return [line for row in text.splitlines() if (line := row.partition(comment)[0].strip())]
 
 
 def sibling_path(folder: Path, name: str, what: str) -> Path:

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io.contents import Contents, faces_cover
+from gnrecon.io.contents import Contents, without_faces
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
 from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
@@ -43,10 +42,9 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
         When `format` is not supported, or standard input is read without one.
     """
     contents = read_contents(Path(path), format)
-    normals = contents.normals
-    if normals is None and faces_cover(contents):
-        normals = _mesh(contents, Path(path)).vertex_normals()
-    return PointCloud(contents.points, normals, contents.attributes, contents.origins)
+    with input_errors_for(Path(path)):
+        found = without_faces(contents)
+    return PointCloud(found.points, found.normals, found.attributes, found.origins)
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -57,10 +55,10 @@ def read_mesh(path: str | Path) -> Mesh:
     InputError
         As `read_cloud` does, and when the file holds no faces.
     """
-    contents = read_contents(Path(path), None)
-    if not len(contents.faces):
-        raise InputError(f"{path}: expected a mesh, but the file holds {len(contents.points)} points and no faces.")
-    return _mesh(contents, Path(path))
+    shape = read_any(path)[0]
+    if not isinstance(shape, Mesh):
+        raise InputError(f"{path}: expected a mesh, but the file holds {len(shape)} points and no faces.")
+    return shape
 
 
 def read_reference(path: str | Path) -> Mesh | PointCloud:
@@ -83,18 +81,8 @@ def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
         As `read_cloud` does.
     """
     contents = read_contents(Path(path), None)
-    if len(contents.faces):
-        return _mesh(contents, Path(path)), contents.unread
-    return PointCloud(contents.points, contents.normals, contents.attributes, contents.origins), contents.unread
-
-
-def _mesh(contents: Contents, path: Path) -> Mesh:
-    colors = contents.attributes.get("colors")
-    attributes = dict(contents.attributes) if colors is None else {**contents.attributes, "colors": as_bytes(colors)}
-    try:
-        return Mesh(contents.points, contents.faces, contents.normals, attributes)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with input_errors_for(Path(path)):
+        return contents.shape(), contents.unread
 
 
 def reader_extension(path: Path, format: str | None) -> str:
@@ -106,12 +94,12 @@ def reader_extension(path: Path, format: str | None) -> str:
         When `format` is not supported, or standard input is read without one.
     """
     if format is None and is_standard_input(path):
-        supported = ", ".join(suffix[1:] for suffix in readable())
-        raise UsageError(f"Standard input has no extension: say with --format how to read it, as one of {supported}.")
+        raise UsageError(
+            f"Standard input has no extension: say with --format how to read it, as one of {_supported()}."
+        )
     extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
     if format is not None and not is_readable(extension):
-        supported = ", ".join(suffix[1:] for suffix in readable())
-        raise UsageError(f"The format {format!r} is not supported; expected one of {supported}.")
+        raise UsageError(f"The format {format!r} is not supported; expected one of {_supported()}.")
     return extension
 
 
@@ -127,6 +115,10 @@ def read_contents(path: Path, format: str | None) -> Contents:
             raise InputError("the file holds no points.")
     _log.info("Read %d points and %d faces of %s.", len(contents.points), len(contents.faces), path)
     return contents
+
+
+def _supported() -> str:
+    return ", ".join(suffix[1:] for suffix in readable())
 
 
 @contextmanager
@@ -171,8 +163,9 @@ def check_file(path: Path, extension: str) -> None:
     if not is_readable(extension):
         if extension == ".gnr":
             raise InputError("this is a fitted field, not a scan or a mesh: gnrecon mesh MODEL -o MESH meshes it.")
-        supported = ", ".join(suffix[1:] for suffix in readable())
-        raise InputError(f"the extension {extension!r} is not supported; expected one of {supported} (see --format).")
+        raise InputError(
+            f"the extension {extension!r} is not supported; expected one of {_supported()} (see --format)."
+        )
     if extension not in READERS:
         return  # the signatures of plugin formats are unknown
     kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)

@@ -8,7 +8,7 @@ or when the side was doubled. The kept points are measured ones, never averages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Region
 from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.format_registry import reader_of
-from gnrecon.io.formats.las import drop_unused_attributes, las_chunks
+from gnrecon.io.formats.las import las_chunks
 from gnrecon.io.formats.npy import read_npy
 from gnrecon.io.formats.ply import ply_chunks
 from gnrecon.io.formats.ptx import ptx_chunks
@@ -147,19 +147,6 @@ def chunk_reader(extension: str) -> Callable[[Path, int], Iterator[Contents]] | 
 
     Files of several formats can be read so: LAS, LAZ, PTX, binary PLY without faces, and tables in text.
     """
-    match extension:
-        case ".las" | ".laz":
-            return las_chunks
-        case ".ptx":
-            return ptx_chunks
-        case ".ply":
-            return ply_chunks
-    return partial(table_chunks, extension=extension) if extension in TABLE_SUFFIXES else None
-
-
-def drop_unused(contents: Contents, extensions: Iterable[str]) -> Contents:
-    """Return all contents of files of some formats without attributes that were never filled in.
-
-    A chunk of a LAS file cannot say which attributes are unused; only all of its points can.
-    """
-    return drop_unused_attributes(contents) if {".las", ".laz"} & set(extensions) else contents
+    readers = {".las": las_chunks, ".laz": las_chunks, ".ptx": ptx_chunks, ".ply": ply_chunks}
+    tables = partial(table_chunks, extension=extension) if extension in TABLE_SUFFIXES else None
+    return readers.get(extension, tables)

@@ -73,3 +73,15 @@ def test_sparse_clouds_whose_winding_number_is_clear_are_not_thinned() -> None:
     samples, counts = prepare(PointCloud(points))
     assert (counts.arrangement, counts.half_line_distance, len(samples)) == ("lines", None, len(points))
     assert (np.einsum("ij,ij->i", samples.normals, points) > 0.9).all()
+
+
+def test_sheets_of_few_points_get_normals_from_the_lines() -> None:
+    """Those of all points by their winding number are off by more than 30 degrees at most points of this terrain."""
+    y, x = (axis.ravel() for axis in np.meshgrid(np.arange(-1, 1, 0.25), np.arange(-1, 1, 0.25 / 8), indexing="ij"))
+    points = np.column_stack([x, y, 0.2 * np.sin(3 * x) + 0.2 * np.cos(4 * y)])
+    samples, counts = prepare(PointCloud(points))
+    assert counts.arrangement == "lines"
+    assert 50 < len(samples) < len(points) / 2
+    x, y, _ = samples.frame.to_world(samples.points).T
+    truth = np.column_stack([-0.6 * np.cos(3 * x), 0.8 * np.sin(4 * y), np.ones(len(x))])
+    assert (np.einsum("ij,ij->i", samples.normals, truth) > 0.85 * np.linalg.norm(truth, axis=1)).all()

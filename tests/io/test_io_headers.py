@@ -119,3 +119,18 @@ def test_old_laz_is_refused_with_a_way_out(tmp_path: Path) -> None:
     path.write_bytes(old)
     with pytest.raises(InputError, match=r"before 2011.*laszip -i old.laz -o new.las"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize(("position", "normal"), [("<f8", "<f4"), ("<f4", "<f8"), ("<f4", "i1")])
+def test_pcd_normals_may_differ_in_type_from_positions(position: str, normal: str, tmp_path: Path) -> None:
+    """open3d reads the former wrongly, and writes beyond its memory for the second."""
+    scale = 127 if normal == "i1" else 1
+    directions = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -1, 0], [0.8, 0.6, 0]])
+    rows = np.zeros(4, [("p", position, 3), ("n", normal, 3)])
+    rows["p"], rows["n"] = POINTS, np.rint(directions * scale) if scale > 1 else directions
+    sizes = " ".join([str(np.dtype(position).itemsize)] * 3 + [str(np.dtype(normal).itemsize)] * 3)
+    kinds = "F F F " + ("I I I" if scale > 1 else "F F F")
+    path = pcd(tmp_path / "a.pcd", "FIELDS", "x y z normal_x normal_y normal_z", sizes, kinds, "1 1 1 1 1 1", rows)
+    cloud = read_cloud(path)
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_allclose(cloud.normals, directions, atol=0.01 if scale > 1 else 1e-7)

@@ -34,6 +34,9 @@ def lines(separator: str = ",", decimal: str = ".", before: str = "", after: str
         lines().replace(",", '","').replace("\n", '"\n"').join(['"', ""])[:-1],
         lines(" ").replace(" ", "D+00 "),
         "//X Y Z Scalar field\n" + lines(" ", after=" 7"),
+        lines().replace(",", "','").replace("\n", "'\n'").join(["'", ""])[:-1],
+        lines(", ", before="(", after=")"),
+        lines(" ") + "\x1a",
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
@@ -55,11 +58,24 @@ def test_what_is_guessed_is_said_and_columns_decide(tmp_path: Path) -> None:
         parse_columns("x,y,-")
 
 
+def test_of_four_columns_the_one_beyond_a_byte_is_the_intensity(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    colors, intensity = rng.integers(0, 256, (20, 3)), rng.integers(0, 4096, (20, 1))
+    for rest in ([intensity, colors], [colors, intensity]):
+        for suffix in ("txt", "pts"):
+            np.savetxt(tmp_path / f"a.{suffix}", np.hstack([POINTS, *rest]), "%.4f")
+            found = read_cloud(tmp_path / f"a.{suffix}").attributes
+            np.testing.assert_array_equal(found["colors"], colors)
+            np.testing.assert_array_equal(found["intensity"], intensity[:, 0])
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("lat,lon,h\n" + lines(), "angles"),
         ("x [m],y [m],z [mm]\n" + lines(), "differ in their units"),
+        ("NCOLS 4\nNROWS 1\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3 4\n", "grid of heights"),
+        ('VARIABLES = "X", "Y", "Z"\n' + lines(" "), "Name those to read with --columns"),
         ("1,01,2,02,3,03\n4,05,5,06,6,07\n", "mark decimals as well"),
     ],
 )

@@ -7,6 +7,7 @@ as invalid. Lengths are metres. The file's pages have checksums, by which the li
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Values
-from gnrecon.io.contents import Contents, concatenated, guard_parser, no_faces
+from gnrecon.io.column_names import COLOR
+from gnrecon.io.contents import Contents, concatenated, from_columns, guard_parser
 from gnrecon.runtime.errors import InputError
 
 
@@ -43,29 +45,20 @@ def read_e57(path: Path) -> Contents:
 
 def _scan(file: Any, header: Any) -> Contents:
     fields = set(header.point_fields)
-    cartesian, spherical = (
-        ("cartesianX", "cartesianY", "cartesianZ"),
-        ("sphericalRange", "sphericalAzimuth", "sphericalElevation"),
-    )
+    cartesian = [f"cartesian{axis}" for axis in "XYZ"]
+    spherical = ["sphericalRange", "sphericalAzimuth", "sphericalElevation"]
     position = next((names for names in (cartesian, spherical) if fields.issuperset(names)), None)
     if position is None:
         raise InputError("a scan has neither Cartesian nor spherical coordinates.")
-    normal, color = ("nor:normalX", "nor:normalY", "nor:normalZ"), ("colorRed", "colorGreen", "colorBlue")
-    states = ("cartesianInvalidState", "sphericalInvalidState")
-    # Names of further fields and of the attributes that they become, with the type of each.
-    others = {
-        "intensity": ("intensity", "f8"),
-        "rowIndex": ("row", "i4"),
-        "columnIndex": ("column", "i4"),
-        "returnIndex": ("return_number", "i4"),
-        "timeStamp": ("time", "f8"),
-    }
-    types = dict.fromkeys(position, "f8")
-    for names in (normal, color):
-        types |= dict.fromkeys(names, "f8") if fields.issuperset(names) else {}
-    types |= {name: kind for name, (_, kind) in others.items() if name in fields}
-    types |= {name: "i1" for name in states if name in fields}
-    values = _read(file, header, types)
+    states, colors = ("cartesianInvalidState", "sphericalInvalidState"), [f"color{name.title()}" for name in COLOR]
+    # Names of further fields and of the columns that they become, with the type of each.
+    others = {f"nor:normal{axis}": (f"n{axis.lower()}", "f8") for axis in "XYZ"}
+    others |= {name: (short, "f8") for name, short in zip(colors, COLOR, strict=True)}
+    others |= {"intensity": ("intensity", "f8"), "rowIndex": ("row", "i4"), "columnIndex": ("column", "i4")}
+    others |= {"returnIndex": ("return_number", "i4"), "timeStamp": ("time", "f8")}
+    others = {name: held for name, held in others.items() if name in fields}
+    types = dict.fromkeys(position, "f8") | {name: kind for name, (_, kind) in others.items()}
+    values = _read(file, header, types | {name: "i1" for name in states if name in fields})
     valid = np.ones(header.point_count, bool)
     for name in states:
         # In state 1, only the direction is known.
@@ -74,14 +67,13 @@ def _scan(file: Any, header: Any) -> Contents:
     points = np.column_stack([values[name] for name in position])
     rotation, translation = np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)
     points = (points if position is cartesian else _from_spherical(points)) @ rotation.T + translation
-    has_normals = normal[0] in values
-    normals = np.column_stack([values[name] for name in normal]) @ rotation.T if has_normals else None
-    attributes: dict[str, Values] = {}
-    if color[0] in values:
-        attributes["colors"] = _colors(np.column_stack([values[name] for name in color]), color, header)
-    attributes |= {label: values[name] for name, (label, _) in others.items() if name in values}
+    found = from_columns({label: values[name] for name, (label, _) in others.items()}, None, points)
+    attributes = dict(found.attributes)
+    if "colors" in attributes:
+        attributes["colors"] = _colors(attributes["colors"], colors, header)
+    normals = None if found.normals is None else found.normals @ rotation.T
     origins = np.broadcast_to(translation, points.shape) if header.has_pose() else None
-    return Contents(points, normals, no_faces(), attributes, (), origins)
+    return replace(found, normals=normals, attributes=attributes, origins=origins)
 
 
 def _read(file: Any, header: Any, types: dict[str, str]) -> dict[str, npt.NDArray[Any]]:
@@ -106,7 +98,7 @@ def _from_spherical(rows: Float) -> Float:
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])
 
 
-def _colors(values: Values, names: tuple[str, ...], header: Any) -> Values:
+def _colors(values: Values, names: list[str], header: Any) -> Values:
     """Colours in 8 bits if the scan's limits, or else the colours themselves, are within 8 bits; else in 16 bits."""
     colors = np.rint(np.clip(np.nan_to_num(values.astype(np.float64)), 0, 65535)).astype(np.uint16)
     limit = colors.max(initial=0)

@@ -10,13 +10,12 @@ and from ``COLOR_0`` in the file's JSON. All other attributes are float32, and t
 trimesh reads only the positions of point clouds. They are therefore passed to it as a mesh of one triangle that uses
 the first point three times: its indices are an accessor without a buffer, whose values are zero by the specification.
 
-Text glTF has its JSON in a file of its own and its buffers inside it or in other files. It is read as the equivalent
-GLB: a GLB has one buffer, so all buffers are concatenated, and the views into them are moved.
+A GLB has its JSON and one buffer in one file; text glTF has its buffers in the JSON or in other files. Both are given
+to trimesh as JSON and buffers by name.
 """
 
 from __future__ import annotations
 
-import binascii
 import json
 from pathlib import Path
 from typing import Any
@@ -44,27 +43,45 @@ def glb_supports(name: str, values: Values) -> bool:
     return exact and bool(np.isfinite(numbers.astype(np.float32)).all())
 
 
-def read_glb(path: Path) -> Contents:
-    """Read all meshes and clouds of the scene into one, each moved by its node's matrix.
+def read_gltf(path: Path) -> Contents:
+    """Read all meshes and clouds of the scene, of a text or GLB file, into one, each moved by its node's matrix.
 
     Attributes are kept where all meshes have them, with their names in lower case.
 
     Raises
     ------
     InputError
-        When the file is malformed or holds no vertices.
+        When the file is malformed, holds no vertices, or a buffer is missing.
     """
-    return read_glb_bytes(path.read_bytes())
-
-
-def read_glb_bytes(data: bytes) -> Contents:
-    """Read the bytes of a GLB file, as `read_glb` does."""
     import trimesh
 
-    with guard_parser("GLB"), unprinted_log("trimesh"):
-        file = trimesh.util.wrap_as_stream(_readable_by_trimesh(data))
-        scene = trimesh.load_scene(file, file_type="glb", process=False, skip_materials=True)
-        return _collected(scene, _unread(data))
+    data = path.read_bytes()
+    with guard_parser("glTF or GLB"), unprinted_log("trimesh"):
+        text, chunk = data, b""
+        if data.startswith(b"glTF"):
+            # 12 bytes of header, 4 for the length of the JSON, 4 for its type, the JSON, 8 bytes, and the buffer.
+            end = 20 + int.from_bytes(data[12:16], "little")
+            text, chunk = data[20:end], data[end + 8 :]
+        tree = json.loads(text)
+        buffers: dict[str, bytes] = {}
+        for buffer in tree.get("buffers", []):
+            uri = buffer.setdefault("uri", "")
+            if not uri.startswith("data:"):
+                buffers[uri] = _sibling(uri, path.parent) if uri else chunk
+                if len(buffers[uri]) < int(buffer["byteLength"]):
+                    raise InputError(f"a buffer ends after {len(buffers[uri])} of {buffer['byteLength']} bytes.")
+        _prepare(tree, len(data) + sum(map(len, buffers.values())))
+        file = trimesh.util.wrap_as_stream(json.dumps(tree))
+        scene = trimesh.load_scene(file, file_type="gltf", resolver=buffers, process=False, skip_materials=True)
+        return _collected(scene, _unread(text))
+
+
+def _sibling(uri: str, folder: Path) -> bytes:
+    """The bytes of a file in or below the scene's folder."""
+    target = sibling_path(folder, unquote(uri), "buffer")
+    if not target.is_file():
+        raise InputError(f"the buffer {uri[:80]!r} is missing from the file's folder.")
+    return target.read_bytes()
 
 
 def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
@@ -91,7 +108,7 @@ def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
     return Contents(np.concatenate(vertices), given, np.concatenate(faces), _attributes(attributes), unread)
 
 
-def _unread(data: bytes) -> tuple[str, ...]:
+def _unread(text: bytes) -> tuple[str, ...]:
     """Describe what else the file's JSON declares."""
     names = {
         b"TEXCOORD_0": "texture coordinates",
@@ -99,25 +116,18 @@ def _unread(data: bytes) -> tuple[str, ...]:
         b"animations": "animations",
         b"skins": "skins",
     }
-    # A GLB begins with 12 bytes of header, then 4 for the length, 4 for the type, and the text of the JSON chunk.
-    text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
     return tuple(name for word, name in names.items() if b'"' + word + b'"' in text)
 
 
-def _readable_by_trimesh(data: bytes) -> bytes:
-    """The file with colours as a custom attribute, and points as triangles, so that trimesh reads both in full."""
-    length = int.from_bytes(data[12:16], "little")
-    if data[16:20] != b"JSON":
-        return data
-    tree = json.loads(data[20 : 20 + length])
-    _require_bounded(tree, len(data))
+def _prepare(tree: dict[str, Any], size: int) -> None:
+    """Make colours a custom attribute, and points triangles, so that trimesh reads both in full."""
+    _require_bounded(tree, size)
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
             _rename(primitive["attributes"], "COLOR_0", "_COLOR_0")
             if primitive.get("mode") == 0:  # points; mode 4 is triangles, component type 5121 is unsigned bytes
                 tree["accessors"].append({"componentType": 5121, "type": "SCALAR", "count": 3})
                 primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
-    return pack_glb(tree, data[20 + length :])
 
 
 def _require_bounded(tree: dict[str, Any], size: int) -> None:
@@ -129,15 +139,6 @@ def _require_bounded(tree: dict[str, Any], size: int) -> None:
         held = size if view is None else min(size, int(views[view]["byteLength"]))
         if not 0 <= int(accessor["count"]) <= held:
             raise InputError(f"an accessor declares {accessor['count']} values, more than the file holds.")
-
-
-def pack_glb(tree: dict[str, Any], rest: bytes) -> bytes:
-    """Return the bytes of a GLB file with this JSON, followed by other chunks."""
-    text = json.dumps(tree).encode()
-    # Chunks are padded to multiples of 4 bytes, JSON with blanks.
-    text += b" " * (-len(text) % 4)
-    size = (20 + len(text) + len(rest)).to_bytes(4, "little")
-    return b"glTF\x02\0\0\0" + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
 
 
 def _rename(names: dict[str, Any], old: str, new: str) -> None:
@@ -198,43 +199,3 @@ def _set_colors_and_material(tree: dict[str, Any]) -> None:
         accessor["normalized"] = True
     tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
     primitive["material"] = 0
-
-
-def read_gltf(path: Path) -> Contents:
-    """Read all meshes and clouds of the scene into one, as `read_glb` does.
-
-    Raises
-    ------
-    InputError
-        When the file is malformed, holds no vertices, or a buffer is missing.
-    """
-    with guard_parser("glTF"):
-        tree = json.loads(path.read_bytes())
-        buffers = [_buffer(one["uri"], path.parent) for one in tree.get("buffers", [])]
-        starts = [0]
-        for buffer in buffers:
-            starts.append(starts[-1] + len(buffer) + -len(buffer) % 4)
-        for view in tree.get("bufferViews", []):
-            view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
-            view["buffer"] = 0
-        data = pack_glb(_with_one_buffer(tree, starts[-1]), _chunk(buffers))
-    return read_glb_bytes(data)
-
-
-def _with_one_buffer(tree: dict[str, Any], size: int) -> dict[str, Any]:
-    return {**tree, "buffers": [{"byteLength": size}]}
-
-
-def _chunk(buffers: list[bytes]) -> bytes:
-    body = b"".join(buffer + b"\0" * (-len(buffer) % 4) for buffer in buffers)
-    return len(body).to_bytes(4, "little") + b"BIN\0" + body
-
-
-def _buffer(uri: str, folder: Path) -> bytes:
-    """The bytes of a data URI, or of a file in or below the scene's folder."""
-    if uri.startswith("data:"):
-        return binascii.a2b_base64(uri.partition(",")[2])
-    target = sibling_path(folder, unquote(uri), "buffer")
-    if not target.is_file():
-        raise InputError(f"the buffer {uri[:80]!r} is missing from the file's folder.")
-    return target.read_bytes()

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Mask, Values
-from gnrecon.io.contents import Columns, Contents, concatenated, from_columns, guard_parser
+from gnrecon.geometry.arrays import Values
+from gnrecon.io.contents import Contents, concatenated, from_columns, guard_parser
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.runtime.errors import InputError
 
@@ -92,26 +92,12 @@ def drop_unused_attributes(contents: Contents) -> Contents:
 
 def _contents(chunk: Any) -> Contents:
     # X, Y and Z are the unscaled integers, and the flags describe processing, not the surface.
-    skipped = {"X", "Y", "Z", "red", "green", "blue", "withheld", "synthetic", "key_point", "overlap"}
+    skipped = {"X", "Y", "Z", "withheld", "synthetic", "key_point", "overlap"}
     names = [name for name in chunk.point_format.dimension_names if name not in skipped]
     used = np.asarray(chunk.withheld) == 0
     columns: dict[str, Values] = {axis: np.asarray(getattr(chunk, axis))[used] for axis in "xyz"}
-    columns |= {name: np.asarray(chunk[name])[used] for name in names}
-    found = from_columns(columns)
-    dropped = len(used) - int(used.sum())
-    return Contents(
-        found.points,
-        found.normals,
-        found.faces,
-        {**found.attributes, **_colors(chunk, used)},
-        ("points marked as withheld",) if dropped else (),
-    )
-
-
-def _colors(chunk: Any, used: Mask) -> Columns:
-    if "red" not in chunk.point_format.dimension_names:
-        return {}
-    return {"colors": np.column_stack([np.asarray(chunk[name])[used] for name in ("red", "green", "blue")])}
+    found = from_columns(columns | {name: np.asarray(chunk[name])[used] for name in names})
+    return found if used.all() else replace(found, unread=(*found.unread, "points marked as withheld"))
 
 
 def _require_consistent_header(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Values
-from gnrecon.io.contents import Contents, decoded_normals, from_columns, guard_parser
+from gnrecon.io.contents import Contents, from_columns, guard_parser
 from gnrecon.io.formats.table_columns import guessed, named_by_user
 from gnrecon.runtime.errors import InputError
 
@@ -37,18 +37,16 @@ def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
         if {"x", "y", "z"} <= found.keys():
             return from_columns({name: values for name, values in arrays.items() if values.ndim == 1})
         raise InputError(f"the archive holds the arrays {', '.join(arrays)[:200]}, but none named points.")
-    contents = _cloud(arrays[chosen], columns)
-    rest = {name: one for name, one in arrays.items() if name != chosen and _fits(one, len(contents.points))}
-    normals = next((rest.pop(name) for name in list(rest) if name.lower() in ("normals", "normal")), None)
-    lost: tuple[str, ...] = ()
-    if normals is not None and normals.shape[1:] == (3,):
-        directions, lost = decoded_normals(normals)
-        contents = replace(contents, normals=directions)
-    unread = tuple(
-        f"the array {name}" for name in arrays if name != chosen and name not in rest and arrays[name] is not normals
+    cloud = _cloud(arrays[chosen], columns)
+    rest = {name: one for name, one in arrays.items() if name != chosen and _fits(one, len(cloud.points))}
+    more = from_columns(rest, None, cloud.points)
+    unread = [f"the array {name}" for name in arrays if name != chosen and name not in rest]
+    return replace(
+        cloud,
+        normals=cloud.normals if more.normals is None else more.normals,
+        attributes={**cloud.attributes, **more.attributes},
+        unread=(*cloud.unread, *unread, *more.unread),
     )
-    renamed = {"colors" if name.lower() in ("colours", "rgb") else name: values for name, values in rest.items()}
-    return replace(contents, attributes={**contents.attributes, **renamed}, unread=(*contents.unread, *unread, *lost))
 
 
 def _arrays(path: Path, *, largest_ratio: int = 1032) -> Mapping[str, Values]:

@@ -4,7 +4,8 @@ That reader keeps doubles and all scalar fields (open3d's older one misreads bin
 warning and returns an empty cloud, and it pads a short file with zeros. The amount of data is therefore compared with
 the header before reading, and the number of points afterwards. A contradictory header would abort the process, so it is
 refused here. Padding (fields named ``_``, also of no bytes), names in upper case and the old COLUMNS, which PCL and
-drivers of scanners write, are put into a header that the reader takes, over the same data.
+drivers of scanners write, are put into a header that the reader takes, over the same data; so are normals, which it
+would misread where their type is not that of the positions.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Values
-from gnrecon.io.contents import Contents, decoded_normals, no_faces
+from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.quiet_imports import import_open3d
@@ -36,7 +36,6 @@ def read_pcd(path: Path) -> Contents:
     header, body = _split(path.read_bytes())
     header = _plain(header)
     declared = int(header["POINTS"][0])
-    _require_consistent(header)
     _require_complete(header, body, declared)
     with (
         open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error),
@@ -46,19 +45,14 @@ def read_pcd(path: Path) -> Contents:
         copy.write("\n".join([*lines, ""]).encode("utf-8") + body)
         copy.flush()
         cloud = open3d.t.io.read_point_cloud(Path(copy.name), format="pcd")
-    arrays: dict[str, Values] = {name: cloud.point[name].numpy() for name in cloud.point}
+    arrays = {name: cloud.point[name].numpy() for name in cloud.point}
     points = arrays.pop("positions", np.empty((0, 3)))
     if len(points) != declared:
         raise InputError(f"the header declares {declared} points, but {len(points)} could be read.")
-    columns = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in arrays.items()}
-    columns = {name: values for name, values in columns.items() if not name.startswith("_")}
-    if {"nx", "ny", "nz"} <= columns.keys():
-        arrays["normals"] = np.column_stack([columns.pop(name) for name in ("nx", "ny", "nz")])
-    # Damaged bytes may be numbers that warn when they are converted; ingest drops them.
-    with np.errstate(invalid="ignore"):
-        normals, unread = decoded_normals(arrays["normals"]) if "normals" in arrays else (None, ())
-        columns.pop("normals", None)
-        return Contents(points.astype(np.float64), normals, no_faces(), columns, unread)
+    columns = {name: values for name, values in arrays.items() if not name.startswith("_")}
+    return from_columns(
+        {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in columns.items()}, None, points
+    )
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:
@@ -90,53 +84,37 @@ def _split(data: bytes) -> tuple[Header, bytes]:
 
 
 def _plain(header: Header) -> Header:
-    """Return the header with the names that the reader knows, each field once, and none that holds nothing."""
-    normal = {f"{prefix}{axis}": f"normal_{axis}" for axis in "xyz" for prefix in ("normal_", "n", "normal")}
-    known = {**{name: name for name in ("x", "y", "z", "rgb", "rgba", "intensity")}, **normal}
-    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
-    columns = (header["FIELDS"], header["SIZE"], header["TYPE"], counts)
-    if len({len(words) for words in columns}) > 1:
-        return header
-    fields = []
-    for place, (name, size, kind, count) in enumerate(zip(*columns, strict=True)):
-        title = known.get(name.lower(), name)
-        if title.startswith("normal_") and kind.upper() != "F":
-            title = f"n{title[-1]}"  # the reader takes integers for directions as they are
-        padding = f"_{place}" if name == "_" else title
-        if count != "0":
-            fields.append((padding, size, kind.upper(), count))
-    if not fields:
-        return header
-    names = ("FIELDS", "SIZE", "TYPE", "COUNT")
-    plain = dict(zip(names, map(list, zip(*fields, strict=True)), strict=True))
-    first = {"VERSION": header.get("VERSION", ["0.7"]), **plain}
-    last = {key: words for key, words in header.items() if key not in first and key != "DATA"}
-    return {**first, **last, "DATA": [word.lower() for word in header["DATA"][:1]]}
-
-
-def _require_consistent(header: Header) -> None:
-    """Refuse fields that are not described completely, have an unknown type, or appear twice.
+    """Return the header with names and types that the reader knows, each field once, and none that holds nothing.
 
     Raises
     ------
     InputError
-        With a sentence on what is wrong.
+        When fields are not described completely, have an unknown type, or appear twice.
     """
-    normal = ("normal_x", "normal_y", "normal_z")
-    types = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
-    names = header["FIELDS"]
-    counts = header.setdefault("COUNT", ["1"] * len(names))
-    if not len(names) == len(header["SIZE"]) == len(header["TYPE"]) == len(counts):
+    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
+    columns = (header["FIELDS"], header["SIZE"], header["TYPE"], counts)
+    if len({len(words) for words in columns}) > 1:
         raise InputError("the PCD header does not give a size, a type and a count for each field.")
-    for name, kind, size, count in zip(names, header["TYPE"], header["SIZE"], counts, strict=True):
-        scalar = name in ("x", "y", "z", "rgb", "rgba", *normal)
-        malformed = scalar and (count != "1" or (name in ("rgb", "rgba") and size != "4"))
-        if kind + size not in types or int(count) < 1 or malformed:
+    # The reader takes three fields normal_x, ... for one array of the first one's type, and writes beyond its end.
+    known = {f"{prefix}{axis}": f"n{axis}" for axis in "xyz" for prefix in ("normal_", "normal")}
+    known |= {name: name for name in ("x", "y", "z", "nx", "ny", "nz", "rgb", "rgba", "intensity")}
+    fields = []
+    for place, (name, size, kind, count) in enumerate(zip(*columns, strict=True)):
+        title = f"_{place}" if name == "_" else known.get(name.lower(), name)
+        single = title not in ("x", "y", "z", "rgb", "rgba") or (count == "1" and (title[0] != "r" or size == "4"))
+        if kind.upper() not in "FIU" or size not in ("1248" if kind.upper() != "F" else "48") or not single:
             raise InputError(f"the PCD header has an invalid description of the field {name[:20]!r}.")
-    if len(set(names)) < len(names) or len(set(names) & set(normal)) not in (0, 3):
-        raise InputError("the PCD header names a field twice, or only some of the three of normals.")
+        if int(count):
+            fields.append((title, size, kind.upper(), count))
+    names, sizes, kinds, lengths = map(list, zip(*fields, strict=True))
+    if len(set(names)) < len(names):
+        raise InputError("the PCD header names a field twice.")
     if int(header["WIDTH"][0]) * int(header["HEIGHT"][0]) != int(header["POINTS"][0]):
         raise InputError("the PCD header's width and height do not give its number of points.")
+    plain = {"FIELDS": names, "SIZE": sizes, "TYPE": kinds, "COUNT": lengths}
+    first = {"VERSION": header.get("VERSION", ["0.7"]), **plain}
+    last = {key: words for key, words in header.items() if key not in first and key != "DATA"}
+    return {**first, **last, "DATA": [word.lower() for word in header["DATA"][:1]]}
 
 
 def _require_complete(header: Header, body: bytes, points: int) -> None:

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,97 +91,78 @@ def _unread(elements: list[Element]) -> tuple[str, ...]:
 
 def _read_rows(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
     """Return the element's rows and the offset after them; `order` is empty for text converted to doubles."""
-    lists = [prop for prop in element.properties if prop.count_type]
-    if lists and element.count:
-        # Most files have lists of one length only. Then all rows have one record type, which numpy reads at once; a row
-        # of another length shows as a wrong count, and the rows are read one by one.
-        lengths = _first_lengths(buffer, offset, element, order)
-        layout = _layout(element, order, lengths)
-        end = offset + element.count * layout.itemsize
-        table = np.frombuffer(buffer[offset:end], layout) if end <= len(buffer) else None
-        if table is None or any((table[f"#{prop.name}"] != lengths[prop.name]).any() for prop in lists):
-            return _read_rows_one_by_one(buffer, offset, element, order)
-    else:
-        layout = _layout(element, order, {prop.name: 0 for prop in lists})
+    if not element.count or not any(prop.count_type for prop in element.properties):
+        layout = np.dtype([(prop.name, order + prop.type if order else "f8") for prop in element.properties])
         end = offset + element.count * layout.itemsize
         # Checked before reading, because a damaged header may declare any number of rows.
         if end > len(buffer):
             raise truncation_error(element, (len(buffer) - offset) // layout.itemsize)
         table = np.frombuffer(buffer[offset:end], layout)
-    scalars = {p.name: _native(table[p.name], p, order) for p in element.properties if not p.count_type}
-    found: dict[str, tuple[Int, Int]] = {
-        p.name: (table[f"#{p.name}"].astype(np.int64), _indices(table[p.name]).ravel()) for p in lists
-    }
-    return _Rows(scalars, found), end
+        return _Rows({p.name: _native(table[p.name], p, order) for p in element.properties}, {}), end
+    # Most files have lists of one length only, so that all rows take as many bytes as the first.
+    starts = _row_starts(buffer, offset, element, order, 1)
+    step = int(starts[1] - offset)
+    rows = None
+    if offset + step * element.count <= len(buffer):
+        starts = offset + step * np.arange(element.count + 1)
+        rows = _rows_at(buffer, starts, element, order)
+    if rows is None:
+        starts = _row_starts(buffer, offset, element, order, element.count)
+        rows = _rows_at(buffer, starts, element, order)
+    assert rows is not None, "rows end where the next ones start"
+    return rows, int(starts[-1])
 
 
-def _read_rows_one_by_one(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
-    """Read row by row, for lists of differing lengths."""
-    scalars: dict[str, list[Values]] = {p.name: [] for p in element.properties if not p.count_type}
-    counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
-    items: dict[str, list[Values]] = {name: [] for name in counts}
-    for row in range(element.count):
-        try:
-            for prop in element.properties:
-                kind = np.dtype(order + prop.type if order else "f8")
-                if not prop.count_type:
-                    scalars[prop.name].append(np.frombuffer(buffer, kind, 1, offset)[0])
-                    offset += kind.itemsize
-                    continue
-                length, offset = _length(buffer, offset, prop, order)
-                counts[prop.name].append(length)
-                items[prop.name].append(np.frombuffer(buffer, kind, length, offset))
-                offset += length * kind.itemsize
-        except ValueError:  # numpy raises it for a buffer that is too short
-            raise truncation_error(element, row) from None
-    by_name = {prop.name: prop for prop in element.properties}
-    columns = {name: _native(np.array(values), by_name[name], order) for name, values in scalars.items()}
-    lists: dict[str, tuple[Int, Int]] = {
-        name: (np.array(counts[name], np.int64), _indices(np.concatenate(items[name]))) for name in counts
-    }
-    return _Rows(columns, lists), offset
-
-
-def _length(buffer: bytes, offset: int, prop: Property, order: str) -> tuple[int, int]:
-    """Return the length of the list that begins at `offset`, and the offset of its first item."""
-    kind = np.dtype(order + (prop.count_type or "") if order else "f8")
-    value = float(np.frombuffer(buffer, kind, 1, offset)[0])
-    if not (value >= 0 and value.is_integer()):
-        raise InputError(f"a list of {prop.name} has the length {value:g}, but a count was expected.")
-    return int(value), offset + kind.itemsize
-
-
-def _first_lengths(buffer: bytes, offset: int, element: Element, order: str) -> dict[str, int]:
-    """Return the list lengths of the element's first row, which are usually those of all rows."""
-    lengths: dict[str, int] = {}
-    try:
-        for prop in element.properties:
-            kind = np.dtype(order + prop.type if order else "f8")
+def _row_starts(buffer: bytes, offset: int, element: Element, order: str, rows: int) -> Int:
+    """The offsets of so many rows, and the one after them, found by the lengths of the lists."""
+    starts, place = [offset], offset
+    kinds = [np.dtype(order + prop.type if order else "f8") for prop in element.properties]
+    counts = [
+        prop.count_type and _view(buffer, np.dtype(order + prop.count_type if order else "f8"))
+        for prop in element.properties
+    ]
+    for row in range(rows):
+        for prop, kind, view in zip(element.properties, kinds, counts, strict=True):
             length = 1
-            if prop.count_type:
-                length, offset = _length(buffer, offset, prop, order)
-                lengths[prop.name] = length
-            offset += length * kind.itemsize
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise truncation_error(element, 0) from None
-    if offset > len(buffer):
-        raise truncation_error(element, 0)
-    return lengths
+            if isinstance(view, np.ndarray):
+                if place >= len(view):
+                    raise truncation_error(element, row)
+                if not (view[place] >= 0 and view[place] % 1 == 0):
+                    raise InputError(f"a list of {prop.name} has the length {view[place]:g}; a count was expected.")
+                length = int(view[place])
+                place += view.itemsize
+            place += length * kind.itemsize
+        if place > len(buffer):
+            raise truncation_error(element, row)
+        starts.append(place)
+    return np.array(starts, np.int64)
 
 
-def _layout(element: Element, order: str, lengths: dict[str, int]) -> np.dtype[np.void]:
-    """Return the record type of a row whose lists have the given lengths; ``#name`` is a list's count."""
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
+def _rows_at(buffer: bytes, starts: Int, element: Element, order: str) -> _Rows | None:
+    """The rows between these offsets, of shape (count + 1,); None where a row does not end at the next offset."""
+    found, place = _Rows({}, {}), starts[:-1].copy()
     for prop in element.properties:
-        kind = order + prop.type if order else "f8"
-        if prop.count_type:
-            fields.append((f"#{prop.name}", order + prop.count_type if order else "f8"))
-            fields.append((prop.name, kind, (lengths[prop.name],)))
-        else:
-            fields.append((prop.name, kind))
-    return np.dtype(fields)
+        kind = np.dtype(order + prop.type if order else "f8")
+        if not prop.count_type:
+            found.scalars[prop.name] = _native(_view(buffer, kind)[place], prop, order)
+            place += kind.itemsize
+            continue
+        counter = np.dtype(order + prop.count_type if order else "f8")
+        lengths = _indices(_view(buffer, counter)[place])
+        place += counter.itemsize
+        after = place + lengths * kind.itemsize
+        if (lengths < 0).any() or (after > starts[1:]).any():
+            return None
+        firsts = place - (np.cumsum(lengths) - lengths) * kind.itemsize
+        items = np.repeat(firsts, lengths) + kind.itemsize * np.arange(lengths.sum())
+        found.lists[prop.name] = lengths, _indices(_view(buffer, kind)[items])
+        place = after
+    return found if (place == starts[1:]).all() else None
+
+
+def _view(buffer: bytes, kind: np.dtype[Any]) -> Values:
+    """The numbers of a type that begin at each byte."""
+    return np.ndarray((max(len(buffer) - kind.itemsize + 1, 0),), kind, buffer, strides=(1,))
 
 
 def _native(values: Values, prop: Property, order: str) -> Values:

@@ -115,8 +115,8 @@ def _cleaned(block: str, dialect: Dialect) -> tuple[str, list[int]]:
         raise InputError("expected text, but the file holds binary data.")
     if any(mark in block for mark in ("#", "//", "%", "!")) or (dialect.separator != ";" and ";" in block):
         block = COMMENT.sub("", block)
-    if not block.isascii():
-        block = block.translate({0xA0: " ", 0x202F: " ", 0x2212: "-", 0xFEFF: None})
+    if not block.isascii() or "\x1a" in block:  # with which DOS ends a text
+        block = block.translate({0xA0: " ", 0x202F: " ", 0x2212: "-", 0xFEFF: None, 0x1A: " "})
     counts: list[int] = []
     if dialect.count is not None:
         counts = [int(word) for word in re.findall(r"^[ \t]*([0-9]{1,18})[ \t]*$", block, re.MULTILINE)]

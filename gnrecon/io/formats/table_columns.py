@@ -81,9 +81,11 @@ def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
         return [""], ""
     four = rest.shape[1] >= 4 and _are_colors(rest[:, 1:4])
     # Four columns that all may be bytes: scanners write the intensity first in PTS, and after the colour elsewhere. One
-    # that never changes is no colour channel.
-    constant = [bool(np.ptp(rest[:, place]) == 0) for place in (0, 3)] if four and len(rest) else [False, False]
-    if four and (constant[0] > constant[1] or (constant[0] == constant[1] and suffix == ".pts")):
+    # that never changes, or alone exceeds 255, is no colour channel.
+    odd = [False, False]
+    if four:
+        odd = [bool(np.ptp(rest[:, end]) == 0 or rest[:, end].max() > 255 >= rest[:, 1:3].max()) for end in (0, 3)]
+    if four and (odd[0] > odd[1] or (odd[0] == odd[1] and suffix == ".pts")):
         return [""], ""
     return list(COLOR), "0 to 255" if rest[:, :3].max(initial=0) > 1 else "0 to 1"
 

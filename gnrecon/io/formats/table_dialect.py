@@ -120,8 +120,10 @@ def find_dialect(lines: list[str]) -> Dialect:
     Raises
     ------
     InputError
-        When there are no rows, no columns x, y, z, or ambiguous columns.
+        When there are no rows, no columns x, y, z, or ambiguous columns, or it is a grid of heights.
     """
+    if re.match(r"\s*ncols\s+\d+\s+nrows\s+\d", "".join(lines[:2]), re.IGNORECASE):
+        raise InputError("it is a grid of heights by Esri, not a table of points; gdal2xyz or QGIS make one of it.")
     texts = [COMMENT.sub("", line.replace("\ufeff", "")) for line in lines]
     dialect, rows = _best(texts)
     # The last line read may be cut off; all others count.
@@ -145,14 +147,20 @@ def find_dialect(lines: list[str]) -> Dialect:
 
 def _best(texts: list[str]) -> tuple[Dialect, list[tuple[int, list[str]]]]:
     """Return the dialect in which most lines are rows, with those rows and their places."""
-    exponents = (("D", "E"), ("d", "e")) if any(re.search(r"\d[Dd][+-]?\d", text) for text in texts) else ()
+    habits = (
+        (r"\d[Dd][+-]?\d", (("D", "E"), ("d", "e"))),  # Fortran's exponents
+        (r"^\s*[\[(]+\s*[-+.\d]", (("(", ""), (")", ""), ("[", ""), ("]", ""))),
+        (r"'[-+.\d][^'\s]*'", (("'", ""),)),
+    )
+    shown = [pairs for pattern, pairs in habits if any(re.search(pattern, text) for text in texts)]
+    common = tuple(pair for pairs in shown for pair in pairs)
     blanks = ((",", " "), (";", " "))
     candidates = [Dialect(separator, decimal) for separator in "\t;|" for decimal in ".,"]
     candidates += [Dialect("\t", ",", replaced=((", ", "\t"),)), Dialect(","), Dialect(",", ",")]
     candidates += [Dialect(BLANKS), Dialect(BLANKS, ","), Dialect(BLANKS, replaced=blanks)]
     best, most, found = candidates[0], (0, 0), []
     for candidate in candidates:
-        tried = replace(candidate, replaced=candidate.replaced + exponents)
+        tried = replace(candidate, replaced=candidate.replaced + common)
         quoted = '"[^"]*' if tried.separator not in "\t;|" else ""
         if re.search(r"\d\.\d{3},\d" if tried.decimal == "," else quoted + r"\d,\d{3}\.\d", "\n".join(texts)):
             tried = replace(tried, thousands="." if tried.decimal == "," else ",")
@@ -257,7 +265,7 @@ def _fitted(dialect: Dialect, names: list[str]) -> Dialect:
     elif len(names) == width - 1 and tuple(name.lower() for name in names[:3]) == POSITION:
         raise InputError(_unequal(names, width) + " The first column seems to be a row's number; see --columns.")
     if len(names) != width:
-        raise InputError(_unequal(names, width))
+        raise InputError(f"{_unequal(names, width)} Name those to read with --columns.")
     return replace(dialect, names=tuple(names))
 
 

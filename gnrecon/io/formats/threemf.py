@@ -17,7 +17,7 @@ import zipfile
 import zlib
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO
 from xml.parsers import expat
@@ -28,7 +28,7 @@ import numpy.typing as npt
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents
+from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.parse import format_rows, parse_numbers
 from gnrecon.runtime.errors import InputError
@@ -165,12 +165,10 @@ def read_3mf(path: Path) -> Contents:
     pieces = [piece for key, matrix in model.items for piece in _transformed(model, key, matrix)]
     if not pieces:
         raise InputError("the 3MF model builds no mesh.")
-    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=False)])
-    colors = np.concatenate([piece.attributes["colors"] for piece in pieces])
+    found = concatenated(pieces)
+    colors = np.asarray(found.attributes["colors"], np.uint8)
     visible = colors if (colors[:, 3] < 255).any() else colors[:, :3]
-    vertices = np.concatenate([piece.vertices for piece in pieces])
-    return Contents(vertices, None, faces, {"colors": visible} if colors.any() else {})
+    return replace(found, attributes={"colors": visible} if colors.any() else {})
 
 
 def _load(archive: zipfile.ZipFile) -> _Model:
@@ -280,7 +278,7 @@ def _require_bounded(
         )
 
 
-def _transformed(model: _Model, key: Key, matrix: Float) -> Iterator[Mesh]:
+def _transformed(model: _Model, key: Key, matrix: Float) -> Iterator[Contents]:
     """The meshes of an object and its components, moved into place; the model has no cycles, see `_require_bounded`."""
     current = model.objects[key]
     if current.corners:
@@ -290,7 +288,7 @@ def _transformed(model: _Model, key: Key, matrix: Float) -> Iterator[Mesh]:
         yield from _transformed(model, inner, np.hstack([step, np.eye(4)[:, 3:]]) @ matrix)
 
 
-def _mesh(current: _Object, matrix: Float) -> Mesh:
+def _mesh(current: _Object, matrix: Float) -> Contents:
     """The object's own mesh in place, with RGBA colours, zero where there are none."""
     vertices = np.array(current.vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.array(current.corners, dtype=np.int64).reshape(-1, 3)
@@ -299,12 +297,12 @@ def _mesh(current: _Object, matrix: Float) -> Mesh:
         vertices = vertices @ matrix[:3]
     # A mirroring matrix would turn faces inside out, so their corners are reversed.
     turned = faces if np.linalg.det(matrix[:3]) > 0 else faces[:, ::-1]
-    mesh = Mesh(vertices + matrix[3], turned, None, {"colors": colors})
+    mesh = Mesh(vertices + matrix[3], turned)  # which refuses indices of other objects' vertices
     codes = np.array(current.colors, dtype=np.int64)
     # Where the corners at a vertex differ, the first one's colour is written last.
     painted = np.flatnonzero(codes != -1)[::-1]
     colors[faces.reshape(-1)[painted]] = codes[painted].astype(">u4").view(np.uint8).reshape(-1, 4)
-    return mesh
+    return Contents(mesh.vertices, None, mesh.faces, {"colors": colors})
 
 
 def _rgba(text: str) -> int:

@@ -8,14 +8,15 @@ and aborts the process on some damaged files, and meshio does not read polydata.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, decoded_normals, fan_triangles, no_faces
+from gnrecon.io.contents import Contents, fan_triangles, from_columns, no_faces
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
@@ -77,11 +78,13 @@ class _Source:
         self.place = len(data) - len(lines[3])
 
     def words(self) -> list[str]:
-        """The words of the next line that is not blank; none at the end."""
+        """The words of the next line that is neither blank nor metadata, which a blank line ends; none at the end."""
+        metadata = False
         while self.place < len(self.data):
             end = self.data.find(b"\n", self.place) + 1 or len(self.data)
             line, self.place = self.data[self.place : end], end
-            if line.strip():
+            metadata = bool(line.strip()) and (metadata or line.strip() == b"METADATA")
+            if line.strip() and not metadata:
                 return line.decode("ascii", errors="replace").split()
         return []
 
@@ -103,10 +106,7 @@ class _Source:
         self.place = len(self.data) - (len(words.pop()) if len(words) > count else 0)
         if len(words) < count:
             raise InputError(f"the file ends after {len(words)} of {count} numbers of the type {kind}.")
-        found = [word.decode("ascii", errors="replace") for word in words]
-        if dtype.kind in "iu":
-            return np.array([int(word) for word in found], dtype)
-        return parse_numbers(found)
+        return text_numbers([word.decode("ascii", errors="replace") for word in words], dtype)
 
 
 def _section(source: _Source, words: list[str], data: _PolyData) -> None:
@@ -127,8 +127,6 @@ def _section(source: _Source, words: list[str], data: _PolyData) -> None:
             data.points = source.numbers(3 * _count(words, 1), _word(words, 2)).astype(np.float64).reshape(-1, 3)
         case "POINT_DATA" | "CELL_DATA":
             data.of_points, data.count = name == "POINT_DATA", _count(words, 1)
-        case "METADATA":
-            _skip_metadata(source)
         case "CELLS" | "VERTICES" | "LINES" | "POLYGONS" | "TRIANGLE_STRIPS":
             _cells(source, words, data)
         case "FIELD":
@@ -148,15 +146,6 @@ def _word(words: list[str], place: int) -> str:
     if len(words) <= place:
         raise InputError(f"the line {' '.join(words)[:60]!r} ends too early.")
     return words[place]
-
-
-def _skip_metadata(source: _Source) -> None:
-    """Skip names of components and the like, up to a blank line."""
-    while source.place < len(source.data):
-        end = source.data.find(b"\n", source.place) + 1 or len(source.data)
-        line, source.place = source.data[source.place : end], end
-        if not line.strip():
-            return
 
 
 def _cells(source: _Source, words: list[str], data: _PolyData) -> None:
@@ -197,49 +186,36 @@ def _faces_of_types(types: Values, data: _PolyData) -> None:
 
 def _lattice(data: _PolyData) -> Float:
     """The points of a regular or rectilinear grid, of shape (N, 3); x varies fastest."""
+    axes = [data.numbers.get(axis, np.zeros(0)) for axis in "XYZ"]
+    shape = np.array([float(len(axis)) for axis in axes])
     if data.kind == "STRUCTURED_POINTS":
-        sizes = data.numbers.get("DIMENSIONS", np.zeros(0))
+        shape = data.numbers.get("DIMENSIONS", np.zeros(0))
+    size = float(np.prod(shape))
+    # A few bytes may declare any number of points.
+    if len(shape) != 3 or not (shape >= 1).all() or size != data.count or not data.arrays:
+        raise InputError(f"the grid has {size:.0f} points, but values of {data.count} points; a surface was expected.")
+    if data.kind == "STRUCTURED_POINTS":
         spacing = data.numbers.get("SPACING", data.numbers.get("ASPECT_RATIO", np.ones(3)))
         origin = data.numbers.get("ORIGIN", np.zeros(3))
-        if [len(sizes), len(spacing), len(origin)] != [3, 3, 3] or not (np.isfinite(sizes) & (sizes >= 1)).all():
-            raise InputError("the grid does not have three dimensions, an origin and a spacing.")
-        _require_values(float(np.prod(sizes)), data)
-        axes = [start + step * np.arange(int(size)) for start, step, size in zip(origin, spacing, sizes, strict=True)]
-    else:
-        axes = [data.numbers.get(axis, np.zeros(0)) for axis in "XYZ"]
-        _require_values(float(np.prod([float(len(axis)) for axis in axes])), data)
+        axes = [start + step * np.arange(int(one)) for start, step, one in zip(origin, spacing, shape, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
 
 
-def _require_values(size: float, data: _PolyData) -> None:
-    """Refuse a grid without a value for each point: a few bytes may declare any number of points."""
-    if size != data.count or not data.arrays:
-        raise InputError(f"the grid has {size:.0f} points, but values of {data.count} points; a surface was expected.")
-
-
 def _counted(values: Int, rows: int) -> tuple[Int, Int]:
     """Split ``n i0 ... i(n-1)``, repeated `rows` times, into counts and corners."""
-    if rows > len(values):
-        raise InputError("the polygons do not have the size that their section declares.")
-    counts, mask, place = np.zeros(rows, np.int64), np.ones(len(values), bool), 0
-    for row in range(rows):
-        if place >= len(values) or values[place] < 0:
-            raise InputError("the polygons do not have the size that their section declares.")
-        mask[place] = False
-        counts[row] = values[place]
+    starts, place = list[int](), 0
+    while len(starts) < rows and 0 <= place < len(values) and values[place] >= 0:
+        starts.append(place)
         place += int(values[place]) + 1
-    if place != len(values):
+    if place != len(values) or len(starts) < rows:
         raise InputError("the polygons do not have the size that their section declares.")
-    return counts, values[mask]
+    return values[starts], np.delete(values, starts)
 
 
 def _fields(source: _Source, words: list[str], data: _PolyData) -> None:
     for _ in range(_count(words, 2)):
         head = source.words()
-        while head[:1] == ["METADATA"]:
-            _skip_metadata(source)
-            head = source.words()
         columns, rows = _count(head, 1), _count(head, 2)
         values = source.numbers(columns * rows, _word(head, 3))
         _keep(data, _word(head, 0), values, columns)
@@ -304,28 +280,22 @@ def assemble_contents(
     InputError
         When an array has another number of rows.
     """
-    attributes = dict(arrays)
-    for name, values in attributes.items():
-        if len(values) != len(points):
-            raise InputError(f"{name!r} has {len(values)} values, but there are {len(points)} points.")
-    chosen = next((name for name in (normals, "Normals") if name in attributes), None)
-    stored = None if chosen is None or attributes[chosen].shape[1:] != (3,) else attributes.pop(chosen)
-    directions, more = (None, ()) if stored is None else decoded_normals(stored)
+    columns = dict(arrays)
+    if normals in columns and columns[normals].shape[1:] == (3,):
+        columns["normals"] = columns.pop(normals)
     # VTK displays an array of bytes as colours.
-    colors = next((name for name, one in attributes.items() if one.dtype == np.uint8 and _is_color(one)), None)
-    if colors is not None:
-        attributes = {"colors": attributes.pop(colors), **attributes}
-    return Contents(
-        points.astype(np.float64),
-        directions,
-        faces,
-        attributes,
-        (*unread, *more),
+    shown = (
+        name for name, one in columns.items() if one.dtype == np.uint8 and one.ndim == 2 and one.shape[1] in (3, 4)
     )
+    if (name := next(shown, None)) is not None:
+        columns = {"colors": columns.pop(name), **columns}
+    found = from_columns(columns, faces, points)
+    return replace(found, unread=(*unread, *found.unread))
 
 
-def _is_color(values: Values) -> bool:
-    return values.ndim == 2 and values.shape[1] in (3, 4)
+def text_numbers(words: list[str], dtype: np.dtype[Any]) -> Values:
+    """Return the words as an array of shape (len(words),): integers exactly, all others as float64."""
+    return np.array([int(word) for word in words], dtype) if dtype.kind in "iu" else parse_numbers(words)
 
 
 def triangulate_cells(counts: Int, corners: Int, strips: bool) -> Int:

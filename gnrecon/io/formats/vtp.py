@@ -21,8 +21,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Int, Values
 from gnrecon.io.contents import Contents, concatenated, no_faces
-from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, triangulate_cells
-from gnrecon.io.parse import parse_numbers
+from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, text_numbers, triangulate_cells
 from gnrecon.runtime.errors import InputError
 
 
@@ -114,8 +113,7 @@ def _values(array: ElementTree.Element, file: _File) -> Values:
     dtype = np.dtype(kind.lower())
     form = array.get("format", "ascii")
     if form == "ascii":
-        words = (array.text or "").split()
-        values: Values = np.array([int(word) for word in words], dtype) if dtype.kind in "iu" else parse_numbers(words)
+        values = text_numbers((array.text or "").split(), dtype)
     else:
         values = np.frombuffer(_bytes(array, form, file), np.dtype(file.order + dtype.str[1:])).astype(dtype)
     columns = _whole(array.get("NumberOfComponents", "1"))
@@ -123,12 +121,30 @@ def _values(array: ElementTree.Element, file: _File) -> Values:
 
 
 def _bytes(array: ElementTree.Element, form: str, file: _File) -> bytes:
+    """The bytes of an array; in base64, the header of compressed data is encoded separately."""
+    if form not in ("appended", "binary"):
+        raise InputError(f"the format {form[:20]!r} of an array is unknown.")
     if form == "appended":
         block = file.appended[_whole(array.get("offset")) :]
-        return _from_raw(block, file) if file.raw else _from_base64(block.lstrip(), file)
-    if form != "binary":
-        raise InputError(f"the format {form[:20]!r} of an array is unknown.")
-    return _from_base64("".join((array.text or "").split()).encode("ascii", "replace"), file)
+    else:
+        block = "".join((array.text or "").split()).encode("ascii", "replace")
+    raw, width = form == "appended" and file.raw, file.header.itemsize
+    block = block if raw else block.lstrip()
+
+    def first(size: int, after: int = 0) -> bytes:
+        return block[after : after + size] if raw else _decoded(block[_encoded_size(after) :], size)
+
+    count = _require_plausible(_header(first(width), file, 1)[0], block)
+    if file.decompress is None:
+        data = first(width + count)[width:]
+        if len(data) < count:
+            raise InputError(f"an array declares {count} bytes, but {len(data)} follow.")
+        return data
+    # The number of blocks, the size of one, that of the last one, and what each takes when it is compressed.
+    length = (3 + count) * width
+    ends = np.cumsum([0, *_header(first(length), file, 3 + count)[3:]], dtype=np.int64).tolist()
+    packed = first(_require_plausible(ends[-1], block), length)
+    return b"".join(file.decompress(packed[start:end]) for start, end in itertools.pairwise(ends))
 
 
 def _header(data: bytes, file: _File, count: int) -> list[int]:
@@ -136,28 +152,6 @@ def _header(data: bytes, file: _File, count: int) -> list[int]:
         raise InputError("the file ends within the header of an array.")
     found: list[int] = np.frombuffer(data, file.header, count).tolist()
     return found
-
-
-def _from_raw(data: bytes, file: _File) -> bytes:
-    if file.decompress is None:
-        size = _header(data, file, 1)[0]
-        return _exactly(data[file.header.itemsize :], size)
-    blocks = _header(data, file, 1)[0]
-    sizes = _header(data, file, 3 + _require_plausible(blocks, data))[3:]
-    return _decompressed(data[(3 + blocks) * file.header.itemsize :], sizes, file.decompress)
-
-
-def _from_base64(text: bytes, file: _File) -> bytes:
-    """The bytes of an array in base64, where the header of compressed data is encoded separately."""
-    width = file.header.itemsize
-    if file.decompress is None:
-        size = _header(_decoded(text, width), file, 1)[0]
-        return _exactly(_decoded(text, width + _require_plausible(size, text))[width:], size)
-    blocks = _require_plausible(_header(_decoded(text, width), file, 1)[0], text)
-    length = (3 + blocks) * width
-    sizes = _header(_decoded(text, length), file, 3 + blocks)[3:]
-    packed = _decoded(text[_encoded_size(length) :], _require_plausible(sum(sizes), text))
-    return _decompressed(packed, sizes, file.decompress)
 
 
 def _encoded_size(size: int) -> int:
@@ -175,14 +169,3 @@ def _require_plausible(count: int, data: bytes) -> int:
     if count > len(data):
         raise InputError("an array declares more than the file holds.")
     return count
-
-
-def _exactly(data: bytes, size: int) -> bytes:
-    if len(data) < size:
-        raise InputError(f"an array declares {size} bytes, but {len(data)} follow.")
-    return data[:size]
-
-
-def _decompressed(data: bytes, sizes: list[int], decompress: Callable[[bytes], bytes]) -> bytes:
-    ends = np.cumsum([0, *sizes], dtype=np.int64).tolist()
-    return b"".join(decompress(data[start:end]) for start, end in itertools.pairwise(ends))
