@@ -21,7 +21,7 @@ class Agreement:
     Parameters
     ----------
     opposing : share of the pairs whose normals oppose each other
-    conflicting : the same of those where the neighbour does not lie behind the point
+    conflicting : the same of those where the neighbour lies neither behind the point nor across a gap from it
     mostly : share of the points that most neighbours oppose
     depth_variation : standard deviation, over the mean, of the depths of the opposing neighbours of a point below its
         plane, in the median; infinite where hardly any neighbours oppose each other
@@ -57,6 +57,7 @@ def agreement_of(
     queries: int = 10_000,
     opposing_cosine: float = -0.5,
     least_height: float = 1e-6,
+    gap_height: float = 0.5,
 ) -> Agreement:
     """Return how the normals of neighbours agree.
 
@@ -67,6 +68,8 @@ def agreement_of(
     queries : random points at which it is measured
     opposing_cosine : of the angle beyond which normals oppose each other
     least_height : of a neighbour below the plane of a point, over their distance, to lie behind it; above rounding
+    gap_height : of a neighbour above that plane, over their distance, to lie across a gap, as on the other wall of a
+        slot; on one sheet noise is less than half of the spacing
     """
     from scipy.spatial import cKDTree
 
@@ -76,7 +79,7 @@ def agreement_of(
     distances, near = distances[:, 1:], near[:, 1:]
     opposing = np.einsum("gki,gi->gk", normals[near], normals[some]) < opposing_cosine
     heights = np.einsum("gki,gi->gk", points[near] - points[some, None], normals[some])
-    conflicting = opposing & (heights >= -least_height * distances)
+    conflicting = opposing & (heights >= -least_height * distances) & (heights <= gap_height * distances)
     return Agreement(
         float(opposing.mean()),
         float(conflicting.mean()),
