@@ -14,7 +14,15 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gnrecon.batch.executors import cuda_devices, fitting_jobs, run_locally, run_on_cluster
-from gnrecon.batch.job import JobOutcome, Status, all_records, records_folder, running_folder, state_folder
+from gnrecon.batch.job import (
+    SUMMARY_FILES,
+    JobOutcome,
+    Status,
+    all_records,
+    records_folder,
+    running_folder,
+    state_folder,
+)
 from gnrecon.batch.plan import plan
 from gnrecon.batch.progress_board import ProgressBoard
 from gnrecon.batch.request import Request
@@ -46,6 +54,7 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
         When the limit of the shell leaves less than `least_addresses_mb`.
     """
     jobs = plan(request)
+    _require_own_summary(request)
     require_room_for_libraries(least_addresses_mb, in_new_process=True)
     devices = cuda_devices(jobs)
     threads = max(int(job.options["threads"]) for job in jobs)
@@ -84,6 +93,18 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
         print(f"gnrecon: Interrupted; {written} lists what was done until then.", file=sys.stderr)
         return ExitCode.INTERRUPTED
     return ExitCode.BATCH if summary.count(Status.FAILED) else ExitCode.OK
+
+
+def _require_own_summary(request: Request) -> None:
+    """Refuse to replace a file with the name of a summary in a folder in which no batch has run."""
+    if request.overwrite or state_folder(request.output).exists():
+        return
+    for name in SUMMARY_FILES:
+        if (path := request.output / name).exists():
+            raise OutputError(
+                f"{path} exists already and was not written by a batch, but the summary would replace it; choose "
+                "another folder or add --overwrite."
+            )
 
 
 def _reserved_space(output: Path, scans: int, *, least_bytes: int = 1 << 18, scan_bytes: int = 1 << 15) -> Path:

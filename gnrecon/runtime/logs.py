@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gnrecon.runtime.errors import OutputError, UsageError
+from gnrecon.runtime.files import same_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -104,7 +105,7 @@ def unprinted_log(name: str) -> Iterator[None]:
 
 
 def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
-    if any(file.resolve() == other.resolve() for other in others):
+    if any(same_file(file, other) for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
     try:
         handler = _FileHandler(file, encoding="utf-8", errors="backslashreplace")
