@@ -86,7 +86,7 @@ class Options(OptionTable):
         for name in ("edge_length", "max_error", "remesh", "simplify"):
             value = getattr(self, name)
             if value is not None and not least_length <= value <= most_length:
-                raise UsageError(f"{name} must lie between {least_length:g} and {most_length:g}, not {value:g}.")
+                raise UsageError(f"{name} must lie between {least_length:g} and {most_length:g}, not {_shortened(value)}.")
 
     def _require_valid_values(self) -> None:
         self._require_bounded()

@@ -32,10 +32,17 @@ def require_field_types(record: Any) -> None:
             continue
         found = next((plain for kind in kinds if (plain := _plain(kind, value)) is not None), None)
         if found is None:
-            text = repr(value)
-            shown = text if len(text) <= 60 and "\n" not in text else f"a value of type {type(value).__name__}"
-            raise UsageError(f"{option.name} must be {described(kinds)}, not {shown}.")
+            raise UsageError(f"{option.name} must be {described(kinds)}, not {shown(value)}.")
         object.__setattr__(record, option.name, found)
+
+
+def shown(value: object, *, most_characters: int = 60) -> str:
+    """Return a value as a message shows it: short and in one line, or else by its type."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no whole number of thousands of digits
+        text = ""
+    return text if 0 < len(text) <= most_characters and "\n" not in text else f"a value of type {type(value).__name__}"
 
 
 @cache
