@@ -45,6 +45,31 @@ def shown(value: object, *, most_characters: int = 60) -> str:
     return text if 0 < len(text) <= most_characters and "\n" not in text else f"a value of type {type(value).__name__}"
 
 
+def require_at_most(record: object, limits: Mapping[str, int]) -> None:
+    """Refuse fields of a record that exceed their limits; None exceeds none.
+
+    Raises
+    ------
+    UsageError
+        Naming the field.
+    """
+    for name, limit in limits.items():
+        if (value := getattr(record, name)) is not None and value > limit:
+            raise UsageError(f"{name} must be at most {limit:,}, not {shortened(value)}.")
+
+
+def most_threads(*, least: int = 256) -> int:
+    """Return a limit for threads: `least`, or the processors, where there are more. Thousands end the process."""
+    return max(least, os.cpu_count() or 1)
+
+
+def shortened(value: float, *, most_digits: int = 30) -> str:
+    """Return a number as text; one of more digits than anybody reads, by their number."""
+    # Python refuses to print whole numbers of thousands of digits.
+    large = isinstance(value, int) and abs(value) >= 10**most_digits
+    return f"a number of more than {most_digits} digits" if large else f"{value}"
+
+
 @cache
 def _field_types(record: Any, name: str) -> tuple[tuple[Any, ...], bool]:
     """The types of a field besides None, and whether it may be None."""
