@@ -53,8 +53,8 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
     MemoryLimitError
         When the limit of the shell leaves less than `least_addresses_mb`.
     """
-    jobs = plan(request)
     _require_own_summary(request)
+    jobs = plan(request)
     require_room_for_libraries(least_addresses_mb, in_new_process=True)
     devices = cuda_devices(jobs)
     threads = max(int(job.options["threads"]) for job in jobs)
@@ -96,11 +96,13 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
 
 
 def _require_own_summary(request: Request) -> None:
-    """Refuse to replace a file with the name of a summary in a folder in which no batch has run."""
-    if request.overwrite or state_folder(request.output).exists():
-        return
+    """Refuse a folder whose name the system does not take, and to replace a summary's files where no batch has run."""
+    try:
+        new = not state_folder(request.output).is_dir()
+    except OSError as error:
+        raise OutputError(f"The folder {request.output} cannot be created: {error.strerror}.") from error
     for name in SUMMARY_FILES:
-        if (path := request.output / name).exists():
+        if new and not request.overwrite and (path := request.output / name).is_file():
             raise OutputError(
                 f"{path} exists already and was not written by a batch, but the summary would replace it; choose "
                 "another folder or add --overwrite."

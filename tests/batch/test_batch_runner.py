@@ -297,6 +297,8 @@ def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
         run_batch(Request((str(tmp_path),), out, settings=Settings({"resolution": 3})))
     with pytest.raises(OutputError, match="cannot be created"):
         run_batch(Request((str(tmp_path),), tmp_path / "README.md" / "meshes"))
+    with pytest.raises(OutputError, match=r"cannot be created: File name too long\.$"):
+        run_batch(Request((str(tmp_path),), tmp_path / ("n" * 300)))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "a.obj"]
 
 

@@ -110,9 +110,11 @@ def test_verbose_shows_the_log_and_tells_remarks_once(
 
 
 def test_a_log_that_cannot_be_written_is_refused(scan: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    before, link = scan.read_bytes(), tmp_path / "link.log"
+    before, link, fifo = scan.read_bytes(), tmp_path / "link.log", tmp_path / "fifo.log"
     os.link(scan, link)
+    os.mkfifo(fifo)
     for log, code, words in (
+        (fifo, ExitCode.OUTPUT, "cannot be written: No such device or address"),
         (link, ExitCode.USAGE, "is named twice"),
         (scan, ExitCode.USAGE, "is named twice"),
         (tmp_path / "mesh.obj", ExitCode.USAGE, "is named twice"),
@@ -121,7 +123,7 @@ def test_a_log_that_cannot_be_written_is_refused(scan: Path, tmp_path: Path, cap
         assert run(scan, "-o", tmp_path / "mesh.obj", "--log", log, *WORDS) == code
         assert words in capfd.readouterr().err
     assert scan.read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.log", "ring.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo.log", "link.log", "ring.ply"]
 
 
 def test_a_cancelled_run_is_logged(
