@@ -1,10 +1,10 @@
 """Runs damaged and odd scans through whole reconstructions, each in a process of its own, and counts how they end.
 
 Foreseen are a verified mesh and one sentence with an exit code of its own. Exit code 1, a signal, a run that takes too
-long or too much memory, a traceback, a warning of a library, a file that a failed run leaves, and a mesh that is said to
-be closed and that trimesh does not find watertight are faults: they are listed, and their scans are kept with
-``--keep``. A fault is made again by ``--first NUMBER --count 1`` with the same seed; Ctrl-C reports the runs so far. One
-run in ten is killed at a random moment; its mesh must be whole or absent.
+long or too much memory, a traceback, a warning of a library, a file that a failed run leaves, and a mesh that is not
+watertight though its report calls it closed are faults: they are listed, and their scans are kept with ``--keep``. A
+fault is made again by ``--first NUMBER --count 1`` with the same seed; Ctrl-C reports the runs so far. One run in ten
+is killed at a random moment; its mesh must be whole or absent.
 """
 
 from __future__ import annotations
