@@ -24,7 +24,7 @@ import tomli_w
 from gnrecon.option_table import option_rows
 from gnrecon.runtime.errors import InputError, UsageError, suggestion
 from gnrecon.runtime.files import printable
-from gnrecon.runtime.typed_values import described
+from gnrecon.runtime.typed_values import described, shown
 from gnrecon.version import __version__
 
 
@@ -115,8 +115,8 @@ def _read(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"The configuration {path} cannot be read: {error.strerror or error}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"The configuration {path} is not TOML: {error}.") from error
+    except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, or a number of thousands of digits
+        raise InputError(f"The configuration {path} is not TOML: {str(error).partition(';')[0]}.") from error
 
 
 def _split(word: str) -> tuple[str, Any]:
@@ -136,10 +136,11 @@ def _checked(table: Mapping[str, Any], where: str, folder: Path) -> dict[str, An
             raise UsageError(f"{where}there is no option {key!r}{suggestion(name, known)}.")
         if name in found:
             raise UsageError(f"{where}{name} is there twice, with a hyphen and without.")
-        if name in ("timeout", "memory"):
-            found[name] = str(value)
+        if name in ("timeout", "memory", "reference"):
+            text = value if isinstance(value, str) else shown(value)
+            found[name] = folder / text if name == "reference" else text
         else:
-            found[name] = folder / str(value) if name == "reference" else typed(name, value, where)
+            found[name] = typed(name, value, where)
     return found
 
 
@@ -164,7 +165,7 @@ def typed(name: str, value: Any, where: str = "") -> Any:
         found = _converted(kind, value)
         if found is not None:
             return found
-    raise UsageError(f"{where}{name} must be {described(kinds)}, not {value!r}.")
+    raise UsageError(f"{where}{name} must be {described(kinds)}, not {shown(value)}.")
 
 
 def _converted(kind: Any, value: Any) -> Any:
@@ -196,5 +197,5 @@ def _read_value(text: str) -> Any:
     """The TOML value that a text stands for; the text itself where it stands for none."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, KeyError, RecursionError):
+    except (ValueError, KeyError, RecursionError):  # no TOML, or a number of thousands of digits
         return text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -22,7 +21,7 @@ from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.io import parse_columns
 from gnrecon.option_table import OptionTable, option_documentation, option_rows
 from gnrecon.runtime.errors import UsageError, suggestion
-from gnrecon.runtime.typed_values import require_field_types
+from gnrecon.runtime.typed_values import most_threads, require_at_most, require_field_types, shortened
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,6 @@ class Options(OptionTable):
     def _require_bounded(
         self,
         *,
-        most_threads: int = 256,
         most_cells: int = 16_384,
         most_count: int = 2**48,
         most_seed: int = 2**63 - 1,
@@ -71,7 +69,6 @@ class Options(OptionTable):
 
         Parameters
         ----------
-        most_threads : or the processors, where there are more; thousands of stacks end the process
         most_cells : along a side; coordinates of the nodes are packed into 64 bits
         most_count : of points, faces and steps
         most_seed : what all generators take
@@ -79,14 +76,13 @@ class Options(OptionTable):
         """
         counts = ("read_points", "max_points", "faces", "steps")
         most = dict.fromkeys(counts, most_count) | {"resolution": most_cells, "seed": most_seed}
-        most["threads"] = max(most_threads, os.cpu_count() or 1)
-        for name, limit in most.items():
-            if (value := getattr(self, name)) is not None and value > limit:
-                raise UsageError(f"{name} must be at most {limit:,}, not {_shortened(value)}.")
+        require_at_most(self, most | {"threads": most_threads()})
         for name in ("edge_length", "max_error", "remesh", "simplify"):
             value = getattr(self, name)
             if value is not None and not least_length <= value <= most_length:
-                raise UsageError(f"{name} must lie between {least_length:g} and {most_length:g}, not {value:g}.")
+                raise UsageError(
+                    f"{name} must lie between {least_length:g} and {most_length:g}, not {shortened(value)}."
+                )
 
     def _require_valid_values(self) -> None:
         self._require_bounded()
@@ -259,13 +255,6 @@ class Options(OptionTable):
 
 
 Options.__doc__ = f"{Options.__doc__}\n    {option_documentation()}"
-
-
-def _shortened(value: float, *, most_digits: int = 30) -> str:
-    """A number as text; one of more digits than anybody reads, by their number."""
-    # Python refuses to print whole numbers of thousands of digits.
-    large = isinstance(value, int) and abs(value) >= 10**most_digits
-    return f"a number of more than {most_digits} digits" if large else f"{value}"
 
 
 def cells_for_sheet(longest: float, thickness: float, *, cells_through: float = 2.0) -> int:

@@ -84,7 +84,7 @@ def shaped(
     Raises
     ------
     UsageError
-        When the crop misses the field's box, or the shape leaves nothing of the solid.
+        When the crop misses the field's box, the shape leaves nothing of the solid, or a length is out of reach.
     MeshError
         When there is no zero level, or no sound mesh can be made of it.
     """
@@ -94,6 +94,7 @@ def shaped(
     if shape.crop is not None:
         # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
         region = _around(shape.crop, max(map(abs, shape.levels)) + _margin(cell), sdf.bounds)
+    replace(options, edge_length=None).require_reachable(region)  # the cells above have been checked
     data, remarks = _data(sdf, region)
     # A mesh that only serves to measure offsets from is not refined.
     plain = options if 0.0 in shape.levels else replace(options, remesh=None, adaptive=False, simplify=None, faces=None)

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from gnrecon.io.merge import input_files
+from gnrecon.io.named_files import input_files
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import write_text
 from gnrecon.version import __version__
@@ -29,6 +29,9 @@ FILE_ENDINGS = {
     "config": ".config.toml",
 }
 """Kinds of output files, and what each adds to the name of a scan's outputs."""
+
+SUMMARY_FILES = ("summary.json", "summary.csv", "summary.html")
+"""Files of the summary in a batch's output folder: of all figures, of a table, and to look at."""
 
 MESH_FIGURES = ("vertices", "faces", "components", "genus", "closed", "area", "volume", "invented_area_share")
 """Entries of a report's ``mesh`` that a table of many runs shows."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gnrecon.batch.job import Job, Limits
+from gnrecon.batch.job import SUMMARY_FILES, Job, Limits
 from gnrecon.batch.request import Request
 from gnrecon.batch.scan_search import FoundScan, ScanSearch, find_scans, output_names, reference_of
 from gnrecon.config import settings_text
@@ -66,11 +67,29 @@ def _job(request: Request, found: FoundScan, name: str, paired: Path | None) -> 
 
 
 def _require_distinct_from_inputs(jobs: Sequence[Job], others: Sequence[Path]) -> None:
-    """Refuse outputs that are inputs: scans, files that scans name, references, or the `others`."""
+    """Refuse outputs, the summary included, that are inputs: scans, files that scans name, references, or the `others`.
+
+    A scan's output must not have the name of a file of the summary, either.
+    """
     read = [path for job in jobs for path in (job.scan, job.reference) if path is not None]
-    # Resolved, because links and relative paths may lead to the same file.
-    inputs = {path.resolve() for path in [*all_input_files(read), *others]}
+    inputs = {identity for path in [*all_input_files(read), *others] for identity in _identities(path)}
+    summary = {name: jobs[0].output / name for name in SUMMARY_FILES} if jobs else {}
     for job in jobs:
         for name in job.file_names().values():
-            if (job.output / name).resolve() in inputs:
+            if name.casefold() in summary:
+                raise UsageError(f"{name} would be an output of {job.scan} and the batch's summary; choose --name.")
+            if inputs & _identities(job.output / name):
                 raise UsageError(f"{job.output / name} is an input of the batch; choose another folder for the meshes.")
+    for path in summary.values():
+        if inputs & _identities(path):
+            raise UsageError(f"{path} is an input of the batch, whose summary has that name; choose another folder.")
+
+
+def _identities(path: Path) -> set[str | tuple[int, int]]:
+    """What tells one file from others: links, relative paths and letters of either case may lead to the same one."""
+    name = os.path.realpath(path)
+    try:
+        status = path.stat()
+    except OSError:  # it does not exist yet
+        return {name}
+    return {name, (status.st_dev, status.st_ino)}

@@ -14,7 +14,15 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gnrecon.batch.executors import cuda_devices, fitting_jobs, run_locally, run_on_cluster
-from gnrecon.batch.job import JobOutcome, Status, all_records, records_folder, running_folder, state_folder
+from gnrecon.batch.job import (
+    SUMMARY_FILES,
+    JobOutcome,
+    Status,
+    all_records,
+    records_folder,
+    running_folder,
+    state_folder,
+)
 from gnrecon.batch.plan import plan
 from gnrecon.batch.progress_board import ProgressBoard
 from gnrecon.batch.request import Request
@@ -45,6 +53,7 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
     MemoryLimitError
         When the limit of the shell leaves less than `least_addresses_mb`.
     """
+    _require_own_summary(request)
     jobs = plan(request)
     require_room_for_libraries(least_addresses_mb, in_new_process=True)
     devices = cuda_devices(jobs)
@@ -84,6 +93,20 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
         print(f"gnrecon: Interrupted; {written} lists what was done until then.", file=sys.stderr)
         return ExitCode.INTERRUPTED
     return ExitCode.BATCH if summary.count(Status.FAILED) else ExitCode.OK
+
+
+def _require_own_summary(request: Request) -> None:
+    """Refuse a folder whose name the system does not take, and to replace a summary's files where no batch has run."""
+    try:
+        new = not state_folder(request.output).is_dir()
+    except OSError as error:
+        raise OutputError(f"The folder {request.output} cannot be created: {error.strerror}.") from error
+    for name in SUMMARY_FILES:
+        if new and not request.overwrite and (path := request.output / name).is_file():
+            raise OutputError(
+                f"{path} exists already and was not written by a batch, but the summary would replace it; choose "
+                "another folder or add --overwrite."
+            )
 
 
 def _reserved_space(output: Path, scans: int, *, least_bytes: int = 1 << 18, scan_bytes: int = 1 << 15) -> Path:

@@ -20,7 +20,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from gnrecon.batch.job import FILE_ENDINGS, MESH_FIGURES, Cause, JobOutcome, Status
+from gnrecon.batch.job import FILE_ENDINGS, MESH_FIGURES, SUMMARY_FILES, Cause, JobOutcome, Status
 from gnrecon.report.html import scales as numbers
 from gnrecon.report.html import style_text
 from gnrecon.runtime.files import write_text
@@ -99,10 +99,10 @@ def write_summary(summary: BatchSummary, folder: Path) -> Path:
     """
     # JSON has no NaN; a value that is not finite would make the file unreadable for other programs.
     text = json.dumps(summary.as_dict(), indent=2, allow_nan=False) + "\n"
-    write_text(folder / "summary.json", text, overwrite=True)
-    write_text(folder / "summary.csv", summary_csv(summary.outcomes), overwrite=True)
-    write_text(folder / "summary.html", summary_html(summary.as_dict(), folder), overwrite=True)
-    return folder / "summary.json"
+    texts = (text, summary_csv(summary.outcomes), summary_html(summary.as_dict(), folder))
+    for name, contents in zip(SUMMARY_FILES, texts, strict=True):
+        write_text(folder / name, contents, overwrite=True)
+    return folder / SUMMARY_FILES[0]
 
 
 def summary_csv(outcomes: Sequence[JobOutcome]) -> str:

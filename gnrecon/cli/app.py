@@ -32,7 +32,7 @@ from gnrecon.cli.reconstruct_command import reconstruct_command
 from gnrecon.cli.streams import lenient_streams
 from gnrecon.cli.supervision import continue_in_child
 from gnrecon.runtime.errors import ExitCode, failure
-from gnrecon.runtime.interrupts import polite_ends
+from gnrecon.runtime.interrupts import polite_ends, reraised
 from gnrecon.runtime.memory_budget import is_capped, require_room_for_libraries
 from gnrecon.version import __version__
 
@@ -111,7 +111,9 @@ def _guarded(words: list[str], command: str, *, least_mb: float = 1000.0, least_
     try:
         light = not words or words[0] in LIGHT_COMMANDS
         require_room_for_libraries(least_light_mb if light else least_mb)
-        result: Any = command_line_app()(words, prog_name="gnrecon", standalone_mode=False, obj=command)
+        # After an interrupt, a failure is its consequence: the best field so far may have no surface yet.
+        with reraised():
+            result: Any = command_line_app()(words, prog_name="gnrecon", standalone_mode=False, obj=command)
         # Newer versions of typer turn Ctrl-C into this value silently; `run` and `run_batch` raise SystemExit.
         if result == ExitCode.INTERRUPTED:
             raise KeyboardInterrupt

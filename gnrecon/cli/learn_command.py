@@ -40,7 +40,7 @@ BudgetOption = Annotated[
 StepsOption = Annotated[
     int | None,
     valued_option(
-        help="Limit of steps; without a budget, the same steps and seed give the same mesh.",
+        help="Limit of steps; without a budget, the same steps, seed and threads give the same mesh.",
         panel=Panel.FIT,
         limits="at least 1",
         default="none",

@@ -28,6 +28,7 @@ from gnrecon.report.report import plain, versions
 from gnrecon.runtime.compute_limits import limited
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
+from gnrecon.runtime.typed_values import most_threads, require_at_most
 from gnrecon.shape_learning import (
     OPTIMISERS,
     PROBLEMS,
@@ -57,6 +58,11 @@ class LearnOptions:
 
     def __post_init__(self) -> None:
         """Refuse values out of range, before any work."""
+        # A thousand units more in each layer are some millions of parameters.
+        most = {"steps": 2**48, "seed": 2**63 - 1, "resolution": 16_384, "wider": 1000, "threads": most_threads()}
+        require_at_most(self, most)
+        if self.seed < 0:
+            raise UsageError(f"The seed must not be negative, not {self.seed}.")
         if self.optimiser not in OPTIMISERS:
             raise UsageError(f"The optimiser is {self.optimiser!r}, but must be one of {', '.join(OPTIMISERS)}.")
         if self.budget is not None and not self.budget > 0:

@@ -78,8 +78,9 @@ class HandleParameters:
     fairing_lengths: float = 0.3
     # Most times that loops are searched: those cut at once hide others.
     rounds: int = 20
-    # Loops that are cut at once: few enough for their signatures of 64 bits to be independent.
-    loops_at_once: int = 24
+    # Loops that are cut at once: of so many signatures of 64 bits, hardly one depends on the others by chance, and a
+    # loop of which that is so is cut in the next round.
+    loops_at_once: int = 48
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Repairs a mesh that is not quite a solid, and removes components that no scanned point supports.
 
-A sound mesh is returned unchanged. For any other, three attempts follow, from the mildest to the strongest, and the
-first sound result is taken:
+In a sound mesh, only vertices that rounding has brought to one place are joined or moved apart. For any other, three
+attempts follow, from the mildest to the strongest, and the first sound result is taken:
 
 1. collapsed, repeated and fin-like faces are dropped, vertices where several fans of faces touch are split, and an
    inside-out mesh is reversed;
@@ -28,6 +28,7 @@ from gnrecon.export.boolean import (
 from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.mesh_statistics import Edges, concatenated, corner_fans, face_components, split_vertices, submesh
 from gnrecon.export.metrics import nearest_on_surface
+from gnrecon.export.remeshing.edge_operators import collapse_coincident
 from gnrecon.export.verify import require_sound, verify
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
@@ -36,6 +37,9 @@ from gnrecon.runtime.errors import MeshError, UsageError
 
 def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
     """Return a sound mesh and one sentence for each change (none if it was sound).
+
+    No two vertices of a sound mesh stay at one place where that can be helped: a format that knows vertices by their
+    place, such as STL, would join them.
 
     Normals are those of the nearest vertex of the given mesh.
 
@@ -46,7 +50,7 @@ def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
     """
     failure = _soundness_error(mesh)
     if failure is None:
-        return mesh, []
+        return _without_coincident(mesh), []
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
         raise MeshError(failure)
     tidy, actions = _clean_faces(mesh)
@@ -138,6 +142,15 @@ def _separate_coincident(mesh: Mesh, *, share: float = ExportParameters.repair.s
     return mesh.with_vertices(
         np.where(shared[:, None], mesh.vertices + share * (middle - mesh.vertices), mesh.vertices)
     )
+
+
+def _without_coincident(mesh: Mesh) -> Mesh:
+    """A sound mesh without vertices at one place; unchanged where it has none, or would not stay sound."""
+    if len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices):
+        return mesh
+    joined = collapse_coincident(mesh)
+    separate = _separate_coincident(submesh(joined, np.ones(len(joined.faces), dtype=bool)))
+    return separate if _soundness_error(separate) is None else mesh
 
 
 def _sew(mesh: Mesh) -> tuple[Mesh | None, list[str]]:

@@ -13,24 +13,26 @@ from gnrecon.runtime.errors import UsageError
 METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 
 
-def parse_length(text: str, units: str | None) -> float:
+def parse_length(text: str, units: str | None, *, least: float = 1e-30, most: float = 1e30) -> float:
     """Return a length in the file's unit.
 
     Parameters
     ----------
     text : such as ``2mm``, ``-0.5`` or ``1e-3 m``
     units : the file's unit, a name of `METRES`, or None where it is unknown
+    least, most : magnitudes of lengths other than zero; squares and cubes of others under- or overflow
 
     Raises
     ------
     UsageError
-        When `text` is not a length, a unit is not supported, or the file's unit is needed but unknown.
+        When `text` is not a length or out of range, a unit is not supported, or the file's unit is needed but unknown.
     """
     if units is not None and units not in METRES:
         raise UsageError(f"The file's unit must be one of {', '.join(METRES)}, not {units!r}.")
     match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z]*)\s*", text, re.IGNORECASE)
     if match is None or not math.isfinite(float(match[1])):
         raise UsageError(f"{text!r} is not a length such as 0.5 or 2mm.")
+    _require_magnitude(text, float(match[1]), least, most)
     suffix = match[2].lower()
     if not suffix:
         return float(match[1])
@@ -41,7 +43,14 @@ def parse_length(text: str, units: str | None) -> float:
     return float(match[1]) * (METRES[suffix] / METRES[units])
 
 
-def parse_reach(text: str, spacing: float, units: str | None) -> float:
+def _require_magnitude(text: str, value: float, least: float, most: float) -> None:
+    if value and not least <= abs(value) <= most:
+        raise UsageError(f"{text!r} is out of range: a length lies between {least:g} and {most:g}.")
+
+
+def parse_reach(
+    text: str, spacing: float, units: str | None, *, least_spacings: float = 1e-30, most_spacings: float = 1e30
+) -> float:
     """Return a positive distance in the file's unit, from a length or a multiple of the points' spacing.
 
     Parameters
@@ -49,13 +58,16 @@ def parse_reach(text: str, spacing: float, units: str | None) -> float:
     text : such as ``2.5``, ``2mm``, or ``3s`` for three spacings
     spacing : of the points, in the file's unit
     units : as of `parse_length`
+    least_spacings, most_spacings : range of multiples
 
     Raises
     ------
     UsageError
-        When it is not a positive length, or cannot be converted.
+        When it is not a positive length, out of range, or cannot be converted.
     """
     match = re.fullmatch(r"\s*\+?((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*s\s*", text, re.IGNORECASE)
+    if match:
+        _require_magnitude(text, float(match[1]), least_spacings, most_spacings)
     reach = float(match[1]) * spacing if match else parse_length(text, units)
     if not 0 < reach < math.inf:
         raise UsageError(f"{text!r} is not a positive distance such as 2.5, 2mm or 3s (spacings).")

@@ -35,7 +35,9 @@ def smooth_points(
 
     tree = cKDTree(points)
     least = parameters.least_neighbours
-    expected = np.pi * (width / neighbour_spacing(points)) ** 2 if len(points) > least else 1.0
+    # No more than all points, before it is squared.
+    spacings = min(width / neighbour_spacing(points), len(points)) if len(points) > least else 1.0
+    expected = np.pi * spacings**2
     count = int(min(parameters.neighbour_surplus * expected + least, parameters.most_neighbours, len(points)))
     moved, turned = points.copy(), normals.copy()
     step = max(1, parameters.chunk_values // (6 * count))  # a quadric has 6 terms

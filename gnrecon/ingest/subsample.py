@@ -190,7 +190,7 @@ def _apart(cloud: PointCloud, spacing: float, method: str, seed: int) -> PointCl
         centred = cloud.points - cloud.points.mean(axis=0)
         return cloud.select(np.sort(BY_DISTANCE[method](centred, spacing, np.random.default_rng(seed))))
     # On a surface, the number of points falls with the square of their distance.
-    share = min(1.0, (mean_spacing(cloud.points) / spacing) ** 2)
+    share = min(1.0, mean_spacing(cloud.points) / spacing) ** 2
     return _chosen(cloud, max(1, round(share * len(cloud))), method, seed)
 
 

@@ -5,7 +5,8 @@ from gnrecon.io.format_registry import CLOUD_WRITERS, READERS, WRITERS, readable
 from gnrecon.io.interop import as_cloud, as_mesh, as_shape, to_open3d, to_pymeshlab, to_trimesh
 from gnrecon.io.interop_grids import to_meshio, to_pyvista
 from gnrecon.io.io_parameters import IOParameters
-from gnrecon.io.merge import Reading, all_input_files, cropped, read_scans
+from gnrecon.io.merge import Reading, cropped, read_scans
+from gnrecon.io.named_files import all_input_files
 from gnrecon.io.read import extension_of, read_any, read_cloud, read_mesh, read_reference
 from gnrecon.io.write import (
     check_writable,

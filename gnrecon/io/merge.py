@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
@@ -16,10 +14,8 @@ from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.io.contents import without_faces
 from gnrecon.io.formats.las import drop_unused_attributes
-from gnrecon.io.formats.stanford_conf import parse_conf
 from gnrecon.io.io_parameters import IOParameters
-from gnrecon.io.parse import read_text, sibling_path
-from gnrecon.io.read import check_file, extension_of, input_errors_for, reader_extension
+from gnrecon.io.read import check_file, input_errors_for, reader_extension
 from gnrecon.io.streaming import VoxelThinning, read_chunks
 from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, UsageError
@@ -226,37 +222,3 @@ def same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[
         if (first := next(earlier, None)) is not None:
             found.append((files[first], name))
     return tuple(found)
-
-
-def input_files(path: Path, format: str | None = None) -> list[Path]:
-    """Return a scan's file and all existing files that it refers to, each once.
-
-    A file that cannot be parsed refers to none; its reader reports what is wrong with it.
-
-    Parameters
-    ----------
-    path : the scan's file
-    format : extension that says how the file is read, such as ``"conf"``; by default its own
-    """
-    extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
-    parsers = {".conf": _named_by_conf, ".gltf": _named_by_gltf}
-    try:
-        names = parsers[extension](path) if extension in parsers else []
-        named = [sibling_path(path.parent, name, "file") for name in names]
-    except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError):
-        named = []
-    return list(dict.fromkeys([path, *(file for file in named if file.is_file())]))
-
-
-def all_input_files(paths: Iterable[Path], format: str | None = None) -> list[Path]:
-    """Return all files that scans are read from, see `input_files`; none of them may be overwritten."""
-    return [file for path in paths for file in input_files(path, format)]
-
-
-def _named_by_conf(path: Path) -> list[str]:
-    return [pose.file for pose in parse_conf(read_text(path))]
-
-
-def _named_by_gltf(path: Path) -> list[str]:
-    uris = [str(buffer["uri"]) for buffer in json.loads(path.read_bytes()).get("buffers", [])]
-    return [unquote(uri) for uri in uris if not uri.startswith("data:")]

@@ -6,6 +6,7 @@ Every message is one sentence for the user: it names what is wrong and what was 
 from __future__ import annotations
 
 import enum
+import errno
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -107,6 +108,8 @@ def failure(error: BaseException) -> tuple[str, ExitCode]:
         return "Interrupted; nothing was written.", ExitCode.INTERRUPTED
     if _lacks_memory(error):
         return f"There is not enough memory. {error}".strip(), ExitCode.MEMORY
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        return f"{error.filename}: {error.strerror}.", ExitCode.USAGE
     # A bug in gnrecon: the user still gets one sentence, and a way to report it.
     name = type(error).__name__
     return f"Unforeseen {name}: {error} Please report it with the output of --debug.", ExitCode.UNFORESEEN

@@ -172,12 +172,13 @@ def require_files(inputs: Sequence[Path], targets: Sequence[Path], overwrite: bo
         if not is_standard_input(path) and not os.path.exists(path):  # noqa: PTH110 - a name too long is no file
             raise InputError(f"There is no file {path}.")
     for index, target in enumerate(targets):
-        if any(_same(target, other) for other in [*inputs, *targets[:index]]):
+        if any(same_file(target, other) for other in [*inputs, *targets[:index]]):
             raise UsageError(f"{target} is named twice; an input or another output is never overwritten.")
         require_writable(target, overwrite)
 
 
-def _same(one: Path, other: Path) -> bool:
+def same_file(one: Path, other: Path) -> bool:
+    """Return whether two paths lead to one file, by links of any kind, or will once it exists."""
     try:
         return one.samefile(other)
     except OSError:  # one does not exist, or its name cannot

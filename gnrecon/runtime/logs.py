@@ -7,6 +7,7 @@ it decides what happens to the records, by Python's `logging`. The command line 
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gnrecon.runtime.errors import OutputError, UsageError
+from gnrecon.runtime.files import same_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -104,9 +106,11 @@ def unprinted_log(name: str) -> Iterator[None]:
 
 
 def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
-    if any(file.resolve() == other.resolve() for other in others):
+    if any(same_file(file, other) for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
     try:
+        if file.is_fifo():
+            os.close(os.open(file, os.O_WRONLY | os.O_NONBLOCK))  # fails where nobody reads, instead of waiting for it
         handler = _FileHandler(file, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error

@@ -32,10 +32,42 @@ def require_field_types(record: Any) -> None:
             continue
         found = next((plain for kind in kinds if (plain := _plain(kind, value)) is not None), None)
         if found is None:
-            text = repr(value)
-            shown = text if len(text) <= 60 and "\n" not in text else f"a value of type {type(value).__name__}"
-            raise UsageError(f"{option.name} must be {described(kinds)}, not {shown}.")
+            raise UsageError(f"{option.name} must be {described(kinds)}, not {shown(value)}.")
         object.__setattr__(record, option.name, found)
+
+
+def shown(value: object, *, most_characters: int = 60) -> str:
+    """Return a value as a message shows it: short and in one line, or else by its type."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no whole number of thousands of digits
+        text = ""
+    return text if 0 < len(text) <= most_characters and "\n" not in text else f"a value of type {type(value).__name__}"
+
+
+def require_at_most(record: object, limits: Mapping[str, int]) -> None:
+    """Refuse fields of a record that exceed their limits; None exceeds none.
+
+    Raises
+    ------
+    UsageError
+        Naming the field.
+    """
+    for name, limit in limits.items():
+        if (value := getattr(record, name)) is not None and value > limit:
+            raise UsageError(f"{name} must be at most {limit:,}, not {shortened(value)}.")
+
+
+def most_threads(*, least: int = 256) -> int:
+    """Return a limit for threads: `least`, or the processors, where there are more. Thousands end the process."""
+    return max(least, os.cpu_count() or 1)
+
+
+def shortened(value: float, *, most_digits: int = 30) -> str:
+    """Return a number as text; one of more digits than anybody reads, by their number."""
+    # Python refuses to print whole numbers of thousands of digits.
+    large = isinstance(value, int) and abs(value) >= 10**most_digits
+    return f"a number of more than {most_digits} digits" if large else f"{value}"
 
 
 @cache

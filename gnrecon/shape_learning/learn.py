@@ -277,7 +277,10 @@ def pretrained(
 
     theta = problem.network.initial(torch.Generator().manual_seed(seed))
     method = GaussNewton(GainRatioDamping(initial_damping=1e-2, metric=identity))
-    return method.run(freeze, theta, StopRule(fit.steps, fit.tolerance, fit.patience, seconds)).theta
+    solution = method.run(freeze, theta, StopRule(fit.steps, fit.tolerance, fit.patience, seconds))
+    if solution.interrupted:  # there is no surface of the problem yet
+        raise KeyboardInterrupt
+    return solution.theta
 
 
 def _pretraining_on_values(problem: ShapeProblem, parameters: RunParameters) -> Pretraining:

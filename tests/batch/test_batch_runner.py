@@ -297,6 +297,8 @@ def test_what_is_refused_before_any_scan(tmp_path: Path) -> None:
         run_batch(Request((str(tmp_path),), out, settings=Settings({"resolution": 3})))
     with pytest.raises(OutputError, match="cannot be created"):
         run_batch(Request((str(tmp_path),), tmp_path / "README.md" / "meshes"))
+    with pytest.raises(OutputError, match=r"cannot be created: File name too long\.$"):
+        run_batch(Request((str(tmp_path),), tmp_path / ("n" * 300)))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "a.obj"]
 
 
@@ -316,6 +318,26 @@ def test_what_scans_and_options_name_is_no_output(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"poses\.config\.toml is an input of the batch"):
         run_batch(Request((source,), other, settings=settings, overwrite=True))
     assert (scans / "poses.ply").read_text() == "seed = 1\n"
+
+
+def test_a_summary_replaces_no_scan_no_list_and_no_file_of_others(tmp_path: Path) -> None:
+    table, out = tmp_path / "summary.csv", tmp_path / "meshes"
+    table.write_text("a.ply\n")
+    (tmp_path / "Summary.ply").write_text("any")
+    for request, sentence in (
+        (Request((str(table),), tmp_path, overwrite=True), r"summary\.csv is an input of the batch, whose summary"),
+        (Request((str(tmp_path / "Summary.ply"),), out, kinds=("page",)), r"Summary\.html would be an output of"),
+    ):
+        with pytest.raises(UsageError, match=sentence):
+            run_batch(request)
+    (tmp_path / "a.ply").write_text("any")
+    with pytest.raises(OutputError, match=r"summary\.csv exists already and was not written by a batch"):
+        run_batch(Request((str(tmp_path / "a.ply"),), tmp_path))
+    os.link(table, tmp_path / "a.obj")
+    with pytest.raises(UsageError, match=r"a\.obj is an input of the batch"):
+        run_batch(Request((str(tmp_path / "a.ply"),), tmp_path, lists=(table,), overwrite=True))
+    assert table.read_text() == "a.ply\n"
+    assert not out.exists()
 
 
 def test_a_missing_folder_has_its_exit_code(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

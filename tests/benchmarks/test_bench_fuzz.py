@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,9 @@ from benchmarks.__main__ import main as bench
 from benchmarks.damage import damaged_scan
 from benchmarks.fuzz import Run, runs, table
 
+from gnrecon import reconstruct
 from gnrecon.batch.job import Limits
-from gnrecon.ingest import prepare, survey
-from gnrecon.io import read_scans
-from gnrecon.options import Options
-from gnrecon.runtime.errors import ExitCode, InputError
+from gnrecon.runtime.errors import ExitCode, GnreconError
 
 
 def test_damaged_scans_end_in_a_mesh_or_in_one_sentence() -> None:
@@ -27,25 +26,26 @@ def test_damaged_scans_end_in_a_mesh_or_in_one_sentence() -> None:
 
 
 @pytest.mark.parametrize("first", range(1000, 1300, 50))
-def test_damaged_scans_are_prepared_or_refused_by_one_sentence(tmp_path: Path, first: int) -> None:
-    options, prepared = Options(), 0
+def test_damaged_scans_end_in_a_sound_mesh_or_in_one_sentence_in_one_process(tmp_path: Path, first: int) -> None:
+    """With the smallest fit and the coarsest mesh, many more can be tried."""
+    smallest: dict[str, Any] = {"widths": (40,), "steps": 1, "resolution": 16, "threads": 1, "keep_handles": True}
+    foreseen, meshes = (ExitCode.INPUT, ExitCode.FIT, ExitCode.MESH, ExitCode.USAGE), 0
     for number in range(first, first + 50):
         folder = tmp_path / str(number)
         folder.mkdir()
         scan = damaged_scan(folder, np.random.default_rng([0, number]))
-        sentence, samples = "", None
+        sentence, result = "", None
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
             try:
-                cloud, _ = read_scans([scan], None, options.read_points, options.region())
-                samples, _ = prepare(cloud, **options.ingest())
-                survey(cloud)
-            except InputError as error:
-                sentence = str(error)
+                result = reconstruct(scan, quality="draft", **smallest)
+            except GnreconError as error:
+                sentence = f"{error}, exit code {int(error.exit_code)}"
         assert "\n" not in sentence, number
-        assert sentence or (samples is not None and np.isfinite(samples.points).all()), number
-        prepared += not sentence
-    assert 0 < prepared < 50
+        assert not sentence or int(sentence.rpartition(" ")[2]) in foreseen, number
+        assert sentence or (result is not None and np.isfinite(result.mesh.vertices).all()), number
+        meshes += not sentence
+    assert 0 < meshes < 50
 
 
 @pytest.mark.parametrize(
@@ -59,15 +59,18 @@ def test_damaged_scans_are_prepared_or_refused_by_one_sentence(tmp_path: Path, f
     ],
 )
 def test_what_a_fault_is(tmp_path: Path, code: int, printed: str, fault: str) -> None:
-    assert fuzz._fault(code, printed, tmp_path / "mesh.ply", trimmed=False) == fault
+    assert fuzz._fault(code, printed, tmp_path / "mesh.ply", tmp_path / "report.json") == fault
 
 
 def test_a_file_that_is_left_and_an_open_mesh_are_faults(tmp_path: Path) -> None:
     mesh = tmp_path / "mesh.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert fuzz._fault(ExitCode.FIT, "gnrecon: No.\n", mesh, trimmed=False) == "left mesh.obj"
-    assert fuzz._fault(ExitCode.OK, "", mesh, trimmed=False) == "the mesh is not watertight"
-    assert fuzz._fault(ExitCode.OK, "", mesh, trimmed=True) == ""
+    report = tmp_path / "report.txt"
+    report.write_text('{"mesh": {"closed": true}}')
+    assert fuzz._fault(ExitCode.FIT, "gnrecon: No.\n", mesh, report) == "left mesh.obj, report.txt"
+    assert fuzz._fault(ExitCode.OK, "", mesh, report) == "the mesh is not watertight"
+    report.write_text('{"mesh": {"closed": false}}')
+    assert fuzz._fault(ExitCode.OK, "", mesh, report) == ""
 
 
 def test_its_exit_code_and_its_table_hold_every_end(

@@ -16,7 +16,7 @@ from scan_files import start, torus, wait_for
 
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io import write_cloud, write_mesh
-from gnrecon.runtime.errors import ExitCode, InputError
+from gnrecon.runtime.errors import ExitCode, InputError, MeshError
 from gnrecon.runtime.interrupts import polite_ends
 from gnrecon.runtime.plugins import guarded
 
@@ -163,3 +163,29 @@ def test_a_signal_that_a_library_takes_for_a_bad_file_still_ends_the_run(tmp_pat
         process.communicate()
     assert (process.returncode, stderr) == (ExitCode.INTERRUPTED, "gnrecon: Interrupted; nothing was written.\n")
     assert [path.name for path in tmp_path.iterdir()] == ["cube.glb"]
+
+
+def test_a_signal_before_the_first_step_of_learning_ends_it(
+    command: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which an optimiser of the start takes for its own end."""
+
+    def freeze(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("gnrecon.shape_learning.shape_problem.ShapeProblem.freeze", freeze)
+    words = ("learn", "catenoid", "-o", tmp_path / "mesh.ply", "--steps", "1", "--resolution", "16")
+    command.refuses(ExitCode.INTERRUPTED, "Interrupted; nothing was written.", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_after_a_signal_is_an_interruption(
+    command: CommandLine, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        raise MeshError("The field has no zero level.")
+
+    monkeypatch.setattr("gnrecon.run.reconstruct", failing)
+    command.refuses(ExitCode.INTERRUPTED, "Interrupted; nothing was written.", scan, "-o", tmp_path / "mesh.ply")

@@ -190,6 +190,9 @@ def test_offset_shell_and_crop_at_once(model: Path, tmp_path: Path, command: Com
         (("--adaptive",), "add --remesh"),
         (("--simplify", "0"), "tolerance to simplify to must be positive"),
         (("--faces", "3"), "number of faces must be at least 4"),
+        (("--remesh", "1e-9"), "give --remesh at least"),
+        (("--max-error", "1e-12"), "give --max-error at least"),
+        (("--offset", "1e300"), "is out of range"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from gnrecon.export import (
     require_bordered,
     require_sound,
     verify,
+    verify_file,
 )
 from gnrecon.export.mesh_statistics import submesh
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.io import write_mesh
 from gnrecon.runtime.errors import MeshError, UsageError
 
 
@@ -68,6 +71,21 @@ def test_touching_parts_are_set_apart(ball: Mesh) -> None:
         assert actions
         assert len(np.unique(result.vertices, axis=0)) == len(result.vertices)
         assert result.volume == pytest.approx(mesh.volume, rel=1e-3)
+
+
+def test_vertices_that_rounding_brought_together_are_joined(ball: Mesh, tmp_path: Path) -> None:
+    """STL knows vertices by their place, and would join them without the faces between."""
+    length = np.linalg.norm(ball.corners - np.roll(ball.corners, 1, axis=1), axis=2)
+    step = float(np.quantile(length, 0.05))
+    rounded = ball.with_vertices(np.round(ball.vertices / step) * step)
+    assert verify(rounded).closed
+    assert len(np.unique(rounded.vertices, axis=0)) < len(rounded.vertices)
+    mended, _ = repair(rounded)
+    assert len(np.unique(mended.vertices, axis=0)) == len(mended.vertices)
+    assert verify(mended).genus == 0
+    assert mended.volume == pytest.approx(ball.volume, rel=0.02)
+    write_mesh(mended, tmp_path / "ball.stl")
+    assert verify_file(tmp_path / "ball.stl").vertices == len(mended.vertices)
 
 
 def test_normals_stay_outward(ball: Mesh) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -109,8 +110,12 @@ def test_verbose_shows_the_log_and_tells_remarks_once(
 
 
 def test_a_log_that_cannot_be_written_is_refused(scan: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    before = scan.read_bytes()
+    before, link, fifo = scan.read_bytes(), tmp_path / "link.log", tmp_path / "fifo.log"
+    os.link(scan, link)
+    os.mkfifo(fifo)
     for log, code, words in (
+        (fifo, ExitCode.OUTPUT, "cannot be written: No such device or address"),
+        (link, ExitCode.USAGE, "is named twice"),
         (scan, ExitCode.USAGE, "is named twice"),
         (tmp_path / "mesh.obj", ExitCode.USAGE, "is named twice"),
         (tmp_path / "no" / "run.log", ExitCode.OUTPUT, "cannot be written: No such file or directory"),
@@ -118,7 +123,7 @@ def test_a_log_that_cannot_be_written_is_refused(scan: Path, tmp_path: Path, cap
         assert run(scan, "-o", tmp_path / "mesh.obj", "--log", log, *WORDS) == code
         assert words in capfd.readouterr().err
     assert scan.read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == ["ring.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo.log", "link.log", "ring.ply"]
 
 
 def test_a_cancelled_run_is_logged(

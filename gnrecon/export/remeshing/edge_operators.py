@@ -4,7 +4,7 @@ An edge collapses into its end of the higher kind (corner, crease, smooth), or i
 kind. It may do so when the topology and the shape stay: the ends share no neighbours but the two opposite vertices (the
 link condition, by which a closed 2-manifold stays one of the same genus), creases neither vanish nor merge, no face
 turns away from its surroundings, and no edge becomes too long. Collapses that touch no common face are made at once,
-the shortest edges first. The entries are `collapse_short` and `split_long`.
+the shortest edges first. The entries are `collapse_short`, `collapse_coincident` and `split_long`.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gnrecon.export.remeshing.edge_table import (
     unit,
 )
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.mesh import Mesh
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,26 @@ def collapse_short(
         surface = _collapse(surface, collapses.only(good))
     used = np.unique(surface.faces)
     return surface.compact(), length[used]
+
+
+def collapse_coincident(mesh: Mesh) -> Mesh:
+    """Collapse the edges of a closed, oriented 2-manifold whose ends are at one place, where the topology allows it.
+
+    Vertices that no face uses stay.
+    """
+    faces, size = mesh.faces, len(mesh.vertices)
+    while True:
+        edges = EdgeTable.of(faces)
+        first, second = np.moveaxis(mesh.vertices[edges.ends], 1, 0)
+        wanted = np.flatnonzero((first == second).all(axis=1))
+        wanted = wanted[_keeps_topology(edges, wanted, size)]
+        chosen = wanted[independent_rings(edges.ends[wanted], np.arange(len(wanted)), faces, size)]
+        if not len(chosen):
+            return Mesh(mesh.vertices, faces, mesh.normals)
+        names = np.arange(size)
+        names[edges.ends[chosen, 1]] = edges.ends[chosen, 0]
+        faces = names[faces]
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
 
 def _collapsible(surface: CreasedSurface, edges: EdgeTable, length: Float, short_ratio: float) -> Mask:

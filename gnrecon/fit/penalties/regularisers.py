@@ -323,4 +323,7 @@ def minimise_penalised(
     stop = StopRule(
         steps, parameters.least_decrease_share, patience=steps + 1, held_out_patience=parameters.patience_steps
     )
-    return method.run(posed, amplitudes, stop, held_out=lambda theta: loss_of(posed(0, theta), theta)).theta
+    solution = method.run(posed, amplitudes, stop, held_out=lambda theta: loss_of(posed(0, theta), theta))
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    return solution.theta

@@ -1,0 +1,76 @@
+"""Files that a scan's file names: the scans of a ``.conf``, buffers and images of a glTF, materials and textures."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import unquote
+
+from gnrecon.io.formats.stanford_conf import parse_conf
+from gnrecon.io.parse import read_text
+from gnrecon.io.read import extension_of
+from gnrecon.runtime.errors import InputError
+
+
+def input_files(path: Path, format: str | None = None) -> list[Path]:
+    """Return a scan's file and all existing files that it refers to, each once, also where they are not read.
+
+    A file that cannot be parsed refers to none; its reader reports what is wrong with it.
+
+    Parameters
+    ----------
+    path : the scan's file
+    format : extension that says how the file is read, such as ``"conf"``; by default its own
+    """
+    extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
+    parsers = {".conf": _named_by_conf, ".gltf": _named_by_gltf, ".obj": _named_by_obj, ".ply": _named_by_ply}
+    found = [path]
+    # What a pipe holds can be read only once.
+    if extension not in parsers or not path.is_file():
+        return found
+    with suppress(InputError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        for name in parsers[extension](path):
+            if (file := path.parent / name).is_file():
+                found.append(file)
+    return list(dict.fromkeys(found))
+
+
+def all_input_files(paths: Iterable[Path], format: str | None = None) -> list[Path]:
+    """Return all files that scans are read from, see `input_files`; none of them may be overwritten."""
+    return [file for path in paths for file in input_files(path, format)]
+
+
+def _named_by_conf(path: Path) -> list[str]:
+    return [pose.file for pose in parse_conf(read_text(path))]
+
+
+def _named_by_gltf(path: Path) -> Iterator[str]:
+    document = json.loads(path.read_bytes())
+    for entry in [*document.get("buffers", []), *document.get("images", [])]:
+        uri = str(entry.get("uri", "data:"))
+        if not uri.startswith("data:"):
+            yield unquote(uri)
+
+
+def _named_by_obj(path: Path) -> Iterator[str]:
+    """Yield materials, which are named in the file's head, and the textures that these name."""
+    for material in _words_after(path, rb"mtllib"):
+        yield material
+        if (path.parent / material).is_file():
+            yield from _words_after(path.parent / material, rb"(?:map_\w+|bump|disp|decal|refl|norm)")
+
+
+def _named_by_ply(path: Path) -> list[str]:
+    return _words_after(path, rb"comment[ \t]+TextureFile")
+
+
+def _words_after(path: Path, keyword: bytes, *, head_bytes: int = 1_000_000) -> list[str]:
+    """Return what follows a keyword in lines of a file's head: all of it, and each of its words."""
+    with path.open("rb") as file:
+        head = file.read(head_bytes)
+    lines = re.findall(rb"^[ \t]*" + keyword + rb"[ \t]+([^\r\n]*[^\s])", head, re.IGNORECASE | re.MULTILINE)
+    words = [word for line in lines for word in (line, *line.split())]
+    return [word.decode("utf-8", "surrogateescape") for word in dict.fromkeys(words)]
