@@ -92,7 +92,8 @@ def wide_start(
     of_data, volume = LastLayer.of(field, data, theta), of_volume(x, distance, 1)
     ridge = parameters.ridge / max(len(x), *map(len, data))
     for round_number in range(parameters.rounds):
-        weight = distance_weight(total, len(scene.points)) / total
+        # A few points may be so far apart that no place has a known distance.
+        weight = distance_weight(total, len(scene.points)) / max(total, 1)
         solved = of_data.plus(volume, weight).solved(ridge, parameters=parameters)
         advance((round_number + 1) / parameters.rounds)
         if round_number + 1 < parameters.rounds:
@@ -183,8 +184,11 @@ class LastLayer:
 
     @classmethod
     def of(cls, field: Siren, terms: Sequence[ObjectiveTerm], theta: Tensor) -> LastLayer:
-        """Assemble the equations of some terms."""
-        problem = _last_layer_problem(field, terms, theta)
+        """Assemble the equations of some terms; those without points have none."""
+        problem = _last_layer_problem(field, [term for term in terms if len(term)], theta)
+        if not problem.terms:
+            free = problem.free()
+            return cls(field, theta, free.new_zeros(len(free), len(free)), torch.zeros_like(free))
         jacobian, residual = problem.linearise(problem.free())
         return cls(field, theta, jacobian.gram(), jacobian.tmv(residual))
 

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
-from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import CubeSpace
 from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem
@@ -35,6 +34,20 @@ _log = logging.getLogger(__name__)
 
 PenaltiesFor = Callable[[float], SurfacePenalties]
 """Returns the curvature penalties for features of a length scale, in radii."""
+
+
+@dataclass(frozen=True)
+class LocalData:
+    """What the local fields are fitted to.
+
+    Parameters
+    ----------
+    residuals : of the global field at the samples
+    hyperparameters : length scale and noise
+    """
+
+    residuals: FieldResiduals
+    hyperparameters: Hyperparameters
 
 
 def fit_detail(
@@ -53,7 +66,7 @@ def fit_detail(
     Parameters
     ----------
     sdf : the global field, in the samples' frame
-    data : the samples, the residuals of the global field at them, and their length scale and noise
+    data : the residuals of the global field at the samples, and their length scale and noise
     features : number of features a cube
     rng : draws features and samples of the volume
     device : a torch device
@@ -208,11 +221,11 @@ class _Cubes:
         density, hyperparameters, limits = self.residuals.density, self.hyperparameters, self.parameters
         reach = self.partition.reach + limits.data_margin_disk_radii * density.radius
 
-        def solved(number: int) -> tuple[float, Tensor] | None:
+        def solved(number: int, least_points: int = limits.least_points) -> tuple[float, Tensor] | None:
             """Return the length and amplitudes of a cube, or None where it holds too few points."""
             center = self.partition.center(keys[number])
             rows = self.residuals.within(center, reach)
-            if len(rows) < limits.least_points:
+            if len(rows) < least_points:
                 return None
             disks, stretch = density.disks[rows], limits.most_length_stretch
             length = cube_length(hyperparameters, disks, density.radius, most_length_stretch=stretch)
@@ -221,6 +234,9 @@ class _Cubes:
             return solve_cube(*cube, self.penalties, parameters=limits)
 
         cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
+        if not any(cubes):
+            # A few points that are far apart: a cube of one is better than none.
+            cubes = [solved(number, 1) for number in range(len(keys))]
         kept = [number for number, cube in enumerate(cubes) if cube is not None]
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Fitted %d local fields; %d cubes had too few points.", len(kept), len(keys) - len(kept))

@@ -78,33 +78,19 @@ class FieldResiduals:
         return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
 
 
-@dataclass(frozen=True)
-class SelectedModel:
-    """Hyperparameters that cross-validation selected.
-
-    Parameters
-    ----------
-    hyperparameters : with noise from the table of candidates
-    scores : of its length at each patch with each tabled noise, of shape (patches, noises), in radii
-    most_likely : with the noise of the largest marginal likelihood, or None if that is not available
-    """
-
-    hyperparameters: Hyperparameters
-    scores: Float
-    most_likely: Hyperparameters | None = None
-
-    @property
-    def best(self) -> Hyperparameters:
-        """Return the hyperparameters for points as they were scanned."""
-        return self.most_likely or self.hyperparameters
-
-
 def select_hyperparameters(
-    residuals: FieldResiduals, held_out: Mask, radius: float, rng: np.random.Generator, device: str = "cpu"
+    residuals: FieldResiduals,
+    held_out: Mask,
+    radius: float,
+    rng: np.random.Generator,
+    device: str = "cpu",
+    features: int = ModelSelectionParameters.features,
+    *,
+    outliers: bool = False,
 ) -> Hyperparameters:
     """Return the hyperparameters of a clean scan, or for any other those that predict the validation points best.
 
-    The noise is then that of the largest marginal likelihood, unless normals were estimated.
+    The noise is then that of the largest marginal likelihood, unless normals were estimated or there are outliers.
 
     Parameters
     ----------
@@ -113,9 +99,14 @@ def select_hyperparameters(
     radius : of the disk that a point stands for, unit coordinates
     rng : draws patches and features
     device : a torch device
+    features : number of features a cube
+    outliers : whether some were found. Those that remain would make spikes if the scan were fitted as clean, and the
+        marginal likelihood is not robust to them.
     """
-    validation = CrossValidation.draw(residuals, held_out, radius, rng, device)
-    return validation.clean() or validation.select().best
+    validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
+    if outliers:
+        return validation.select(by_likelihood=False)
+    return validation.clean() or validation.select()
 
 
 def _marginal_likelihood(
@@ -172,8 +163,7 @@ class CrossValidation:
 
     Parameters
     ----------
-    residuals : that the patches are fitted to
-    scanned : residuals at the points as they were scanned, with the same rows
+    residuals : that the patches are fitted to, and validation points
     radius : of the disk that a point stands for, unit coordinates
     features : of the patches
     centers : of the patches, of shape (patches, 3)
@@ -186,7 +176,6 @@ class CrossValidation:
     """
 
     residuals: FieldResiduals
-    scanned: FieldResiduals
     radius: float
     features: Features
     centers: Float
@@ -226,9 +215,7 @@ class CrossValidation:
         centers = residuals.points[chosen]
         likelihood = None if residuals.estimated else _marginal_likelihood(residuals, radius, rng.spawn(1)[0], device)
         found = list(out[near])
-        return cls(
-            residuals, residuals, radius, features, centers, found, held_out, device, None, likelihood, parameters
-        )
+        return cls(residuals, radius, features, centers, found, held_out, device, None, likelihood, parameters)
 
     def clean(self) -> Hyperparameters | None:
         """Return the hyperparameters of a clean scan, whose noise follows from its points, or None of any other.
@@ -246,8 +233,8 @@ class CrossValidation:
             number += 1
         return Hyperparameters(self._length(number), *noise)
 
-    def select(self) -> SelectedModel:
-        """Return the hyperparameters that predict best."""
+    def select(self, by_likelihood: bool = True) -> Hyperparameters:
+        """Return the hyperparameters that predict best, with the likeliest noise if it is asked for and known."""
         scores: dict[int, Float] = {}
 
         def least(number: int) -> float:
@@ -261,21 +248,15 @@ class CrossValidation:
         step = 1 if least(at + 1) < least(at) else -1
         while least(at + step) < least(at):
             at += step
+        if by_likelihood and self.likelihood is not None:
+            number, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
+            # Errors of dense scans are alike among neighbours, as those of estimated normals are.
+            by_place = len(self.residuals) <= self.parameters.sparse_points
+            return Hyperparameters(self._length(number), *self.noises(self._length(number))[-1], by_place)
         count = len(_noise_candidates(self.parameters))
         tabled = {number: of_length[:, :count] for number, of_length in scores.items()}
         number, noise = _smoothest(tabled, parameters=self.parameters)
-        most_likely = None
-        if self.likelihood is not None:
-            last, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
-            most_likely = self._belief(last, -1)
-        return SelectedModel(self._belief(number, noise), tabled[number], most_likely)
-
-    def _belief(self, number: int, noise: int) -> Hyperparameters:
-        """Return the hyperparameters with the numbers of a length and of one of its noises."""
-        length = self._length(number)
-        # Errors of dense scans are alike among neighbours, as those of averaged points and of estimated normals are.
-        by_place = self.likelihood is not None and len(self.residuals) <= self.parameters.sparse_points
-        return Hyperparameters(length, *self.noises(length)[noise], by_place)
+        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise])
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
@@ -327,8 +308,8 @@ class CrossValidation:
             rows = rows[np.sort(np.argsort(far, kind="stable")[:most])]
         patch = self.residuals.patch(rows, center, Volume.none(), self.device)
         system = patch_system(patch, self.features, length, patch.size)
-        target = self.scanned.patch(predicted, center, Volume.none(), self.device)
-        normals = torch.as_tensor(self.scanned.normals[predicted], device=self.device)
+        target = self.residuals.patch(predicted, center, Volume.none(), self.device)
+        normals = torch.as_tensor(self.residuals.normals[predicted], device=self.device)
         # On a nearly exact scan, the limit by the residuals makes several noises equal.
         noises = self.noises(length)
         found = {each: self._score(system.solve(*each), target, normals, length) for each in set(noises)}

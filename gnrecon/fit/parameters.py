@@ -138,16 +138,6 @@ class GlobalFieldParameters:
 
 
 @dataclass(frozen=True)
-class DenoisingParameters:
-    """Averaging of noisy points before the local fit (`fit.denoising`)."""
-
-    widths_disk_radii: tuple[float, ...] = (2.5, 4.0, 6.0)  # of the filter; the others are tried where the first helps
-    normal_difference: float = 0.4  # of unit normals, at which a neighbour's weight is 1/e
-    gain_standard_errors: float = 2.0  # by which averaging must predict better where no edges are detected
-    least_noise_disk_radii: float = 0.05  # noise above which averaging is tried
-
-
-@dataclass(frozen=True)
 class InitialisationParameters:
     """Linear starts of sine networks (`fit.initialisation`)."""
 
@@ -354,5 +344,4 @@ class FitParameters:
     shape_priors: ShapePriorParameters = ShapePriorParameters()
     global_field: GlobalFieldParameters = GlobalFieldParameters()
     outliers: OutlierParameters = OutlierParameters()
-    denoising: DenoisingParameters = DenoisingParameters()
     local_fields: LocalFieldParameters = LocalFieldParameters()

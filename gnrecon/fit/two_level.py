@@ -7,7 +7,7 @@ sums of sine features whose output weights solve linear least-squares problems. 
 1. Prepare the data: snap a ball, turn contradicted normals around, extend faces to sharp edges and across holes.
 2. Fit the global field (`global_field`), without validation points; leave out outliers.
 3. Apply the curvature penalties, if any, to the global field (`penalties`).
-4. Choose length scale and noise on the validation points (`denoising`, `model_selection`).
+4. Choose length scale and noise on the validation points (`model_selection`).
 5. Take the network's last steps on all points, if they are few. Then fit the local fields
    (`local_fields`), or those of a large scan by blocks (`blocks.solve`).
 """
@@ -23,13 +23,12 @@ from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.blocks.solve import fit_large
 from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
-from gnrecon.fit.denoising import LocalData, choose_local_data
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.fit_summary import FitSummary, describe
 from gnrecon.fit.global_field import GlobalField, fit_global
-from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
-from gnrecon.fit.model_selection import FieldResiduals
+from gnrecon.fit.local_fields import LocalData, PenaltiesFor, fit_detail
+from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import FitParameters
 from gnrecon.fit.penalties.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.fit.shape_priors.ball_fit import BallFit
@@ -94,9 +93,7 @@ def fit_two_level(
     sdf, penalties = steps.apply_penalties(first, data)
     try:
         rest = subrange(advance, share, 1.0)
-        sdf, detail, averaging_width = steps.fit_local(
-            first, sdf, data, penalties, outliers > 0, rest, folder, scheduler
-        )
+        sdf, detail = steps.fit_local(first, sdf, data, penalties, outliers > 0, rest, folder, scheduler)
     except KeyboardInterrupt:
         status = "Interrupted before the local fields were solved: this is the smooth global field alone."
         return sdf, replace(first.solution, status=status, interrupted=True)
@@ -105,7 +102,6 @@ def fit_two_level(
         flipped_share=flipped_share,
         outliers=outliers,
         steps=0 if first.ladder is None else len(first.solution.history),
-        averaging_width=averaging_width,
         ball_radius=None if ball is None else ball.radius,
         ball_points=len(samples),
         ball_samples=0 if ball is None else len(ball.samples) - len(samples),
@@ -236,25 +232,25 @@ class _Steps:
         advance: ProgressCallback,
         folder: str | Path | None,
         scheduler: str | None,
-    ) -> tuple[NeuralSDF, Detail, float | None]:
-        """Return the global field, the local ones, and the width of averaging for them, in disk radii, or None."""
+    ) -> tuple[NeuralSDF, Detail]:
+        """Return the global field and the local ones."""
         options, rng = self.options, self.rng
         if self.by_blocks:
-            return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler), None
+            return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler)
         if data.sharp is not None:
-            local = LocalData.of_faces(sdf, data.sharp)
+            local = LocalData(FieldResiduals.of(sdf, data.sharp.samples), data.sharp.hyperparameters)
         else:
-            samples, chosen = data.samples, (options.features, rng, options.device)
-            limits = self.parameters.denoising
-            local = choose_local_data(sdf, samples, data.held_out, *chosen, outliers=outliers, parameters=limits)
+            residuals = FieldResiduals.of(sdf, data.samples)
+            chosen = (residuals.density.radius, rng, options.device, options.features)
+            local = LocalData(residuals, select_hyperparameters(residuals, data.held_out, *chosen, outliers=outliers))
             # The validation points have chosen everything, and may be fitted, too.
-            if first.ladder is not None and len(samples) <= self.parameters.two_level.most_refitted_points:
+            if first.ladder is not None and len(residuals) <= self.parameters.two_level.most_refitted_points:
                 sdf = first.refitted(data.samples)
-                local = replace(local, residuals=FieldResiduals.of(sdf, local.samples))
+                local = replace(local, residuals=FieldResiduals.of(sdf, data.samples))
         cubes = self.parameters.local_fields
         advance(cubes.selection_time_share)
         detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=cubes)
-        return sdf, detail, None if local.averaging is None else local.averaging.width_radii
+        return sdf, detail
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
         """Return the data with samples across holes, and the global field that is fitted to them."""
@@ -294,6 +290,7 @@ def _summary(detail: Detail, data: _Data, options: FitOptions) -> FitSummary:
     """Return the part of the summary that the final data and the local fields determine."""
     chosen = detail.as_dict(data.scan.frame.scale)
     snapped = None if data.sharp is None else data.sharp.snapped
+    averaging = None if data.sharp is None else data.sharp.averaging
     return FitSummary(
         cubes=len(detail),
         length=chosen["length"],
@@ -303,6 +300,7 @@ def _summary(detail: Detail, data: _Data, options: FitOptions) -> FitSummary:
         snapped_points=0 if snapped is None else int(snapped.on_primitive.sum()),
         primitives=0 if snapped is None else snapped.primitives,
         edge_samples=None if data.sharp is None else len(data.samples) - len(data.scan) - len(data.across),
+        averaging_width=None if averaging is None else averaging.width_radii,
         hole_samples=len(data.across),
         holes=data.across.holes,
         regularisers=options.regularisers,

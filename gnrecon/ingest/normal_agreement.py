@@ -22,14 +22,14 @@ class Agreement:
     ----------
     opposing : share of the pairs whose normals oppose each other
     conflicting : the same of those where the neighbour lies neither behind the point nor across a gap from it
-    mostly : share of the points that most neighbours oppose
+    contradicted : share of the points with which half of the neighbours or more conflict
     depth_variation : standard deviation, over the mean, of the depths of the opposing neighbours of a point below its
         plane, in the median; infinite where hardly any neighbours oppose each other
     """
 
     opposing: float
     conflicting: float
-    mostly: float
+    contradicted: float
     depth_variation: float
 
     def lie_behind(self, *, most_conflicting_share: float = 0.1) -> bool:
@@ -83,7 +83,7 @@ def agreement_of(
     return Agreement(
         float(opposing.mean()),
         float(conflicting.mean()),
-        float((opposing.mean(axis=1) > 0.5).mean()),
+        float((conflicting.mean(axis=1) >= 0.5).mean()),
         _depth_variation(heights, opposing),
     )
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gnrecon.fit.denoising import LocalData
 
 from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Detail
@@ -22,7 +23,6 @@ from gnrecon.fit import FitOptions, NeuralSDF
 from gnrecon.fit.blocks import block, workers
 from gnrecon.fit.blocks import solve as large
 from gnrecon.fit.blocks.store import WorkFolder
-from gnrecon.fit.denoising import LocalData
 from gnrecon.fit.fit_options import QUALITIES
 from gnrecon.fit.local_fields import fit_detail
 from gnrecon.fit.local_solve import Hyperparameters

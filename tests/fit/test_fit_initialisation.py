@@ -83,6 +83,16 @@ def test_equations_add_and_what_counts_several_times_is_as_many_rows() -> None:
     torch.testing.assert_close(sum_.solved(1e-9), solve_last_layer(field, [*terms[:2], twice], theta, 1e-9))
 
 
+def test_terms_without_points_have_no_equations() -> None:
+    field, terms, theta = draw((20,))
+    none = replace(terms[0], points=terms[0].points[:0])
+    empty = LastLayer.of(field, [none], theta)
+    assert empty.product.shape == (21, 21)
+    whole = LastLayer.of(field, terms, theta)
+    assert torch.equal(whole.plus(empty).product, whole.product)
+    assert torch.equal(LastLayer.of(field, [*terms, none], theta).gradient, whole.gradient)
+
+
 def test_values_that_are_not_finite_end_with_a_sentence() -> None:
     field, terms, theta = draw((20,))
     broken = [*terms, ObjectiveTerm("distance", signed_distance, terms[0].points, terms[0].points[:, 0] * torch.nan)]

@@ -235,3 +235,19 @@ def test_acute_edges_are_edges_and_the_sides_of_a_sheet_are_none() -> None:
     disc[:, 2] = 0.01 * rng.choice([-1.0, 1.0], len(disc))
     normals = np.sign(disc[:, 2:]) * [[0.0, 0.0, 1.0]] + 0.15 * rng.standard_normal(disc.shape)
     assert SharpShape.of(Samples(disc, normals / np.linalg.norm(normals, axis=1, keepdims=True), FRAME)) is None
+
+
+def test_faces_that_meet_are_told_from_bends() -> None:
+    def edges(samples: Samples) -> bool:
+        return has_edges(*AVERAGING.apply(samples.points, samples.normals))
+
+    assert edges(cube(1500))
+    assert edges(cube(1500, 0.01))
+    assert not edges(ball(1500, 0.01))
+    # So few that neighbours' normals differ as if there were edges between them.
+    assert not edges(ball(60))
+    # The two sides of a thin sheet are no edge.
+    rng = np.random.default_rng(2)
+    side = rng.choice([-1.0, 1.0], 1000)
+    x = np.stack([*rng.uniform(-1, 1, (2, 1000)), 0.002 * side], axis=1)
+    assert not edges(Samples(x, np.stack([0 * side, 0 * side, side], axis=1), FRAME))

@@ -94,6 +94,19 @@ def test_ten_points_are_enough() -> None:
     assert np.sqrt(np.mean(sdf.sdf(sdf.data) ** 2)) < 0.1 * FRAME.scale
 
 
+@pytest.mark.parametrize("farther", [1.0, 30.0])
+def test_corners_of_a_cube_far_from_each_other_are_fitted(farther: float) -> None:
+    """No place of the box has a known distance, or no cube of the local fields two points."""
+    corners = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]]), axis=-1).reshape(-1, 3)
+    corners[-1] *= farther
+    corners /= np.abs(corners).max() * np.sqrt(3)
+    directions = corners / np.linalg.norm(corners, axis=1, keepdims=True)
+    sdf, _ = fit(Samples(corners, directions, FRAME), FitOptions(quality="draft"))
+    assert np.isfinite(sdf.sdf(sdf.data)).all()
+    assert sdf.detail is not None
+    assert len(sdf.detail) > 0
+
+
 def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:
     samples = clean[0]
     few = Samples(samples.points[::4], samples.normals[::4], FRAME)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 
 from gnrecon.fit.parameters import (
-    DenoisingParameters,
     FitParameters,
     GlobalFieldParameters,
     NetworkLadderParameters,
@@ -47,7 +46,6 @@ PARTS: Mapping[str, FitParameters] = {
     "widening": _ladder(NetworkLadderParameters(widths=NetworkLadderParameters.widths[:1])),
     "last steps": FitParameters(two_level=TwoLevelParameters(most_refitted_points=0)),
     "outliers": FitParameters(outliers=OutlierParameters(least_points=_NEVER)),
-    "averaging": FitParameters(denoising=DenoisingParameters(least_noise_disk_radii=math.inf)),
     "ball": FitParameters(ball=BallFitParameters(min_points=_NEVER)),
     "sharp faces": _priors(ShapePriorParameters(sharp=SharpShapeParameters(max_points=0))),
     "snapping": _priors(ShapePriorParameters(snapping=SnappingParameters(min_snapped_share=2.0))),

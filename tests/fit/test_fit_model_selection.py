@@ -1,0 +1,39 @@
+"""Length scale and noise by validation points: what is tried, and what each scan allows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import made_shapes
+import numpy as np
+import pytest
+
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
+
+
+def test_the_noise_of_estimated_normals_is_about_that_of_the_points() -> None:
+    points = made_shapes.sphere(500, np.random.default_rng(0))[0]
+    residuals = FieldResiduals(points, points, np.full(500, 0.05), points, estimated=True, noise=0.03)
+    held_out = np.arange(500) % 8 == 0
+    for known, least, most in ((0.03, 0.015, 0.06), (None, 0.0, 0.051)):
+        of_points = replace(residuals, noise=known)
+        validation = CrossValidation.draw(of_points, held_out, 0.1, np.random.default_rng(0), "cpu")
+        positions = [position for position, _ in validation.noises(0.4)]
+        assert least <= min(positions)
+        assert max(positions) <= most
+    assert min(positions) < 0.015
+
+
+@pytest.mark.parametrize("outliers", [False, True])
+def test_outliers_leave_the_choice_to_validation_points(monkeypatch: pytest.MonkeyPatch, outliers: bool) -> None:
+    """The marginal likelihood is not robust to those that remain; nor is the scan fitted as a clean one."""
+    rng = np.random.default_rng(0)
+    points, normals = made_shapes.sphere(400, rng, 0.8, 0.02)
+    value, held_out = np.linalg.norm(points, axis=1) - 0.8, np.arange(400) % 6 == 0
+    residuals = FieldResiduals(points, normals, value, points / np.linalg.norm(points, axis=1, keepdims=True))
+    likely = 0.123 * residuals.density.radius
+    monkeypatch.setattr(MarginalLikelihood, "noise", lambda *_: (likely, 0.2))
+    chosen = select_hyperparameters(residuals, held_out, residuals.density.radius, rng, outliers=outliers)
+    assert chosen.by_place is not outliers
+    assert (chosen.position == likely) is not outliers
