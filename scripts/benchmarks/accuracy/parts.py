@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from gnrecon.fit.parameters import (
     FitParameters,
     GlobalFieldParameters,
+    LocalFieldParameters,
     NetworkLadderParameters,
     NetworkTermParameters,
     OutlierParameters,
@@ -45,6 +46,7 @@ PARTS: Mapping[str, FitParameters] = {
     "several networks": _ladder(NetworkLadderParameters(starts=1, most_members=1)),
     "widening": _ladder(NetworkLadderParameters(widths=NetworkLadderParameters.widths[:1])),
     "last steps": FitParameters(two_level=TwoLevelParameters(most_refitted_points=0)),
+    "lengths by place": FitParameters(local_fields=LocalFieldParameters(most_length_steps=0)),
     "outliers": FitParameters(outliers=OutlierParameters(least_points=_NEVER)),
     "ball": FitParameters(ball=BallFitParameters(min_points=_NEVER)),
     "sharp faces": _priors(ShapePriorParameters(sharp=SharpShapeParameters(max_points=0))),
