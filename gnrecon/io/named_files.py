@@ -28,11 +28,12 @@ def input_files(path: Path, format: str | None = None) -> list[Path]:
     extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
     parsers = {".conf": _named_by_conf, ".gltf": _named_by_gltf, ".obj": _named_by_obj, ".ply": _named_by_ply}
     found = [path]
-    # What a pipe holds can be read only once.
-    if extension not in parsers or not path.is_file():
+    if extension not in parsers:
         return found
+    # A name may be longer than the system allows.
     with suppress(InputError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        for name in parsers[extension](path):
+        # What a pipe holds can be read only once.
+        for name in parsers[extension](path) if path.is_file() else ():
             if (file := path.parent / name).is_file():
                 found.append(file)
     return list(dict.fromkeys(found))

@@ -103,14 +103,17 @@ def test_the_field_is_a_distance_whose_sign_is_right_in_all_of_the_box(
     assert np.linalg.norm(gradient - truth.normals, axis=1).mean() < 0.1
 
 
-def test_steps_on_all_points_come_nearer_to_those_left_out(network: tuple[GlobalField, list[Record]]) -> None:
-    samples = capsule(900, 0)
-    left = samples.points[held_out(samples)]
+def test_steps_on_all_points_come_nearer_to_those_left_out() -> None:
+    """Of few points: of many, those left out tell the network nothing that their neighbours do not."""
 
-    def missed(sdf: object) -> float:
-        return float(np.abs(sdf.sdf(FRAME.to_world(left))).mean())  # type: ignore[attr-defined]
+    def nearer(seed: int) -> float:
+        samples = capsule(100, seed)
+        found = fitted(samples, TWO_WIDTHS)
+        left = FRAME.to_world(samples.points[held_out(samples)])
+        before, after = (np.abs(sdf.sdf(left)).mean() for sdf in (found.sdf, found.refitted(samples)))
+        return float(after / before)
 
-    assert missed(network[0].refitted(samples)) < missed(network[0].sdf)
+    assert np.median([nearer(seed) for seed in range(3)]) < 1.0
 
 
 def test_outliers_and_contradicting_normals_lose_their_weight() -> None:

@@ -81,25 +81,27 @@ def test_exact_points_with_tilted_normals_are_believed(rng: np.random.Generator)
     radius = residuals.density.radius
     held = rng.random(1500) < 1 / 6
     validation = CrossValidation.draw(residuals, held, radius, rng, "cpu")
-    hyperparameters = validation.select().best
+    hyperparameters = validation.select()
     assert hyperparameters.position <= 0.05 * radius
     assert 0.17 <= hyperparameters.angle <= 0.4
 
 
-def test_few_points_and_estimated_normals_have_a_belief_too(rng: np.random.Generator) -> None:
+def test_few_points_have_a_likeliest_noise_and_estimated_normals_have_none(rng: np.random.Generator) -> None:
     x = rng.standard_normal((40, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     residuals = FieldResiduals(x, x, 0.01 * x[:, 0], x)
     assert len(x) < MarginalLikelihoodParameters.patch_points
     held = np.arange(40) % 6 == 0
-    found = CrossValidation.draw(residuals, held, residuals.density.radius, rng, "cpu").select()
-    assert found.most_likely is not None
-    assert found.best == found.most_likely
-    of_estimated = CrossValidation.draw(
-        replace(residuals, estimated=True), held, residuals.density.radius, rng, "cpu"
-    ).select()
-    assert of_estimated.most_likely is None
-    assert of_estimated.best == of_estimated.hyperparameters
+    given, estimated = (
+        CrossValidation.draw(each, held, residuals.density.radius, rng, "cpu")
+        for each in (residuals, replace(residuals, estimated=True))
+    )
+    found = given.select()
+    assert found.by_place
+    assert (found.position, found.angle) == given.noises(found.length)[-1]
+    assert not given.select(by_likelihood=False).by_place
+    assert estimated.likelihood is None
+    assert not estimated.select().by_place
 
 
 def test_size_of_a_kernel(rng: np.random.Generator) -> None:
