@@ -76,7 +76,6 @@ def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> No
         assert np.abs(Can().distance(elsewhere)).mean() < 0.01
         return float(np.sqrt(np.mean(Can().distance(hole) ** 2)))
 
-    assert off() < 2e-3  # its side goes on
     developable = [off(seed, prior="developable") for seed in range(3)]
     monkeypatch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
     monkeypatch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
@@ -100,7 +99,7 @@ def test_strain_smooths() -> None:
 
 
 def test_the_same_again_is_the_same() -> None:
-    one, other = (fitted(ball(200), prior="developable", smooth="strain=1e-5") for _ in range(2))
+    one, other = (fitted(ball(100), prior="developable", smooth="strain=1e-5") for _ in range(2))
     assert one.theta.equal(other.theta)
     assert one.detail is not None
     assert other.detail is not None

@@ -237,7 +237,7 @@ def test_it_works_in_the_frame_of_a_notebook(chromium: Browser, file: Path, tmp_
     )
     chromium.events.clear()
     chromium.open(notebook, 1200, 800)
-    state = "document.querySelector('iframe').contentDocument.documentElement.dataset.viewer"
+    state = "document.querySelector('iframe')?.contentDocument?.documentElement?.dataset.viewer"
     deadline = time.monotonic() + 60
     while (found := chromium.value(state)) is None and time.monotonic() < deadline:
         time.sleep(0.1)
