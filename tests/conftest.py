@@ -25,8 +25,8 @@ hypothesis.settings.register_profile("gnrecon", deadline=None)
 hypothesis.settings.load_profile("gnrecon")
 
 
-LONGEST = ("test_docs.py",)
-"""Files that take minutes. Each is one process's, so that one begun late would leave the others without work."""
+LONGEST = ("test_docs.py", "test_fit_surface_penalties.py", "test_pipeline.py", "test_notebook.py")
+"""Files that take minutes, or long and come last. Each is one process's, which may leave the others without work."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
