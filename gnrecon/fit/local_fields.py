@@ -36,23 +36,10 @@ PenaltiesFor = Callable[[float], SurfacePenalties]
 """Returns the curvature penalties for features of a length scale, in radii."""
 
 
-@dataclass(frozen=True)
-class LocalData:
-    """What the local fields are fitted to.
-
-    Parameters
-    ----------
-    residuals : of the global field at the samples
-    hyperparameters : length scale and noise
-    """
-
-    residuals: FieldResiduals
-    hyperparameters: Hyperparameters
-
-
 def fit_detail(
     sdf: NeuralSDF,
-    data: LocalData,
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
     features: int,
     rng: np.random.Generator,
     device: str,
@@ -66,14 +53,14 @@ def fit_detail(
     Parameters
     ----------
     sdf : the global field, in the samples' frame
-    data : the residuals of the global field at the samples, and their length scale and noise
+    residuals : of the global field at the samples
+    hyperparameters : their length scale and noise
     features : number of features a cube
     rng : draws features and samples of the volume
     device : a torch device
     advance : called with the share that is done
     shape : gives the curvature penalties for the length scale of the local fields
     """
-    residuals, hyperparameters = data.residuals, data.hyperparameters
     _log.info(
         "Local fields: length scale %.3g radii, noise %.2g radii and %.2g radians; %d features each.",
         hyperparameters.length,
@@ -137,17 +124,15 @@ def solve_cube(
     """
     patch = residuals.patch(rows, space.center, space.far(), device)
     position, angle = hyperparameters.position, hyperparameters.angle
-    if penalties is not None:
-        system = PatchSystem(patch, features, length, patch.size)
-        draw = partial(space.near, length, position)
-        solved = penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
-        return length, solved
-    features = _precise_enough(features, patch, length, hyperparameters, parameters)
-    if hyperparameters.by_place:
-        length, system = _likeliest_system(patch, features, length, (position, angle), parameters)
-    else:
-        system = PatchSystem(patch, features, length, patch.size)
-    return length, system.solve_with_bounds(position, angle, partial(space.near, length, position))
+    if penalties is None:
+        features = _precise_enough(features, patch, length, hyperparameters, parameters)
+    system = PatchSystem(patch, features, length, patch.size)
+    if hyperparameters.by_place and penalties is None:
+        length, system = _likeliest_system(system, patch, features, length, (position, angle), parameters)
+    draw = partial(space.near, length, position)
+    if penalties is None:
+        return length, system.solve_with_bounds(position, angle, draw)
+    return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
 
 
 def _precise_enough(
@@ -162,10 +147,14 @@ def _precise_enough(
 
 
 def _likeliest_system(
-    patch: Patch, features: Features, length: float, noise: tuple[float, float], parameters: LocalFieldParameters
+    best: PatchSystem,
+    patch: Patch,
+    features: Features,
+    length: float,
+    noise: tuple[float, float],
+    parameters: LocalFieldParameters,
 ) -> tuple[float, PatchSystem]:
-    """Return the length near a given one of which the cube's own data is most likely, and its system."""
-    best = PatchSystem(patch, features, length, patch.size)
+    """Return the length near a given one, of `best`, of which the cube's own data is most likely, and its system."""
     most = best.log_evidence(*noise)
     for factor in (1 / parameters.length_step, parameters.length_step):
         start = length

@@ -200,9 +200,7 @@ class PatchSystem:
         Source: Rasmussen and Williams (2006), equation 2.30 in the space of the weights.
         """
         scale = self._scale / LocalSolveParameters.correction_rms_factor
-        product = self._positions[0] * (scale / position) ** 2
-        product.add_(self._angles[0], alpha=(scale / angle) ** 2)
-        right = scale * (self._positions[1] / position**2 + self._angles[1] / angle**2)
+        product, right = self._data_product(scale, position, angle), scale * self._data_right(position, angle)
         factor = damped_factor(product, torch.ones_like(right), overwrite=True)
         if factor is None:
             return -math.inf
@@ -216,14 +214,21 @@ class PatchSystem:
 
     def _factored(self, position: float, angle: float) -> tuple[Tensor | None, Tensor]:
         """Return the Cholesky factor and the right-hand side for amplitudes over their standard deviation."""
-        right = self._scale * (self._positions[1] / position**2 + self._angles[1] / angle**2 + self._volume[1])
+        right = self._scale * (self._data_right(position, angle) + self._volume[1])
         return _factor(lambda: self._product(position, angle), right), right
 
     def _product(self, position: float, angle: float) -> Tensor:
         """Return s^2 J^T J in its lower triangle, in as few passes over the matrices as there are matrices."""
-        product: Tensor = self._positions[0] * (self._scale / position) ** 2
-        product.add_(self._angles[0], alpha=(self._scale / angle) ** 2)
-        return product.add_(self._volume[0], alpha=self._scale**2)
+        return self._data_product(self._scale, position, angle).add_(self._volume[0], alpha=self._scale**2)
+
+    def _data_product(self, scale: float, position: float, angle: float) -> Tensor:
+        """Return that product of the data alone, for a standard deviation `scale` of the amplitudes."""
+        product: Tensor = self._positions[0] * (scale / position) ** 2
+        return product.add_(self._angles[0], alpha=(scale / angle) ** 2)
+
+    def _data_right(self, position: float, angle: float) -> Tensor:
+        """Return J^T D^-1 y of the data alone."""
+        return self._positions[1] / position**2 + self._angles[1] / angle**2
 
 
 class LocalRowSystem:

@@ -27,7 +27,7 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.fit_summary import FitSummary, describe
 from gnrecon.fit.global_field import GlobalField, fit_global
-from gnrecon.fit.local_fields import LocalData, PenaltiesFor, fit_detail
+from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
 from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import FitParameters
 from gnrecon.fit.penalties.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
@@ -237,20 +237,20 @@ class _Steps:
         options, rng = self.options, self.rng
         if self.by_blocks:
             return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler)
+        residuals = FieldResiduals.of(sdf, data.samples)
         if data.sharp is not None:
-            local = LocalData(FieldResiduals.of(sdf, data.sharp.samples), data.sharp.hyperparameters)
+            hyperparameters = data.sharp.hyperparameters
         else:
-            residuals = FieldResiduals.of(sdf, data.samples)
             chosen = (residuals.density.radius, rng, options.device, options.features)
-            local = LocalData(residuals, select_hyperparameters(residuals, data.held_out, *chosen, outliers=outliers))
+            hyperparameters = select_hyperparameters(residuals, data.held_out, *chosen, outliers=outliers)
             # The validation points have chosen everything, and may be fitted, too.
             if first.ladder is not None and len(residuals) <= self.parameters.two_level.most_refitted_points:
                 sdf = first.refitted(data.samples)
-                local = replace(local, residuals=FieldResiduals.of(sdf, data.samples))
+                residuals = FieldResiduals.of(sdf, data.samples)
         cubes = self.parameters.local_fields
         advance(cubes.selection_time_share)
-        detail = fit_detail(sdf, local, options.features, rng, options.device, advance, penalties, parameters=cubes)
-        return sdf, detail
+        fitted = (sdf, residuals, hyperparameters, options.features, rng, options.device, advance, penalties)
+        return sdf, fit_detail(*fitted, parameters=cubes)
 
     def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
         """Return the data with samples across holes, and the global field that is fitted to them."""

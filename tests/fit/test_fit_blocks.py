@@ -23,7 +23,7 @@ from gnrecon.fit.blocks import block, workers
 from gnrecon.fit.blocks import solve as large
 from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.fit_options import QUALITIES
-from gnrecon.fit.local_fields import LocalData, fit_detail
+from gnrecon.fit.local_fields import fit_detail
 from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
@@ -153,8 +153,8 @@ def test_a_scheduler_needs_a_shared_folder_and_an_answer(tmp_path: Path, monkeyp
 def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     detail, samples = whole, ellipsoid()
     sdf = constant_field(samples)
-    found = LocalData(FieldResiduals.of(sdf, samples), fixed_belief())
-    single = fit_detail(sdf, found, FEATURES, np.random.default_rng(0), "cpu")
+    residuals = FieldResiduals.of(sdf, samples)
+    single = fit_detail(sdf, residuals, fixed_belief(), FEATURES, np.random.default_rng(0), "cpu")
     assert np.array_equal(single.keys, detail.keys)
     assert single.lengths == pytest.approx(detail.lengths, rel=1e-12)
     by_single, by_blocks = (0.05 + d.value(samples.points) for d in (single, detail))
