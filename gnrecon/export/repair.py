@@ -15,6 +15,7 @@ The entries are `repair` and `remove_stray`.
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gnrecon.export.boolean import (
     from_meshlab,
@@ -28,6 +29,7 @@ from gnrecon.export.boolean import (
 from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.mesh_statistics import Edges, concatenated, corner_fans, face_components, split_vertices, submesh
 from gnrecon.export.metrics import nearest_on_surface
+from gnrecon.export.project import side_lengths
 from gnrecon.export.remeshing.edge_operators import collapse_coincident
 from gnrecon.export.verify import require_sound, verify
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -267,7 +269,7 @@ def _vote(
     count = int(labels.max(initial=-1)) + 1
     if count < 2:
         return labels, np.ones(count, dtype=bool), []
-    votes = np.bincount(labels[nearest_on_surface(mesh, points)[1]], minlength=count)
+    votes = np.bincount(_nearest_components(mesh, labels, points), minlength=count)
     least = max(least_points, least_share * len(points))
     stays = votes >= least
     stays[votes.argmax()] = True
@@ -278,6 +280,24 @@ def _vote(
         f"(at most {votes[~stays].max(initial=0)})."
     )
     return labels, stays, [sentence] if dropped else []
+
+
+def _nearest_components(mesh: Mesh, labels: Int, points: Float) -> Int:
+    """Return the component, of shape (N,), that each point's nearest face, of labels of shape (F,), belongs to.
+
+    Most points are so near to a vertex of the largest component that no other can be nearer; the others are few, and
+    the search for the nearest face takes a library that is slow to load.
+    """
+    largest = int(np.bincount(labels).argmax())
+    one, others = submesh(mesh, labels == largest), submesh(mesh, labels != largest)
+    # No point of a triangle is farther from all of its corners than its longest side over the root of three.
+    reach = float(side_lengths(others).max()) / np.sqrt(3)
+    near, next_near = (cKDTree(part.vertices).query(points)[0] for part in (one, others))
+    unclear = next_near - reach <= near
+    nearest = np.full(len(points), largest, dtype=labels.dtype)
+    if unclear.any():
+        nearest[unclear] = labels[nearest_on_surface(mesh, points[unclear])[1]]
+    return nearest
 
 
 def _orient_component(part: Mesh, others: list[Mesh]) -> Mesh:
