@@ -273,7 +273,7 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals))
     bounds, points = bounds_of(samples), samples.frame.to_world(samples.points)
-    sheet = sheet_thickness(points, samples.normals)
+    sheet = sheet_thickness(points, samples.normals, (samples.noise or 0.0) * samples.frame.scale)
     run.options = run.options.for_scan(points, bounds, sheet)
     run.options.require_reachable(bounds)
     if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:

@@ -101,9 +101,11 @@ def _depth_variation(heights: Float, opposing: Mask, *, least_neighbours: int = 
 def sheet_thickness(
     points: Float,
     normals: Float,
+    noise: float = 0.0,
     *,
     neighbours: int = 16,
     queries: int = 10_000,
+    least_depth_deviations: float = 4.0,
     least_share: float = 0.02,
     percentile: float = 10.0,
 ) -> float | None:
@@ -112,8 +114,10 @@ def sheet_thickness(
     Parameters
     ----------
     points, normals : arrays of shape (N, 3); outward unit normals
+    noise : standard deviation of the points along the normal, in their unit
     neighbours : of a point, among which the layer behind it is looked for; farther layers are far for the spacing
     queries : random points at which it is measured
+    least_depth_deviations : of the noise, of a layer behind a point: less may be the noise of the two points alone
     least_share : of these with a layer behind them, below which it may be noise
     percentile : of the depths of these layers
     """
@@ -122,7 +126,7 @@ def sheet_thickness(
     some = np.random.default_rng(0).permutation(len(points))[:queries]
     near = cKDTree(points).query(points[some], min(neighbours + 1, len(points)))[1]
     depths = -np.einsum("gki,gi->gk", points[near] - points[some, None], normals[some])
-    behind = (np.einsum("gki,gi->gk", normals[near], normals[some]) < -0.9) & (depths > 0)
+    behind = (np.einsum("gki,gi->gk", normals[near], normals[some]) < -0.9) & (depths > least_depth_deviations * noise)
     found = np.flatnonzero(behind.any(axis=1))
     if len(found) < least_share * len(some):
         return None

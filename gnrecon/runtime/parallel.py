@@ -10,9 +10,10 @@ do.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
+from functools import cached_property
 from threading import Lock
 from typing import TypeVar
 
@@ -26,13 +27,32 @@ Result = TypeVar("Result")
 
 _lock = Lock()
 
-_workers: ContextVar[int | None] = ContextVar("_workers", default=None)
-"""Threads for pieces of work, where a block fixes sums; a thread that starts later does not inherit it."""
+
+class _Workers:
+    """Threads for pieces of work, each with one torch thread, started when they are first used."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    @cached_property
+    def pool(self) -> ThreadPoolExecutor:
+        """The threads, which stay, because to start them takes as long as a small product."""
+        return ThreadPoolExecutor(self.count, initializer=set_threads, initargs=(1,))
+
+    def close(self) -> None:
+        """End the threads if any were started."""
+        if "pool" in vars(self):
+            self.pool.shutdown()
+
+
+_workers: ContextVar[_Workers | None] = ContextVar("_workers", default=None)
+"""Those of a block that fixes sums; a thread that starts later does not inherit them."""
 
 
 def worker_count() -> int:
     """Return how many threads `map_in_threads` uses: those of `fixed_sums`, elsewhere as many as torch has."""
-    return _workers.get() or torch.get_num_threads()
+    workers = _workers.get()
+    return torch.get_num_threads() if workers is None else workers.count
 
 
 @contextmanager
@@ -46,12 +66,14 @@ def fixed_sums(threads: int | None) -> Iterator[None]:
     ----------
     threads : for pieces of work; by default as many as the caller has
     """
-    before = _workers.set(threads or worker_count())
+    workers = _Workers(threads or worker_count())
+    before = _workers.set(workers)
     try:
         with torch_threads(1), _one_blas_thread:
             yield
     finally:
         _workers.reset(before)
+        workers.close()
 
 
 class _OneBlasThread:
@@ -132,12 +154,15 @@ def map_in_threads(
         advance(number / len(items))
         return result
 
-    threads = min(worker_count(), len(items))
-    if threads <= 1 or torch.device(device).type != "cpu":
+    if min(worker_count(), len(items)) <= 1 or torch.device(device).type != "cpu":
         return [report(work(item), number) for number, item in enumerate(items, 1)]
-    pool = ThreadPoolExecutor(threads, initializer=set_threads, initargs=(1,))
+    kept = _workers.get()
+    workers = kept or _Workers(worker_count())
+    futures = [workers.pool.submit(work, item) for item in items]
     try:
-        futures = [pool.submit(work, item) for item in items]
         return [report(future.result(), number) for number, future in enumerate(futures, 1)]
     finally:
-        pool.shutdown(cancel_futures=True)
+        # None runs on when one has failed.
+        wait([future for future in futures if not future.cancel()])
+        if workers is not kept:
+            workers.close()

@@ -147,6 +147,8 @@ def test_two_opposite_layers_show_the_thickness_of_a_sheet(rng: np.random.Genera
     flat = np.column_stack([rng.uniform(-1, 1, (3000, 2)), 0.02 * sides])
     normals = sides[:, None] * [[0.0, 0, 1]]
     assert sheet_thickness(flat + 1000, normals) == pytest.approx(0.04)
+    assert sheet_thickness(flat, normals, noise=0.009) == pytest.approx(0.04)
+    assert sheet_thickness(flat, normals, noise=0.011) is None  # two sides of one surface may be as far apart
     assert sheet_thickness(flat, np.abs(normals)) is None
     assert sheet_thickness(flat, -normals) is None  # the layers face each other: nothing is between them
     assert sheet_thickness(*sphere(3000)) is None

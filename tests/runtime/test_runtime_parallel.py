@@ -24,6 +24,7 @@ from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.compute_limits import limited
 from gnrecon.runtime.parallel import map_in_threads, set_threads, worker_count
+from gnrecon.runtime.preload import preload
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
@@ -90,6 +91,7 @@ def test_the_process_is_left_as_it_was() -> None:
             str(Path.cwd()),
         ]
 
+    preload()  # libraries add filters of warnings when they are imported
     before = state()
     reconstruct(*torus(600, np.random.default_rng(1)), threads=1, **FEW)
     assert state() == before
