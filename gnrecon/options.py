@@ -10,6 +10,7 @@ import numpy as np
 
 from gnrecon.export import RefineOptions
 from gnrecon.export.mesh_field import MeshOptions
+from gnrecon.export.resolution import cells_for_sheet
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.geometry.arrays import Float
@@ -255,11 +256,6 @@ class Options(OptionTable):
 
 
 Options.__doc__ = f"{Options.__doc__}\n    {option_documentation()}"
-
-
-def cells_for_sheet(longest: float, thickness: float, *, cells_through: float = 2.0) -> int:
-    """Return the cells along a box that resolve a sheet: with fewer through it, its two sides meet in places."""
-    return math.ceil(cells_through * longest / thickness)
 
 
 def _default_cells(

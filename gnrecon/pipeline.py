@@ -29,7 +29,7 @@ from gnrecon.export import (
     verify_file,
     vertex_error,
 )
-from gnrecon.export.mesh_field import cells_for_curvature, mesh_field
+from gnrecon.export.mesh_field import cells_for_faces, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
@@ -50,7 +50,7 @@ from gnrecon.io import (
     write_mesh,
 )
 from gnrecon.optim import Record
-from gnrecon.options import Options, cells_for_sheet
+from gnrecon.options import Options
 from gnrecon.report.estimate import estimate
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
@@ -271,18 +271,18 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     """Clean and thin the points, orient their normals, and choose a resolution from their spacing."""
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
-        ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals))
-    bounds, points = bounds_of(samples), samples.frame.to_world(samples.points)
-    sheet = sheet_thickness(points, samples.normals, (samples.noise or 0.0) * samples.frame.scale)
+        points, noise = samples.frame.to_world(samples.points), (samples.noise or 0.0) * samples.frame.scale
+        sheet = sheet_thickness(points, samples.normals, noise)
+        ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals), sheet)
+    bounds = bounds_of(samples)
     run.options = run.options.for_scan(points, bounds, sheet)
     run.options.require_reachable(bounds)
     if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
         require_memory(expected.memory_mb)
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
-    layers, cells = ingested.layers, run.options.mesh().cells(bounds)
+    layers, cells, longest = ingested.layers, run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
-    unclear = layers.offset if layers is not None and samples.estimated else None
-    warnings += thin_sheet_remark(sheet, unclear, cells, partial(cells_for_sheet, np.ptp(bounds, axis=0).max()))
+    warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested
 
@@ -312,7 +312,7 @@ def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted)
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
-        run.options = replace(run.options, resolution=cells_for_curvature(sdf, run.options.resolution))
+        run.options = replace(run.options, resolution=cells_for_faces(sdf, run.options.resolution, ingested.sheet))
     cell = float(np.ptp(sdf.bounds, axis=0).max()) / run.options.mesh().cells(sdf.bounds)
     run.remark([] if sdf.data is None else coarse_parts_remark(sdf.data, cell))
     # With the field's own points, so that a saved field makes the same mesh again.

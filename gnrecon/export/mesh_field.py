@@ -22,6 +22,7 @@ from gnrecon.export.remeshing.refine import RefineOptions
 from gnrecon.export.resolution import (
     Fineness,
     cells_for_edges,
+    cells_for_sheet,
     measure_fineness,
     projected_chord_error,
     refined_resolution,
@@ -108,39 +109,63 @@ class MeshOptions:
         return self.resolution or self.default_cells
 
 
-def cells_for_curvature(
-    sdf: NeuralSDF, cells: int, *, most_cells: int = 224, samples: int = 2000, chord_ratio: float = 0.07
+def cells_for_faces(
+    sdf: NeuralSDF,
+    cells: int,
+    sheet: float | None = None,
+    *,
+    least_cells: int = 128,
+    most_cells: int = 224,
+    samples: int = 2000,
+    chord_ratio: float = 0.07,
+    noise_share: float = 0.05,
 ) -> int:
-    """Return the cells, or more, so that a smooth shape's faces are no farther off the surface than its field.
+    """Return the cells that the faces need: more for a smooth shape without noise, fewer where noise hides the gain.
 
     The amplitude of the detail field at the data bounds the error of the smooth global field between them. It is far
-    more than the distance of the faces, except on smooth shapes that were scanned without noise.
+    more than the distance of the faces, except on smooth shapes that were scanned without noise. Where faces are nearer
+    to the field than a small share of the noise, finer ones bring them no nearer to the surface.
 
     Parameters
     ----------
     sdf : NeuralSDF
     cells : int
-        Least to return.
+        That suit the spacing of the points.
+    sheet : float, file units, optional
+        Thickness of the thinnest sheet, which the cells resolve whatever the noise is.
+    least_cells : int
+        Least to return because of noise.
     most_cells : int
-        Most to return for the faces' sake.
+        Most to return for the sake of smooth faces.
     samples : int
         Most points at which the curvature is evaluated.
     chord_ratio : float
         Mean distance of faces from the surface over its curvature and the square of a cell; 0.072 on spheres.
+    noise_share : float
+        Mean distance of faces, over the deviation of the points' noise, that is small enough.
     """
     data = sdf.data
-    if sdf.detail is None or data is None or cells >= most_cells:
+    if sdf.detail is None or data is None:
         return cells
-    # The coarse field at the data is the detail that the smooth field does not represent.
     some = data[:: max(1, len(data) // samples)]
-    off = float(np.sqrt(np.mean(sdf.coarse().sdf(some) ** 2)))
     mean, gauss = curvatures(sdf.gradient(some), sdf.hessian(some))
     # sqrt(k1^2 + k2^2) from the mean and the Gauss curvature.
     bend = float(np.nanmean(np.sqrt((4 * mean**2 - 2 * gauss).clip(0.0))))
     longest = float(np.ptp(sdf.bounds, axis=0).max())
-    # off = chord_ratio bend (longest / wanted)^2
-    wanted = longest * np.sqrt(chord_ratio * bend / max(off, np.finfo(np.float64).tiny))
-    return int(np.clip(np.ceil(wanted), cells, most_cells))
+
+    def needed(off: float) -> int:
+        """Return the cells for a mean distance: off = chord_ratio bend (longest / cells)^2."""
+        least_off = chord_ratio * bend * (longest / ExportParameters.resolution.most_refined_cells) ** 2
+        return math.ceil(longest * math.sqrt(chord_ratio * bend / max(off, least_off, np.finfo(np.float64).tiny)))
+
+    if (enough := needed(noise_share * sdf.detail.position * sdf.frame.scale)) < cells:
+        through = 0 if sheet is None else cells_for_sheet(longest, sheet)
+        return min(max(enough, least_cells, through), cells)
+    if cells >= most_cells:
+        return cells
+    # The coarse field at the data is the detail that the smooth field does not represent.
+    off = float(np.sqrt(np.mean(sdf.coarse().sdf(some) ** 2)))
+    return min(max(needed(off), cells), most_cells)
 
 
 @dataclass(frozen=True)

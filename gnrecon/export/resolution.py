@@ -52,6 +52,11 @@ class Fineness:
         return asdict(self)
 
 
+def cells_for_sheet(longest: float, thickness: float, *, cells_through: float = 2.0) -> int:
+    """Return the cells along a box that resolve a sheet: with fewer through it, its two sides meet in places."""
+    return math.ceil(cells_through * longest / thickness)
+
+
 def cells_for_edges(
     length: float, bounds: Float, *, parameters: ResolutionParameters = ExportParameters.resolution
 ) -> int:

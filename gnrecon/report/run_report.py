@@ -31,12 +31,13 @@ class ScanRead:
 
 @dataclass(frozen=True)
 class Ingested:
-    """The points to fit, what was removed, and what is known of the scan."""
+    """The points to fit, what was removed, and what is known of the scan; `sheet` is its thinnest, file units."""
 
     samples: Samples
     counts: IngestCounts
     survey: Survey | None
     layers: Layers | None
+    sheet: float | None
 
 
 @dataclass(frozen=True)

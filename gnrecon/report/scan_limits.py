@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from gnrecon.export.resolution import cells_for_sheet
 from gnrecon.geometry.arrays import Float, Int
 
 
@@ -24,9 +23,7 @@ def few_points_remark(points: Float, *, few: int = 100) -> list[str]:
     ]
 
 
-def thin_sheet_remark(
-    thickness: float | None, layers: float | None, cells: int, needed: Callable[[float], int]
-) -> list[str]:
+def thin_sheet_remark(thickness: float | None, layers: float | None, cells: int, longest: float) -> list[str]:
     """Return a sentence where the mesh does not resolve the thinnest sheet that two layers of points show.
 
     Parameters
@@ -34,18 +31,18 @@ def thin_sheet_remark(
     thickness : between layers that face opposite ways, file units, if there are any
     layers : distance of layers that face the same way by estimated normals, file units, if there are any
     cells : of the mesh, along its box
-    needed : the cells that a thickness needs
+    longest : side of the box, file units
     """
     if layers is not None:
         return [
             "The two layers may also be the two sides of a thin sheet, which estimated normals do not show: give "
-            f"outward normals and --resolution {needed(layers)} for that."
+            f"outward normals and --resolution {cells_for_sheet(longest, layers)} for that."
         ]
-    if thickness is None or cells >= needed(thickness):
+    if thickness is None or cells >= (needed := cells_for_sheet(longest, thickness)):
         return []
     return [
         f"Two opposite layers of points are {thickness:.3g} apart, a sheet too thin for {cells} cells along the box; "
-        f"--resolution {needed(thickness)} resolves it."
+        f"--resolution {needed} resolves it."
     ]
 
 

@@ -13,10 +13,10 @@ from analytic_fields import UTM, Field, torus
 from gnrecon.export import SignedDistance
 from gnrecon.export import mesh_field as meshing
 from gnrecon.export.export_parameters import ExportParameters, ResolutionParameters
-from gnrecon.export.mesh_field import MeshOptions, cells_for_curvature, mesh_field
-from gnrecon.export.resolution import chord_error
+from gnrecon.export.mesh_field import MeshOptions, cells_for_faces, mesh_field
+from gnrecon.export.resolution import cells_for_sheet, chord_error
 from gnrecon.ingest.point_spacing import neighbour_spacing
-from gnrecon.options import Options, cells_for_sheet
+from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
 from gnrecon.runtime.errors import UsageError
 
@@ -137,8 +137,21 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
             x = result.mesh.vertices[result.mesh.faces].mean(axis=1)
             off = np.hypot(np.hypot(x[:, 0], x[:, 1]) - 3, x[:, 2]) - 1
             assert np.abs(off).mean() < 3e-4
-            assert cells_for_curvature(result.sdf, 200) == max(200, cells)
-            assert cells_for_curvature(replace(result.sdf, detail=None), 128) == 128
+            assert cells_for_faces(result.sdf, 200) == max(200, cells)
+            assert cells_for_faces(replace(result.sdf, detail=None), 128) == 128
+        else:
+            # The noise hides what more cells gain, but not a sheet that the points show.
+            fewer = cells_for_faces(result.sdf, 512, least_cells=16)
+            assert fewer < 100
+            assert cells_for_faces(result.sdf, 512) == 128
+            box_edge = float(np.ptp(result.sdf.bounds, axis=0).max())
+            assert cells_for_faces(result.sdf, 512, sheet=box_edge / 150) == 300
+            # Half of the cells have four times the distance of the faces, which needs four times the noise.
+            assert result.sdf.detail is not None
+            noisier = replace(result.sdf.detail, position=4 * result.sdf.detail.position)
+            assert cells_for_faces(replace(result.sdf, detail=noisier), 512, least_cells=16) == pytest.approx(
+                fewer / 2, abs=1
+            )
     assert found[0.0] > found[0.02] == 128
     few = reconstruct(points[::8], normals[::8], quality="draft", resolution=24)
     assert few.report["fineness"]["resolution"] == 24

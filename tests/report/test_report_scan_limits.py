@@ -41,13 +41,10 @@ def test_scans_of_one_part_are_never_said_to_have_more() -> None:
 
 
 def test_a_sheet_too_thin_for_the_cells_is_said() -> None:
-    def needed(thickness: float) -> int:
-        return round(100 / thickness)
-
-    assert thin_sheet_remark(None, None, 10, needed) == thin_sheet_remark(0.5, None, 200, needed) == []
-    (sentence,) = thin_sheet_remark(0.25, None, 256, needed)
+    assert thin_sheet_remark(None, None, 10, 50.0) == thin_sheet_remark(0.5, None, 200, 50.0) == []
+    (sentence,) = thin_sheet_remark(0.25, None, 256, 50.0)
     assert "0.25 apart" in sentence
     assert "--resolution 400 resolves it" in sentence
-    (sentence,) = thin_sheet_remark(None, 0.2, 256, needed)
+    (sentence,) = thin_sheet_remark(None, 0.2, 256, 50.0)
     assert "the two sides of a thin sheet" in sentence
     assert "--resolution 500" in sentence
