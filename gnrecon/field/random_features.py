@@ -48,6 +48,10 @@ class Features:
         """Return the same features in another precision."""
         return Features(self.frequencies.to(dtype), self.phases.to(dtype))
 
+    def first(self, count: int) -> Features:
+        """Return the first of the features, at most so many."""
+        return Features(self.frequencies[:count], self.phases[:count])
+
     @cached_property
     def _affine(self) -> Tensor:
         """Frequencies and phases in one matrix, of shape (4, m); a product with it is faster than one and a sum."""

@@ -126,9 +126,9 @@ def solve_cube(
     position, angle = hyperparameters.position, hyperparameters.angle
     if penalties is None:
         features = _precise_enough(features, patch, length, hyperparameters, parameters)
-    system = PatchSystem(patch, features, length, patch.size)
     if hyperparameters.by_place and penalties is None:
-        length, system = _likeliest_system(system, patch, features, length, (position, angle), parameters)
+        length = _likeliest_length(patch, features, length, (position, angle), parameters)
+    system = PatchSystem(patch, features, length, patch.size)
     draw = partial(space.near, length, position)
     if penalties is None:
         return length, system.solve_with_bounds(position, angle, draw)
@@ -146,26 +146,26 @@ def _precise_enough(
     return features.to(torch.float32) if largest < parameters.most_single_eigenvalue else features
 
 
-def _likeliest_system(
-    best: PatchSystem,
-    patch: Patch,
-    features: Features,
-    length: float,
-    noise: tuple[float, float],
-    parameters: LocalFieldParameters,
-) -> tuple[float, PatchSystem]:
-    """Return the length near a given one, of `best`, of which the cube's own data is most likely, and its system."""
-    most = best.log_evidence(*noise)
+def _likeliest_length(
+    patch: Patch, features: Features, length: float, noise: tuple[float, float], parameters: LocalFieldParameters
+) -> float:
+    """Return the length near a given one of which the cube's own data is most likely."""
+    # Which of two lengths is likelier, a part of the features shows as well as all of them, in a fraction of the time.
+    some = features.first(parameters.length_features)
+
+    def likelihood(length: float) -> float:
+        return PatchSystem(patch, some, length, patch.size).log_evidence(*noise)
+
+    most = likelihood(length)
     for factor in (1 / parameters.length_step, parameters.length_step):
         start = length
         for _ in range(parameters.most_length_steps):
-            system = PatchSystem(patch, features, factor * length, patch.size)
-            if not (found := system.log_evidence(*noise)) > most:
+            if not (found := likelihood(factor * length)) > most:
                 break
-            length, best, most = factor * length, system, found
+            length, most = factor * length, found
         if length != start:
             break
-    return length, best
+    return length
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ class TwoLevelParameters:
     global_field_points: int = 5000  # most points that the global field is fitted to; its 1,000 units resolve no more
     validation_one_in: int = 6  # one point in so many is a validation point
     most_validation_points: int = 2000  # where the local fields are not solved by blocks; more change no choice
-    most_refitted_points: int = 6000  # up to which the network takes its last steps on all points, see `global_field`
+    # Up to which the network takes its last steps on all points: with more, local fields make up for those left out.
+    most_refitted_points: int = 800
     global_time_share: float = 0.4  # of the whole fit, measured, for the progress bar
 
 
@@ -31,6 +32,7 @@ class LocalFieldParameters:
     data_margin_disk_radii: float = 2.0  # a cube is also fitted to data so far beyond it
     least_points: int = 4  # of a cube; fewer do not define a surface
     most_length_stretch: float = 4.0  # most a cube's length scale may exceed the scan's where points are sparse
+    length_features: int = 300  # most that the likelihood of a length is computed with
     length_step: float = 2.0**0.5  # between the lengths of which a cube's own data chooses
     most_length_steps: int = 2  # from the scan's length
     most_single_eigenvalue: float = 1e5  # of J^T J over the prior's; single precision suffices below

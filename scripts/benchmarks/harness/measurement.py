@@ -10,11 +10,12 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryFile
 from time import perf_counter, process_time
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -63,6 +64,29 @@ class Stopwatch:
 def _cpu_seconds() -> float:
     times = os.times()
     return process_time() + times.children_user + times.children_system
+
+
+def run_command(words: Sequence[str], threads: int) -> dict[str, Any]:
+    """Run a command with so many threads of the numerical libraries; return its seconds and its peak memory.
+
+    The figures are `seconds`, `cpu_seconds` and `peak_memory_mb`, that of its largest process. A failure is a result
+    too: the last line that it wrote then replaces them, under ``"error"``.
+    """
+    with TemporaryFile("w+", encoding="utf-8") as messages:
+        start = perf_counter()
+        process = subprocess.Popen(words, env=_environment(threads), stdout=subprocess.DEVNULL, stderr=messages)
+        _, status, used = os.wait4(process.pid, 0)
+        seconds = perf_counter() - start
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            messages.seek(0)
+            last = messages.read().strip().splitlines()[-1:]
+            return {"error": last[0] if last else f"The process ended with status {process.returncode}."}
+    return {
+        "seconds": seconds,
+        "cpu_seconds": used.ru_utime + used.ru_stime,
+        "peak_memory_mb": used.ru_maxrss * 1024 / 1e6,
+    }
 
 
 class Clock:
