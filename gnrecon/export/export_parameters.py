@@ -53,6 +53,8 @@ class ResolutionParameters:
     error_quantile: float = 0.999
     # Faces at which the chord error is measured: four points each, so that 20 lie beyond this quantile.
     error_faces: int = 5_000
+    # Distance of vertices from the zero level, in half edges, that is no matter next to that of the faces.
+    projection_tolerance: float = 1e-3
 
 
 @dataclass(frozen=True)

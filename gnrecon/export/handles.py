@@ -37,7 +37,9 @@ from gnrecon.geometry.statistics import widest_gap
 from gnrecon.runtime.errors import MeshError
 
 
-def remove_handles(mesh: Mesh, points: Float, *, parameters: HandleParameters | None = None) -> tuple[Mesh, list[str]]:
+def remove_handles(
+    mesh: Mesh, points: Float, *, parameters: HandleParameters | None = None, known_sound: bool = False
+) -> tuple[Mesh, list[str]]:
     """Cut handles and close tunnels that no points support.
 
     Parameters
@@ -48,6 +50,8 @@ def remove_handles(mesh: Mesh, points: Float, *, parameters: HandleParameters | 
         The cloud that the surface was fitted to.
     parameters : HandleParameters, optional
         By default ``HandleParameters()``.
+    known_sound : bool
+        Whether the mesh need not be checked, as after a repair.
 
     Returns
     -------
@@ -61,7 +65,8 @@ def remove_handles(mesh: Mesh, points: Float, *, parameters: HandleParameters | 
     MeshError
         When the mesh is not sound, as an open one.
     """
-    require_sound(mesh)
+    if not known_sound:
+        require_sound(mesh)
     if len(points) < 2:
         return mesh, []
     # The random words only tell classes apart, so that a fixed seed gives the same mesh each time.

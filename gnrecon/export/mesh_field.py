@@ -223,9 +223,11 @@ def mesh_field(
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
         mesh, fast, cells, dropped = _extract_until_accurate(field, options, data, box, advance, parameters)
-    # Two Newton steps bring a smooth field to rounding; gradients may come from the cheaper field.
+    # The first Newton step brings nearly all vertices so near to the zero level that it is no matter next to the faces.
     with stages("project"):
-        mesh = project(mesh, field, steps=2, rough=None if fast is field else fast, advance=advance)
+        rough = None if fast is field else fast
+        tolerance = parameters.resolution.projection_tolerance
+        mesh = project(mesh, field, steps=2, rough=rough, tolerance=tolerance, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []
     if options.refine.anything:
@@ -235,7 +237,7 @@ def mesh_field(
         mesh, repaired = repair(mesh)
         cut: list[str] = []
         if data is not None and not options.keep_handles:
-            mesh, cut = remove_handles(mesh, data, parameters=parameters.handles)
+            mesh, cut = remove_handles(mesh, data, parameters=parameters.handles, known_sound=True)
         fineness = measure_fineness(mesh, field, cells, box, parameters=parameters.resolution)
     sentences = _resolution_sentences(fineness, options, parameters.resolution.most_refined_cells)
     return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *sentences])

@@ -28,6 +28,7 @@ def project(
     steps: int = 3,
     limit: float | None = None,
     rough: SignedDistance | None = None,
+    tolerance: float = 1e-8,
     batch: int = 65536,
     advance: ProgressCallback = ignore_progress,
 ) -> Mesh:
@@ -44,7 +45,10 @@ def project(
     limit : float, file units, optional
         Largest distance that a vertex may move; by default half the median edge, which is less than half a cell.
     rough : SignedDistance, optional
-        The same field, cheaper and a little less accurate. It then gives the gradients; values are the field's own.
+        The same field, cheaper and a little less accurate. It then gives the gradients and the values at the start;
+        other values are the field's own.
+    tolerance : float
+        Vertices nearer to the zero level than this, in limits, take no further step.
     batch : int
         Most points to evaluate at once.
     advance : callable
@@ -70,7 +74,9 @@ def project(
     value = np.empty(len(moved))
     gradient = np.empty_like(moved)
     for rows in slices(len(moved), batch):
-        moved[rows], value[rows], gradient[rows] = newton_project(mesh.vertices[rows], field, steps, limit, rough)
+        moved[rows], value[rows], gradient[rows] = newton_project(
+            mesh.vertices[rows], field, steps, limit, rough, tolerance=tolerance
+        )
         advance(rows.stop / len(moved))
     back = _vertices_to_restore(mesh, moved)
     moved[back] = mesh.vertices[back]
@@ -107,29 +113,36 @@ def newton_project(
     limit: float,
     rough: SignedDistance | None = None,
     *,
+    tolerance: float = 1e-8,
     gradient_reuse_limits: float = 0.05,
 ) -> tuple[Float, Float, Float]:
     """Move points of shape (N, 3) by Newton steps, and return them with the value and the gradient there.
 
     Points stay within `limit` of their start. After a step shorter than `gradient_reuse_limits`, in limits, the old
     gradient is kept: a gradient costs as much as two or three values, and over a fiftieth of a cell, which most steps
-    are shorter than, it hardly changes. With a rough field, see `project`, gradients are that field's.
+    are shorter than, it hardly changes. With a rough field, see `project`, gradients are that field's, and so is the
+    value at the start: nearly all points then need one value of the field itself. Points nearer than `tolerance`, in
+    limits, take no further step.
     """
     points = start.copy()
     value, gradient = sdf_and_gradient(rough or field, points)
-    if rough is not None and steps:
-        value = field.sdf(points)
-    for _ in range(steps):
-        rows, trial = _newton_steps(points, value, gradient, start, limit, field.bounds)
+    for number in range(steps):
+        # Of rough values, none is near enough.
+        from_rough = rough is not None and number == 0
+        near_enough = -1.0 if from_rough else tolerance
+        rows, trial = _newton_steps(points, value, gradient, start, limit, field.bounds, near_enough)
         if not len(rows):
             break
-        trial_value = field.sdf(trial)
-        # A step that does not reduce the field's magnitude is not taken: the linear model failed.
-        better = np.abs(trial_value) < np.abs(value[rows])
+        trial_value, slopes = field.sdf(trial), np.linalg.norm(gradient[rows], axis=1)
+        # A step that does not reduce the field's magnitude is not taken: the linear model failed. A rough value that is
+        # smaller than the difference of both fields says nothing about that.
+        allowed = gradient_reuse_limits * limit * slopes if from_rough else 0.0
+        better = np.abs(trial_value) < np.maximum(np.abs(value[rows]), allowed)
         rows, trial, trial_value = rows[better], trial[better], trial_value[better]
         far = np.linalg.norm(trial - points[rows], axis=1) > gradient_reuse_limits * limit
-        # Scaled to the slope observed along the step: where the gradient is kept, the next step is a secant step.
-        gradient[rows] *= (1.0 - trial_value / value[rows])[:, None]
+        if not from_rough:
+            # Scaled to the slope observed along the step: where the gradient is kept, the next step is a secant step.
+            gradient[rows] *= (1.0 - trial_value / value[rows])[:, None]
         points[rows], value[rows] = trial, trial_value
         gradient[rows[far]] = (rough or field).gradient(trial[far])
     return points, value, gradient
@@ -142,17 +155,16 @@ def _newton_steps(
     start: Float,
     limit: float,
     bounds: Float,
-    *,
-    converged_limits: float = 1e-8,
+    tolerance: float,
 ) -> tuple[Int, Float]:
     """Rows that may take a Newton step, of shape (S,), and where it leads them, of shape (S, 3).
 
-    Points nearer to the zero level than `converged_limits`, in limits, take no further step.
+    Points nearer to the zero level than `tolerance`, in limits, take none.
     """
     low, high = bounds
     slopes = np.linalg.norm(gradient, axis=1)
     # From one side of the limit to the other is twice the limit; where the field is flat there is no step.
-    open_rows = np.abs(value) > converged_limits * limit * slopes
+    open_rows = np.abs(value) > tolerance * limit * slopes
     rows = np.flatnonzero(open_rows & (np.abs(value) <= 2 * limit * slopes))
     trial = points[rows] - (value[rows] / slopes[rows])[:, None] * (gradient[rows] / slopes[rows][:, None])
     near = np.linalg.norm(trial - start[rows], axis=1) <= limit
