@@ -20,3 +20,6 @@ class IOParameters:
 
     visible_rounding_diagonals: float = 1e-6
     # Rounding to float32, in diagonals of the mesh, that is reported or avoided: about eight times the float32 epsilon.
+
+    most_built_numbers: int = 100_000_000
+    # Coordinates and indices that a file may build by using what it stores many times: they take some 3 GB while read.

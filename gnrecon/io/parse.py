@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Values
+from gnrecon.io.io_parameters import IOParameters
 from gnrecon.runtime.errors import InputError
 
 
@@ -90,3 +91,22 @@ def sibling_path(folder: Path, name: str, what: str) -> Path:
     if not target.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"the {what} {name[:80]!r} lies outside of the file's folder, so it is not read.")
     return target
+
+
+def require_buildable(instances: int, numbers: int, stored: int, most_instances: int) -> None:
+    """Refuse a scene that uses what it stores so often that it takes minutes or all memory to build.
+
+    Parameters
+    ----------
+    instances : objects that the scene builds
+    numbers : coordinates, indices and attributes' values of all of them
+    stored : how many of them the file itself can hold
+    most_instances : that are built within a minute
+
+    Raises
+    ------
+    InputError
+        When it does.
+    """
+    if instances > most_instances or numbers > max(IOParameters.most_built_numbers, stored):
+        raise InputError(f"the scene builds {instances:,} objects with {numbers:,} numbers, more than can be read.")

@@ -287,6 +287,29 @@ def test_damaged_3mf_models_are_refused(components: str, item: int, sentence: st
         read_mesh(path)
 
 
+@pytest.mark.parametrize(
+    ("levels", "copies", "items", "sentence"),
+    [
+        (6, 20, 1, "the scene builds 67,368,421 objects"),
+        (40, 1, 1, "contains itself"),
+        (40, 1, 40, "more than 32 levels"),
+    ],
+)
+def test_3mf_models_that_multiply_are_refused(
+    levels: int, copies: int, items: int, sentence: str, tmp_path: Path
+) -> None:
+    """`items` objects are built, the innermost first, so that each knows the one within."""
+    corner = '<object id="0"><mesh><vertices><vertex x="0" y="0" z="0"/></vertices><triangles/></mesh></object>'
+    rows = [
+        f'<object id="{level}">' + copies * f'<component objectid="{level - 1}"/>' + "</object>"
+        for level in range(1, levels + 1)
+    ]
+    built = "".join(f'<item objectid="{levels - place}"/>' for place in reversed(range(items)))
+    model = f"<model><resources>{corner}{''.join(rows)}</resources><build>{built}</build></model>"
+    with pytest.raises(InputError, match=sentence):
+        read_mesh(archive(tmp_path / "m.3mf", model))
+
+
 def test_damaged_3mf_archives_are_refused(tmp_path: Path, mesh: Mesh) -> None:
     whole = tmp_path / "whole.3mf"
     write_mesh(mesh, whole)

@@ -7,6 +7,7 @@ import io
 import json
 import struct
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +190,27 @@ def test_damaged_data_sets(
         read_cloud(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
+
+
+def test_gltf_builds_no_more_than_the_file_can_hold(tmp_path: Path) -> None:
+    path = file_of("gltf-embedded", random_cloud(np.random.default_rng(0), 20), tmp_path)
+    whole = path.read_text()
+    deep = [{"mesh": 0, "children": [place + 1]} for place in range(1_500)] + [{"mesh": 0}]
+    zeros = {"componentType": 5126, "type": "VEC4", "count": len(whole)}
+    damages: list[tuple[str, Callable[[Any], object]]] = [
+        ("declares 1000000000 values", lambda tree: tree["accessors"][0].update(count=10**9)),
+        ("declares 20 values", lambda tree: tree["bufferViews"][1].update(byteLength=19)),
+        ("more than the file holds", lambda tree: tree["accessors"].extend([zeros] * 2)),
+        ("sparse", lambda tree: tree["accessors"][0].update(sparse={"count": 1})),
+        ("builds 20,000 objects", lambda tree: tree.update(nodes=[{"mesh": 0}] * 20_000)),
+        ("nested too deep", lambda tree: tree.update(nodes=deep)),
+    ]
+    for sentence, damage in damages:
+        tree = json.loads(whole)
+        damage(tree)
+        path.write_text(json.dumps(tree))
+        with pytest.raises(InputError, match=sentence):
+            read_cloud(path)
 
 
 def test_compressed_files_are_recognised_whatever_they_are_called(tmp_path: Path) -> None:

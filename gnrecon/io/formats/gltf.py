@@ -27,7 +27,7 @@ from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, guard_parser
-from gnrecon.io.parse import sibling_path
+from gnrecon.io.parse import require_buildable, sibling_path
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.logs import unprinted_log
 
@@ -130,15 +130,52 @@ def _prepare(tree: dict[str, Any], size: int) -> None:
                 primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
 
 
-def _require_bounded(tree: dict[str, Any], size: int) -> None:
+def _require_bounded(tree: dict[str, Any], size: int, *, most_parts: int = 10_000) -> None:
     """Refuse counts that the file's bytes cannot hold, before trimesh allocates arrays of their size."""
     views = tree.get("bufferViews", [])
+    zeros = 0
     for accessor in tree.get("accessors", []):
-        # Without a view, the values are zero or sparse; a file that uses them has at least as many bytes.
-        view = accessor.get("bufferView")
+        if "sparse" in accessor:
+            raise InputError("an accessor is sparse, which is not supported; store its values in full.")
+        # Without a view, the values are zero; a file that uses them has at least as many bytes.
+        view, count = accessor.get("bufferView"), int(accessor["count"])
+        zeros += count if view is None else 0
         held = size if view is None else min(size, int(views[view]["byteLength"]))
-        if not 0 <= int(accessor["count"]) <= held:
-            raise InputError(f"an accessor declares {accessor['count']} values, more than the file holds.")
+        if not 0 <= count <= held or zeros > size:
+            raise InputError(f"an accessor declares {count} values, more than the file holds.")
+    used = _nodes_with_meshes(tree)
+    numbers = [_numbers(tree, mesh) for mesh in range(len(tree.get("meshes", [])))]
+    parts = sum(len(tree["meshes"][mesh]["primitives"]) for mesh in used)
+    require_buildable(parts, sum(numbers[mesh] for mesh in used), size, most_parts)
+
+
+def _nodes_with_meshes(tree: dict[str, Any], *, most_steps: int = 500_000) -> list[int]:
+    """The mesh of each node that has one. trimesh walks up from each to the root, some 30 microseconds a step."""
+    nodes = tree.get("nodes", [])
+    children = [node.get("children", []) for node in nodes]
+    inner = {child for row in children for child in row}
+    depth = {root: 1 for root in range(len(nodes)) if root not in inner}
+    waiting = list(depth)
+    while waiting:
+        parent = waiting.pop()
+        new = [child for child in dict.fromkeys(children[parent]) if child not in depth]
+        depth.update(dict.fromkeys(new, depth[parent] + 1))
+        waiting += new
+    found = [place for place, node in enumerate(nodes) if "mesh" in node]
+    if sum(depth.get(place, 1) for place in found) > most_steps:
+        raise InputError("the nodes of the scene are nested too deep.")
+    return [nodes[place]["mesh"] for place in found]
+
+
+def _numbers(tree: dict[str, Any], mesh: int) -> int:
+    """Coordinates, indices and attributes' values of a mesh."""
+    places = [
+        place
+        for primitive in tree["meshes"][mesh]["primitives"]
+        for place in [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+    ]
+    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+    return sum(columns.get(tree["accessors"][place]["type"], 4) * tree["accessors"][place]["count"] for place in places)
 
 
 def _rename(names: dict[str, Any], old: str, new: str) -> None:

@@ -30,7 +30,7 @@ from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.io_parameters import IOParameters
-from gnrecon.io.parse import format_rows, parse_numbers
+from gnrecon.io.parse import format_rows, parse_numbers, require_buildable
 from gnrecon.runtime.errors import InputError
 
 _NAMESPACES = {
@@ -251,14 +251,12 @@ class _Part:
         return (posixpath.normpath(path).lstrip("/"), values["objectid"]), matrix
 
 
-def _require_bounded(
-    model: _Model, *, most_depth: int = 32, most_instances: int = 1_000_000, most_vertices: int = 100_000_000
-) -> None:
+def _require_bounded(model: _Model, *, most_depth: int = 32, most_instances: int = 100_000) -> None:
     """Refuse a model that builds more than memory holds; objects that contain others twice multiply at each level."""
-    known: dict[Key, tuple[int, int]] = {}
+    known: dict[Key, tuple[int, int, int]] = {}
 
-    def counted(key: Key, depth: int) -> tuple[int, int]:
-        """Instances and vertices of an object with all that it contains."""
+    def counted(key: Key, depth: int) -> tuple[int, int, int]:
+        """Instances, numbers and levels of an object with all that it contains."""
         if key not in known:
             if key not in model.objects or depth > most_depth:
                 raise InputError(
@@ -266,16 +264,19 @@ def _require_bounded(
                 )
             current = model.objects[key]
             inner = [counted(part, depth + 1) for part, _ in current.parts]
-            own = len(current.vertices) // 3 + len(current.corners) // 3
-            known[key] = 1 + sum(one for one, _ in inner), own + sum(vertices for _, vertices in inner)
+            instances, numbers, levels = zip(*inner, strict=True) if inner else ((), (), (0,))
+            known[key] = (1 + sum(instances), _numbers(current) + sum(numbers), 1 + max(levels))
+        if known[key][2] > most_depth:
+            raise InputError(f"the 3MF model nests objects more than {most_depth} levels deep.")
         return known[key]
 
     totals = [counted(key, 0) for key, _ in model.items]
-    instances, vertices = (sum(column) for column in zip(*totals, strict=True)) if totals else (0, 0)
-    if instances > most_instances or vertices > most_vertices:
-        raise InputError(
-            f"the 3MF model builds {instances:,} objects with {vertices:,} vertices and faces, too many for memory."
-        )
+    instances, numbers = (sum(total[column] for total in totals) for column in (0, 1))
+    require_buildable(instances, numbers, sum(map(_numbers, model.objects.values())), most_instances)
+
+
+def _numbers(current: _Object) -> int:
+    return len(current.vertices) + len(current.corners)
 
 
 def _transformed(model: _Model, key: Key, matrix: Float) -> Iterator[Contents]:
