@@ -85,3 +85,22 @@ def test_how_a_child_ends(deed: str, code: ExitCode, printed: str) -> None:
     done = ended(["-c", "\n".join(lines)])
     assert (done.returncode, done.stderr[: len(printed)]) == (code, printed)
     assert done.stderr.count("\n") == bool(printed)
+
+
+def test_native_code_that_asks_for_memory_for_ever_is_ended() -> None:
+    """OpenBLAS does so where it finds no room for its buffers; here, reads of zeros take the time in the system."""
+    lines = (
+        "import mmap, os",
+        "from gnrecon.cli.supervision import continue_in_child",
+        "continue_in_child()",
+        "zeros, buffer, kept = os.open('/dev/zero', os.O_RDONLY), bytearray(1 << 20), []",
+        "try:",
+        "    while True:",
+        "        kept.append(mmap.mmap(-1, 1 << 20))",
+        "except OSError:",
+        "    while True:",
+        "        os.readv(zeros, [buffer])",
+    )
+    done = ended(["-c", "\n".join(lines)], 700_000)
+    assert (done.returncode, done.stdout) == (ExitCode.MEMORY, ""), done.stderr
+    assert "ended the run by signal 6, most likely because a limit left it no memory" in done.stderr
