@@ -194,14 +194,14 @@ class Options(OptionTable):
         thin = cells if sheet is None else cells_for_sheet(longest, sheet)
         return replace(self, resolution=max(cells, thin if thin <= most_sheet_cells else cells))
 
-    def require_reachable(self, bounds: Float, *, most_faces: float = 1e8, least_error: float = 1e-9) -> None:
+    def require_reachable(self, bounds: Float, *, most_faces: float = 1e8, least_error: float = 1e-7) -> None:
         """Refuse lengths for which the mesh would not fit into memory, before the work.
 
         Parameters
         ----------
         bounds : box in which the points will be meshed, of shape (2, 3), file units
         most_faces : with `remesh`, of a surface as large as that of the box; a hundred bytes and more for each
-        least_error : of `max_error`, in longest sides of the box; doubles resolve hardly less
+        least_error : of `max_error`, in longest sides of the box: half of what 1024 cells, the most, leave on a ball
 
         Raises
         ------

@@ -88,6 +88,7 @@ def shaped(
     MeshError
         When there is no zero level, or no sound mesh can be made of it.
     """
+    _require_in_proportion(shape, sdf.bounds)
     box = sdf.bounds if shape.crop is None else shape.crop
     cell = float(np.ptp(box, axis=0).max()) / options.mesh().cells(box)
     region = sdf.bounds
@@ -115,6 +116,28 @@ def shaped(
     with stages("cut"):
         result = surfaces[0] if len(surfaces) == 1 else subtract(*surfaces)
         return result if shape.crop is None else crop(result, shape.crop), remarks
+
+
+def _require_in_proportion(shape: Shape, limits: Float, *, most_sizes: float = 100.0, least_size: float = 1e-6) -> None:
+    """Refuse lengths that have nothing to do with the model, before the work.
+
+    Parameters
+    ----------
+    shape : whose lengths are checked
+    limits : box of the model, of shape (2, 3)
+    most_sizes : of the box's longest side, for offsets: the model is a point within a ball then
+    least_size : of the same, for the sides of a crop: the field is stored with single precision
+    """
+    size = float(np.ptp(limits, axis=0).max())
+    for level in shape.levels:
+        if abs(level) > most_sizes * size:
+            raise UsageError(
+                f"A distance of {level:g} is out of proportion to the model, whose longest side is {size:.3g}."
+            )
+    if shape.crop is not None and np.ptp(shape.crop, axis=0).min() < least_size * size:
+        raise UsageError(
+            f"The crop is thinner than a millionth of the model; the box of the model is {_corners(limits)}."
+        )
 
 
 def _margin(cell: float, *, cells: float = 3) -> float:

@@ -112,6 +112,13 @@ def test_shapes_that_leave_nothing(sdf: NeuralSDF) -> None:
         shaped(sdf, OPTIONS, Shape(crop=box(0.9, 1.05)))
     with pytest.raises(UsageError, match="too small for this shape"):
         shaped(sdf, OPTIONS, Shape(offset=1e-9 * BIG))
+    for level in (Shape(offset=1e30), Shape(offset=-1e30), Shape(shell=1e30)):
+        with pytest.raises(UsageError, match="out of proportion to the model"):
+            shaped(sdf, OPTIONS, level)
+    with pytest.raises(UsageError, match="thinner than a millionth of the model"):
+        shaped(sdf, OPTIONS, Shape(crop=box(0.0, 1e-300)))
+    with pytest.raises(UsageError, match="give --max-error at least"):
+        shaped(sdf, replace(OPTIONS, max_error=1e-8 * BIG), Shape())
     for thickness in (0.0, -1.0, float("nan")):
         with pytest.raises(UsageError, match="must be positive"):
             Shape(shell=thickness)
