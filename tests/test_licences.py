@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -42,3 +43,37 @@ def test_without_pymeshlab(monkeypatch: pytest.MonkeyPatch) -> None:
             convert(whole)
     with pytest.raises(MeshError, match="pymeshlab, which is not installed"):
         repair(Mesh(corners, whole.faces[:3]))
+
+
+def looked_up(name: str, flaws: list[str], skipped: bool) -> dict[str, object]:
+    if skipped:
+        return {"name": name, "skip_reason": "not found on PyPI"}
+    return {"name": name, "version": "1.0", "vulns": [{"id": one, "fix_versions": ["1.1"]} for one in flaws]}
+
+
+@pytest.mark.parametrize(
+    ("packages", "code", "lines"),
+    [
+        ([("a", [], False), ("b", [], False)], 0, ["2 of the 2 packages that gnrecon requires were looked up."]),
+        ([("a", [], False), ("b", [], True)], 2, ["1 of the 2 packages that gnrecon requires were looked up. Not: b."]),
+        ([("a", ["X-1"], False), ("b", [], False)], 1, ["a 1.0: X-1, mended in ['1.1']", "2 of the 2 packages that"]),
+    ],
+)
+def test_what_was_not_looked_up_is_not_called_sound(
+    monkeypatch: pytest.MonkeyPatch, packages: list[tuple[str, list[str], bool]], code: int, lines: list[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(REPOSITORY / "scripts"))
+    audit = importlib.import_module("audit")
+    found = audit.audited({"dependencies": [looked_up(*package) for package in packages]}, {"a", "b"})
+    assert found[0] == code
+    assert [line.startswith(start) for line, start in zip(found[1], lines, strict=True)] == [True] * len(lines)
+
+
+def test_no_vulnerability_is_known() -> None:
+    pytest.importorskip("pip_audit", reason="pip-audit is not installed")
+    done = subprocess.run(
+        [sys.executable, "scripts/audit.py"], capture_output=True, text=True, check=False, cwd=REPOSITORY, timeout=300
+    )
+    if done.returncode == 2:
+        pytest.skip("packages could not be looked up: " + (done.stdout + done.stderr)[-300:])
+    assert done.returncode == 0, done.stdout

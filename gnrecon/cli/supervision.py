@@ -1,7 +1,8 @@
 """Runs the rest of a command in a child process, where a limit of memory may end it in native code, without a word.
 
-Native code that finds no memory aborts, exits by itself, or asks again for ever, as OpenBLAS does. The parent stays small,
-waits, passes signals on, ends what asks for ever, and reports such an end by one sentence and the exit code for memory.
+Native code that finds no memory aborts, exits by itself, or asks again for ever, as OpenBLAS does. The parent stays
+small, waits, passes signals on, ends what asks for ever, and reports such an end by one sentence and the exit code for
+memory.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ class _Usage:
 
 
 class _AllocationWatch:
-    """Ends descendants that ask in vain, again and again, for memory that the shell's limit of addresses does not leave.
+    """Ends descendants that ask in vain, again and again, for memory that the shell's limit does not leave.
 
     Such a process spends its time in the system without a page fault, close below the limit. It is ended as an abort
     would end it, which a batch knows as a lack of memory.
@@ -167,7 +168,13 @@ class _AllocationWatch:
         self._before = now
 
     def _is_stuck(
-        self, before: _Usage, after: _Usage, *, most_free_bytes: int = 1 << 26, least_ticks: int = 20, ratio: float = 3.0
+        self,
+        before: _Usage,
+        after: _Usage,
+        *,
+        most_free_bytes: int = 1 << 26,
+        least_ticks: int = 20,
+        ratio: float = 3.0,
     ) -> bool:
         """Whether nothing but failed allocations explains what a process has used meanwhile.
 
