@@ -144,9 +144,9 @@ class _Detector:
         inliers = inliers.reshape(len(proposed), len(rows))
         kinds = np.array([type(one).__name__ for one in proposed])
         free, open_ = np.ones(len(rows), dtype=bool), np.ones(len(proposed), dtype=bool)
-        failures = 0
+        free_inliers, failures = inliers.sum(axis=1), 0
         while open_.any() and len(found) < p.max_primitives and failures < p.max_failures:
-            count = np.where(open_, (inliers & free).sum(axis=1), 0)
+            count = np.where(open_, free_inliers, 0)
             best = int(np.argmax(count))
             if count[best] < p.min_points:
                 break
@@ -154,13 +154,15 @@ class _Detector:
             passes = self._ends_at_its_rim(surface, points[free], normals[free], on[free])
             # Proposals that share most inliers with this one are settled; what is no cylinder may still be a plane.
             shared = on if passes else inliers[best] & free
-            settled = (inliers & shared).sum(axis=1) >= p.redundant_share * count
+            common = inliers[:, shared].sum(axis=1)
+            settled = common >= p.redundant_share * count
             open_ &= ~(settled & (passes | (kinds == kinds[best])))
             open_[best] = False
             failures = 0 if passes else failures + 1
             if passes:
                 found.append(DetectedPrimitive(surface, points[on]))
                 free &= ~on
+                free_inliers -= common
         return found, rows[free]
 
     def _refitted(
