@@ -152,8 +152,8 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
     Normals and attributes are kept where all pieces have them in the same shape; `Contents.unread` names the others.
     Scan origins that only some pieces have are NaN for the rest.
     """
-    if len(pieces) == 1:
-        return pieces[0]
+    if len(pieces) < 2:
+        return pieces[0] if pieces else Contents(np.empty((0, 3)))
     starts = np.cumsum([0, *(len(piece.points) for piece in pieces[:-1])])
     normals = [piece.normals for piece in pieces if piece.normals is not None]
     found: dict[str, list[Values]] = {}
@@ -174,6 +174,14 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
         None if all(piece.origins is None for piece in pieces) else np.concatenate(unknown),
         tuple(dict.fromkeys(sentence for piece in pieces for sentence in piece.remarks)),
     )
+
+
+def without_opaque_alpha(attributes: Columns) -> Columns:
+    """Return attributes whose ``colors``, bytes of shape (N, 4), have no alpha where all are opaque."""
+    colors = attributes.get("colors")
+    if colors is None or (as_bytes(colors)[:, 3:] < 255).any():
+        return attributes
+    return {**attributes, "colors": colors[:, :3]}
 
 
 def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:

@@ -8,7 +8,7 @@ Plugins cannot replace built-in formats.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,30 +18,45 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents
+from gnrecon.io.contents import Contents, concatenated
 from gnrecon.io.formats.e57 import read_e57
 from gnrecon.io.formats.gltf import glb_supports, read_gltf, write_glb
-from gnrecon.io.formats.las import read_las
+from gnrecon.io.formats.las import las_chunks, read_las
 from gnrecon.io.formats.npy import read_npy
 from gnrecon.io.formats.obj import read_obj, write_obj
 from gnrecon.io.formats.off import read_off, write_off
 from gnrecon.io.formats.pcd import read_pcd
-from gnrecon.io.formats.ply import read_ply, write_ply
-from gnrecon.io.formats.ptx import read_ptx
+from gnrecon.io.formats.ply import ply_chunks, read_ply, write_ply
+from gnrecon.io.formats.ptx import ptx_chunks
 from gnrecon.io.formats.stanford_conf import read_conf
 from gnrecon.io.formats.stl import read_stl, write_stl
-from gnrecon.io.formats.table import TABLE_SUFFIXES, read_table, write_table
+from gnrecon.io.formats.table import TABLE_SUFFIXES, table_chunks, write_table
 from gnrecon.io.formats.threemf import read_3mf, write_3mf
 from gnrecon.io.formats.vtk import read_vtk
 from gnrecon.io.formats.vtp import read_vtp
 from gnrecon.io.interop import as_shape
+from gnrecon.io.io_parameters import IOParameters
 from gnrecon.runtime.errors import InputError, OutputError
 from gnrecon.runtime.plugins import Plugin, PluginKind, find, installed
+
+CHUNK_READERS: dict[str, Callable[[Path, int], Iterator[Contents]]] = {
+    ".las": las_chunks,
+    ".laz": las_chunks,
+    ".ply": ply_chunks,
+    ".ptx": ptx_chunks,
+    **{suffix: partial(table_chunks, extension=suffix) for suffix in TABLE_SUFFIXES},
+}
+"""Readers of a file's contents by chunks of at most so many points, with the same errors as those of whole files."""
+
+
+def _read_whole(extension: str, path: Path) -> Contents:
+    return concatenated(list(CHUNK_READERS[extension](path, IOParameters.chunk_points)))
+
 
 READERS: dict[str, Callable[[Path], Contents]] = {
     ".ply": read_ply,
     ".pcd": read_pcd,
-    **{suffix: partial(read_table, extension=suffix) for suffix in TABLE_SUFFIXES},
+    **{suffix: partial(_read_whole, suffix) for suffix in TABLE_SUFFIXES},
     ".npy": read_npy,
     ".npz": read_npy,
     ".obj": read_obj,
@@ -53,11 +68,13 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".las": read_las,
     ".laz": read_las,
     ".e57": read_e57,
-    ".ptx": read_ptx,
+    ".ptx": partial(_read_whole, ".ptx"),
     ".vtk": read_vtk,
     ".vtp": read_vtp,
     ".conf": read_conf,
 }
+"""Readers of whole files. A file that is malformed, cut short or of another kind ends in an `InputError` of one
+sentence on what is wrong, and so does a missing optional package."""
 
 WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".obj": write_obj,

@@ -15,9 +15,8 @@ from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.io.contents import without_faces
 from gnrecon.io.formats.las import drop_unused_attributes
 from gnrecon.io.io_parameters import IOParameters
-from gnrecon.io.read import check_file, input_errors_for, reader_extension
+from gnrecon.io.read import opened
 from gnrecon.io.streaming import VoxelThinning, read_chunks
-from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, UsageError
 
 _log = logging.getLogger(__name__)
@@ -151,9 +150,8 @@ def _read_into(
     parameters: IOParameters,
 ) -> str:
     """Add the points of a file, and return the extension by which it was read."""
-    extension, before = reader_extension(path, format), thinning.seen
-    with input_errors_for(path), uncompressed_file(path, extension) as file:
-        check_file(file, extension)
+    before = thinning.seen
+    with opened(path, format) as (file, extension):
         for chunk in read_chunks(file, extension, columns, parameters=parameters):
             moments.add(chunk.points)
             thinning.add(without_faces(chunk))

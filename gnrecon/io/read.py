@@ -85,13 +85,23 @@ def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
         return contents.shape(), contents.unread
 
 
-def reader_extension(path: Path, format: str | None) -> str:
-    """Return the extension, with its dot, that says how a file is read.
+def read_contents(path: Path, format: str | None) -> Contents:
+    """Read everything in a file; the arguments and errors are those of `read_cloud`."""
+    with opened(path, format) as (file, extension):
+        read = reader_of(extension)
+        assert read is not None, "only what something reads is opened"
+        contents = read(file)
+        if not len(contents.points):
+            raise InputError("the file holds no points.")
+    _log.info("Read %d points and %d faces of %s.", len(contents.points), len(contents.faces), path)
+    return contents
 
-    Raises
-    ------
-    UsageError
-        When `format` is not supported, or standard input is read without one.
+
+@contextmanager
+def opened(path: Path, format: str | None) -> Iterator[tuple[Path, str]]:
+    """Yield a plain file with the data, and the extension, with its dot, that says how it is read.
+
+    The arguments are those of `read_cloud`, and so are the errors, into which every failure in the block is turned.
     """
     if format is None and is_standard_input(path):
         raise UsageError(
@@ -100,21 +110,9 @@ def reader_extension(path: Path, format: str | None) -> str:
     extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
     if format is not None and not is_readable(extension):
         raise UsageError(f"The format {format!r} is not supported; expected one of {_supported()}.")
-    return extension
-
-
-def read_contents(path: Path, format: str | None) -> Contents:
-    """Read everything in a file; the arguments and errors are those of `read_cloud`."""
-    extension = reader_extension(path, format)
     with input_errors_for(path), uncompressed_file(path, extension) as file:
-        check_file(file, extension)
-        read = reader_of(extension)
-        assert read is not None, "check_file refuses what nothing reads"
-        contents = read(file)
-        if not len(contents.points):
-            raise InputError("the file holds no points.")
-    _log.info("Read %d points and %d faces of %s.", len(contents.points), len(contents.faces), path)
-    return contents
+        _check_file(file, extension)
+        yield file, extension
 
 
 def _supported() -> str:
@@ -144,14 +142,8 @@ def input_errors_for(path: Path) -> Iterator[None]:
         raise InputError(f"{name}: the file is malformed ({error}).") from None
 
 
-def check_file(path: Path, extension: str) -> None:
-    """Refuse a path that is not a file, an empty file, or one that begins like a file of another kind.
-
-    Raises
-    ------
-    InputError
-        With a sentence on what is wrong.
-    """
+def _check_file(path: Path, extension: str) -> None:
+    """Refuse a path that is not a file, an empty file, or one that begins like a file of another kind."""
     if not path.exists():
         raise InputError("there is no such file.")
     if not path.is_file():

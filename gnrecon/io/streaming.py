@@ -8,9 +8,8 @@ or when the side was doubled. The kept points are measured ones, never averages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,9 @@ import numpy as np
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.point_cloud import Region
 from gnrecon.io.contents import Contents, concatenated
-from gnrecon.io.format_registry import reader_of
-from gnrecon.io.formats.las import las_chunks
+from gnrecon.io.format_registry import CHUNK_READERS, reader_of
 from gnrecon.io.formats.npy import read_npy
-from gnrecon.io.formats.ply import ply_chunks
-from gnrecon.io.formats.ptx import ptx_chunks
-from gnrecon.io.formats.table import TABLE_SUFFIXES, read_table, table_chunks
+from gnrecon.io.formats.table import TABLE_SUFFIXES, table_chunks
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.runtime.errors import UsageError
 
@@ -60,7 +56,7 @@ class VoxelThinning:
 
     def result(self) -> Contents:
         """Return the kept points with their normals, attributes and origins, in the order in which they came."""
-        return concatenated(self._pieces) if self._pieces else Contents(np.empty((0, 3)))
+        return concatenated(self._pieces)
 
     def _thin(self) -> None:
         kept = concatenated(self._pieces)
@@ -129,24 +125,14 @@ def read_chunks(
     UsageError
         When columns are named of a file that is no table.
     """
-    read_by_chunks = chunk_reader(extension)
-    if columns:
-        if extension not in (*TABLE_SUFFIXES, ".npy", ".npz"):
-            raise UsageError(f"--columns names the columns of tables, but {extension[1:].upper()} files are none.")
-        read_by_chunks = None if read_by_chunks is None else partial(table_chunks, columns=columns)
-    if read_by_chunks is not None and path.stat().st_size >= parameters.chunked_file_bytes:
-        yield from read_by_chunks(path, parameters.chunk_points)
+    by_chunks = CHUNK_READERS.get(extension)
+    if columns and extension in (".npy", ".npz"):
+        yield read_npy(path, columns)
+    elif columns and extension not in TABLE_SUFFIXES:
+        raise UsageError(f"--columns names the columns of tables, but {extension[1:].upper()} files are none.")
     elif columns:
-        yield (read_table if extension in TABLE_SUFFIXES else read_npy)(path, columns)
+        yield from table_chunks(path, parameters.chunk_points, columns)
+    elif by_chunks is not None and path.stat().st_size >= parameters.chunked_file_bytes:
+        yield from by_chunks(path, parameters.chunk_points)
     elif read := reader_of(extension):
         yield read(path)
-
-
-def chunk_reader(extension: str) -> Callable[[Path, int], Iterator[Contents]] | None:
-    """Return a function that yields a file's contents by chunks of at most so many points; None where there is none.
-
-    Files of several formats can be read so: LAS, LAZ, PTX, binary PLY without faces, and tables in text.
-    """
-    readers = {".las": las_chunks, ".laz": las_chunks, ".ptx": ptx_chunks, ".ply": ply_chunks}
-    tables = partial(table_chunks, extension=extension) if extension in TABLE_SUFFIXES else None
-    return readers.get(extension, tables)

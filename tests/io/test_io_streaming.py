@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scan_writers import FORMS, file_of, random_cloud
 
-from gnrecon.io import READERS, IOParameters, read_cloud, read_scans
+from gnrecon.io import IOParameters, read_cloud, read_scans
 from gnrecon.io.contents import Contents
+from gnrecon.io.format_registry import CHUNK_READERS
 from gnrecon.io.formats.stanford_conf import parse_conf
-from gnrecon.io.streaming import VoxelThinning, chunk_reader
+from gnrecon.io.streaming import VoxelThinning
 from gnrecon.runtime.errors import InputError
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -174,6 +175,6 @@ def test_large_files_that_are_damaged(tmp_path: Path) -> None:
 
 
 def test_every_chunked_format_is_tried_here() -> None:
-    chunked = {extension for extension in READERS if chunk_reader(extension) is not None}
+    chunked = set(CHUNK_READERS)
     assert chunked
     assert chunked <= {form.suffix for form in FORMS.values()}

@@ -14,20 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.geometry.arrays import Float, Values
+from gnrecon.geometry.arrays import Values
 from gnrecon.io.column_names import COLOR
 from gnrecon.io.contents import Contents, concatenated, from_columns, guard_parser
 from gnrecon.runtime.errors import InputError
 
 
 def read_e57(path: Path) -> Contents:
-    """Read all scans in common coordinates, with the scanner's position for each point.
-
-    Raises
-    ------
-    InputError
-        When pye57 is not installed, or the file is malformed or holds no scan.
-    """
+    """Read all scans in common coordinates, with the scanner's position for each point."""
     try:
         import pye57
     except ImportError:
@@ -44,6 +38,8 @@ def read_e57(path: Path) -> Contents:
 
 
 def _scan(file: Any, header: Any) -> Contents:
+    from pye57.utils import convert_spherical_to_cartesian
+
     fields = set(header.point_fields)
     cartesian = [f"cartesian{axis}" for axis in "XYZ"]
     spherical = ["sphericalRange", "sphericalAzimuth", "sphericalElevation"]
@@ -66,7 +62,7 @@ def _scan(file: Any, header: Any) -> Contents:
     values = {name: column[valid] for name, column in values.items()}
     points = np.column_stack([values[name] for name in position])
     rotation, translation = np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)
-    points = (points if position is cartesian else _from_spherical(points)) @ rotation.T + translation
+    points = (points if position is cartesian else convert_spherical_to_cartesian(points)) @ rotation.T + translation
     found = from_columns({label: values[name] for name, (label, _) in others.items()}, None, points)
     attributes = dict(found.attributes)
     if "colors" in attributes:
@@ -90,12 +86,6 @@ def _read(file: Any, header: Any, types: dict[str, str]) -> dict[str, npt.NDArra
     if found != header.point_count:
         raise InputError(f"a scan declares {header.point_count} points, but {found} could be read.")
     return values
-
-
-def _from_spherical(rows: Float) -> Float:
-    distance, azimuth, elevation = rows.T
-    flat = distance * np.cos(elevation)
-    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])
 
 
 def _colors(values: Values, names: list[str], header: Any) -> Values:

@@ -17,6 +17,7 @@ to trimesh as JSON and buffers by name.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -26,7 +27,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, guard_parser
+from gnrecon.io.contents import Contents, concatenated, guard_parser, without_opaque_alpha
 from gnrecon.io.parse import require_buildable, sibling_path
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.logs import unprinted_log
@@ -47,11 +48,6 @@ def read_gltf(path: Path) -> Contents:
     """Read all meshes and clouds of the scene, of a text or GLB file, into one, each moved by its node's matrix.
 
     Attributes are kept where all meshes have them, with their names in lower case.
-
-    Raises
-    ------
-    InputError
-        When the file is malformed, holds no vertices, or a buffer is missing.
     """
     import trimesh
 
@@ -86,26 +82,27 @@ def _sibling(uri: str, folder: Path) -> bytes:
 
 def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
     """All meshes and clouds of a scene, in one."""
-    vertices, normals, faces, attributes, start = [], [], [], [], 0
+    pieces = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         part = scene.geometry[name]
-        vertices.append(np.asarray(part.vertices) @ matrix[:3, :3].T + matrix[:3, 3])
-        triangles = np.asarray(part.faces, np.int64)
-        triangles = triangles[:0] if np.array_equal(triangles, [[0, 0, 0]]) else triangles
+        faces = np.asarray(part.faces, np.int64)
+        faces = faces[:0] if np.array_equal(faces, [[0, 0, 0]]) else faces
         # A mirroring matrix would turn faces inside out, so their corners are reversed.
-        faces.append((triangles if np.linalg.det(matrix[:3, :3]) > 0 else triangles[:, ::-1]) + start)
+        faces = faces if np.linalg.det(matrix[:3, :3]) > 0 else faces[:, ::-1]
         # Normals transform by the inverse transpose of the matrix, which for row vectors is a product with the inverse.
-        normals.append(np.asarray(part.vertex_normals) @ np.linalg.inv(matrix[:3, :3]))
-        attributes.append(part.vertex_attributes)
-        start += len(part.vertices)
-    if not start:
+        normals = np.asarray(part.vertex_normals) @ np.linalg.inv(matrix[:3, :3])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+        points = np.asarray(part.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
+        pieces.append(Contents(points, normals, faces, _attributes(part.vertex_attributes)))
+    found = concatenated(pieces)
+    if not len(found.points):
         raise InputError("the file holds no vertices.")
-    directions = np.concatenate(normals)
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = np.divide(directions, lengths, out=np.zeros_like(directions), where=lengths > 0)
-    given = directions if directions.any() else None
-    return Contents(np.concatenate(vertices), given, np.concatenate(faces), _attributes(attributes), unread)
+    given = found.normals if found.normals is not None and found.normals.any() else None
+    return replace(
+        found, normals=given, attributes=without_opaque_alpha(found.attributes), unread=unread + found.unread
+    )
 
 
 def _unread(text: bytes) -> tuple[str, ...]:
@@ -183,19 +180,14 @@ def _rename(names: dict[str, Any], old: str, new: str) -> None:
         names[new] = names.pop(old)
 
 
-def _attributes(parts: list[dict[str, Any]]) -> dict[str, Values]:
-    """Attributes that all parts have in the same shape."""
+def _attributes(stored: dict[str, Any]) -> dict[str, Values]:
+    """The attributes of one mesh by their names in lower case; colours in sRGB, of shape (N, 3 or 4)."""
     found: dict[str, Values] = {}
-    for name, first in parts[0].items():
-        values = [np.asarray(part[name]) for part in parts if name in part]
-        if len(values) < len(parts) or any(one.shape[1:] != first.shape[1:] for one in values):
-            continue
-        column = np.concatenate(values)
+    for name, values in stored.items():
+        column = np.asarray(values)
         if name == "_COLOR_0":
             full = 1.0 if column.dtype.kind == "f" else float(np.iinfo(column.dtype).max)
-            colors = to_srgb(column / full)
-            # A fully opaque alpha channel carries no information.
-            found["colors"] = colors if (colors[:, 3:] < 255).any() else colors[:, :3]
+            found["colors"] = with_alpha(to_srgb(column / full))
         else:
             found[name.lstrip("_").lower()] = column[:, 0] if column.shape[1:] == (1,) else column
     return found

@@ -30,26 +30,12 @@ logging.getLogger("laspy").addHandler(logging.NullHandler())
 
 
 def read_las(path: Path) -> Contents:
-    """Read all points with their attributes that are filled in: intensity, classification, colours, extra ones.
-
-    Raises
-    ------
-    InputError
-        When the file is malformed or shorter than its header says.
-    """
-    return drop_unused_attributes(
-        concatenated(list(las_chunks(path, IOParameters.chunk_points)) or [Contents(np.empty((0, 3)))])
-    )
+    """Read all points with their attributes that are filled in: intensity, classification, colours, extra ones."""
+    return drop_unused_attributes(concatenated(list(las_chunks(path, IOParameters.chunk_points))))
 
 
 def las_chunks(path: Path, rows: int, *, most_chunk_bytes: int = 1 << 28) -> Iterator[Contents]:
-    """Yield the points, at most `rows` at a time and in at most `most_chunk_bytes`: damaged records may have any size.
-
-    Raises
-    ------
-    InputError
-        As `read_las` does.
-    """
+    """Yield the points, at most `rows` at a time and in at most `most_chunk_bytes`: damaged records have any size."""
     import laspy
 
     _require_consistent_header(path)
@@ -103,13 +89,7 @@ def _contents(chunk: Any) -> Contents:
 def _require_consistent_header(
     path: Path, *, least_header_bytes: int = 227, record_bytes: int = 54, extended_record_bytes: int = 60
 ) -> None:
-    """Refuse a missing header, or one that declares more than the file holds; sizes are those of the specification.
-
-    Raises
-    ------
-    InputError
-        With a sentence on what is wrong.
-    """
+    """Refuse a missing header, or one that declares more than the file holds; sizes are those of the specification."""
     size = path.stat().st_size
     with path.open("rb") as file:
         # The header of LAS 1.4 has 375 bytes; that of older versions begins in the same way.

@@ -22,11 +22,6 @@ def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
     Of an archive, the only array is read, or the one named points, xyz, positions, coords, vertices, pc, pos or data,
     with those named normals and colors, and all other numbers of one row for each point. Pickled objects are never
     loaded. `columns` are the names of the columns where the user gives them.
-
-    Raises
-    ------
-    InputError
-        When the file is damaged, or does not hold such arrays.
     """
     with guard_parser("NPY or NPZ"):
         arrays = _arrays(path)

@@ -20,13 +20,7 @@ from gnrecon.runtime.errors import InputError
 
 
 def read_obj(path: Path) -> Contents:
-    """Read vertices (with colours, where they follow the position), vertex normals and faces.
-
-    Raises
-    ------
-    InputError
-        When there is no vertex, a word is not a number, or an index is out of range.
-    """
+    """Read vertices (with colours, where they follow the position), vertex normals and faces."""
     # A backslash at the end of a line continues it.
     text = re.sub(r"\\\r?\n", " ", read_text(path))
     lines = [line.partition("#")[0].strip() for line in text.splitlines()]

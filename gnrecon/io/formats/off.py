@@ -16,13 +16,7 @@ from gnrecon.runtime.errors import InputError
 
 
 def read_off(path: Path) -> Contents:
-    """Read vertices, the normals and colours that NOFF and COFF add, and faces.
-
-    Raises
-    ------
-    InputError
-        When the keyword or the counts are missing, rows are missing or too short, or a word is not a number.
-    """
+    """Read vertices, the normals and colours that NOFF and COFF add, and faces."""
     lines = content_lines(read_text(path))
     keyword = re.match(r"(ST)?(C)?(N)?OFF\b", lines[0], re.IGNORECASE) if lines else None
     if keyword is None or "BINARY" in lines[0].upper():

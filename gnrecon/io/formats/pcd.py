@@ -24,13 +24,7 @@ Header = dict[str, list[str]]
 
 
 def read_pcd(path: Path) -> Contents:
-    """Read an ascii, binary or binary_compressed PCD.
-
-    Raises
-    ------
-    InputError
-        When the header is malformed or fewer points than it declares can be read.
-    """
+    """Read an ascii, binary or binary_compressed PCD."""
     open3d = import_open3d()
 
     header, body = _split(path.read_bytes())
@@ -84,13 +78,7 @@ def _split(data: bytes) -> tuple[Header, bytes]:
 
 
 def _plain(header: Header) -> Header:
-    """Return the header with names and types that the reader knows, each field once, and none that holds nothing.
-
-    Raises
-    ------
-    InputError
-        When fields are not described completely, have an unknown type, or appear twice.
-    """
+    """Return the header with names and types that the reader knows, each field once, and none that holds nothing."""
     counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
     columns = (header["FIELDS"], header["SIZE"], header["TYPE"], counts)
     if len({len(words) for words in columns}) > 1:

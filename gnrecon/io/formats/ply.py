@@ -34,13 +34,7 @@ class _Rows:
 
 
 def read_ply(path: Path) -> Contents:
-    """Read vertices with all their scalar properties, and the faces where there are some.
-
-    Raises
-    ------
-    InputError
-        When the header is malformed, the file ends before the declared rows, or a word is not a number.
-    """
+    """Read vertices with all their scalar properties, and the faces where there are some."""
     data = path.read_bytes()
     order, elements, start = parse_header(data)
     buffer = data[start:]
@@ -326,11 +320,6 @@ def ply_chunks(path: Path, rows: int, *, header_bytes: int = 1 << 16) -> Iterato
     """Yield the vertices, at most `rows` at a time; files in text, with faces, or with lists are read as a whole.
 
     The header is searched in the first `header_bytes`, enough for some hundred properties, then in the whole file.
-
-    Raises
-    ------
-    InputError
-        As `read_ply` does.
     """
     with path.open("rb") as file:
         head = file.read(header_bytes)

@@ -16,30 +16,15 @@ from typing import IO
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, concatenated, no_faces
-from gnrecon.io.io_parameters import IOParameters
+from gnrecon.io.contents import Contents, no_faces
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
 
-def read_ptx(path: Path) -> Contents:
-    """Read all scans, in common coordinates, with the scanner's position and the grid cell of each point.
-
-    Raises
-    ------
-    InputError
-        When a block is malformed or ends too early.
-    """
-    return concatenated(list(ptx_chunks(path, IOParameters.chunk_points)))
-
-
 def ptx_chunks(path: Path, rows: int) -> Iterator[Contents]:
-    """Yield the measured points, of at most `rows` grid cells at a time.
+    """Yield the measured points of at most `rows` grid cells at a time, in common coordinates.
 
-    Raises
-    ------
-    InputError
-        As `read_ptx` does.
+    Each point has the scanner's position and its grid cell.
     """
     with path.open("r", encoding="ascii", errors="replace") as file:
         number = 0

@@ -36,11 +36,6 @@ def read_conf(path: Path) -> Contents:
     """Read all existing scans that the file names, in common coordinates, with the scanner's positions.
 
     Published data sets may lack some scans; these are listed in `Contents.unread`.
-
-    Raises
-    ------
-    InputError
-        When a line is malformed, or no scan exists.
     """
     poses = parse_conf(read_text(path))
     existing = [pose for pose in poses if (path.parent / pose.file).is_file()]

@@ -18,13 +18,7 @@ from gnrecon.runtime.logs import unprinted_log
 
 
 def read_stl(path: Path) -> Contents:
-    """Read a binary or text STL; corners of exactly equal position become one vertex, in order of appearance.
-
-    Raises
-    ------
-    InputError
-        When the file is neither, ends too early, or holds no triangle.
-    """
+    """Read a binary or text STL; corners of exactly equal position become one vertex, in order of appearance."""
     from trimesh.exchange.stl import HeaderError, load_stl
 
     try:
@@ -41,12 +35,9 @@ def read_stl(path: Path) -> Contents:
     if not solids:
         raise InputError("the file holds no complete STL solid: it is empty, cut short, or of another format.")
     corners = np.concatenate([np.asarray(solid["vertices"], np.float64) for solid in solids])
-    # np.unique sorts the positions; `rank` restores the order of appearance.
+    # np.unique sorts the positions; their ranks by first appearance restore the order.
     _, first, which = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return Contents(origin + corners[first[order]], None, rank[which].reshape(-1, 3))
+    return Contents(origin + corners[np.sort(first)], None, np.argsort(np.argsort(first))[which].reshape(-1, 3))
 
 
 def write_stl(mesh: Mesh, path: Path) -> None:

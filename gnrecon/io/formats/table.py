@@ -18,7 +18,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, concatenated, from_columns
+from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.formats.ply import vertex_columns
 from gnrecon.io.formats.table_columns import guessed, named_by_user
 from gnrecon.io.formats.table_dialect import BLANKS, COMMENT, MISSING, Dialect, encoding_of, find_dialect
@@ -27,28 +27,13 @@ from gnrecon.runtime.errors import InputError
 TABLE_SUFFIXES = (".xyz", ".pts", ".txt", ".csv", ".asc", ".xyzn", ".xyzrgb", ".dat")
 
 
-def read_table(path: Path, columns: Sequence[str] = (), extension: str = "") -> Contents:
-    """Read a table of points; `columns` are the names of its columns where the user gives them.
-
-    The extension by which it is read says what the columns of some tables are.
-
-    Raises
-    ------
-    InputError
-        When a word is not a number, rows differ in length, a count is wrong, or the columns are ambiguous.
-    """
-    return concatenated(list(table_chunks(path, None, columns, extension)))
-
-
 def table_chunks(
-    path: Path, rows: int | None, columns: Sequence[str] = (), extension: str = "", *, sampled_lines: int = 400
+    path: Path, rows: int, columns: Sequence[str] = (), extension: str = "", *, sampled_lines: int = 400
 ) -> Iterator[Contents]:
     """Yield the points of at most `rows` lines at a time; what the columns are is decided on the first block.
 
-    Raises
-    ------
-    InputError
-        As `read_table` does.
+    `columns` are their names where the user gives them. The extension, by which the file is read, says what the columns
+    of some tables are.
     """
     with path.open("r", encoding=encoding_of(path), errors="replace") as file:
         lines = list(islice(file, sampled_lines))
@@ -127,13 +112,7 @@ def _cleaned(block: str, dialect: Dialect) -> tuple[str, list[int]]:
 
 
 def _parsed(text: str, dialect: Dialect, before: int) -> Float:
-    """Return the rows as an array of shape (N, columns), NaN where a column holds text.
-
-    Raises
-    ------
-    InputError
-        With the row, counted after `before` others, in which a word is no number or cells are missing or too many.
-    """
+    """Return the rows as an array of shape (N, columns), NaN where a column holds text."""
     import pandas
 
     width = dialect.width

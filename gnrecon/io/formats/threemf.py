@@ -16,10 +16,9 @@ import posixpath
 import zipfile
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO
 from xml.parsers import expat
 
 import numpy as np
@@ -28,7 +27,7 @@ import numpy.typing as npt
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
-from gnrecon.io.contents import Contents, concatenated
+from gnrecon.io.contents import Contents, concatenated, without_opaque_alpha
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.parse import format_rows, parse_numbers, require_buildable
 from gnrecon.runtime.errors import InputError
@@ -134,87 +133,39 @@ class _Object:
     parts: list[tuple[Key, Float]] = field(default_factory=list)
 
 
-@dataclass
 class _Model:
-    """Everything that the parts of an archive define; resources come before their use."""
+    """Everything that the parts of an archive define; only its main part may build objects."""
 
-    objects: dict[Key, _Object] = field(default_factory=dict)
-    colors: dict[Key, list[int]] = field(default_factory=dict)
-    items: list[tuple[Key, Float]] = field(default_factory=list)
-
-    def parts(self) -> set[str]:
-        """Names of the archive's parts that objects or items refer to."""
-        inner = {key[0] for one in self.objects.values() for key, _ in one.parts}
-        return inner | {key[0] for key, _ in self.items}
-
-
-def read_3mf(path: Path) -> Contents:
-    """Read all objects that the model builds into one mesh, each moved by its transform; lengths as stored.
-
-    Raises
-    ------
-    InputError
-        When the archive or its XML is damaged, or builds no mesh.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            model = _load(archive)
-    except (zipfile.BadZipFile, zlib.error, expat.ExpatError, KeyError, EOFError) as error:
-        raise InputError(f"the file is not a well-formed 3MF archive ({error}).") from None
-    _require_bounded(model)
-    pieces = [piece for key, matrix in model.items for piece in _transformed(model, key, matrix)]
-    if not pieces:
-        raise InputError("the 3MF model builds no mesh.")
-    found = concatenated(pieces)
-    colors = np.asarray(found.attributes["colors"], np.uint8)
-    visible = colors if (colors[:, 3] < 255).any() else colors[:, :3]
-    return replace(found, attributes={"colors": visible} if colors.any() else {})
-
-
-def _load(archive: zipfile.ZipFile) -> _Model:
-    """Read the main part of an archive, and all parts that it refers to."""
-    model = _Model()
-    main = _main(archive)
-    waiting, seen = [main], {main}
-    while waiting:
-        part = waiting.pop()
-        with archive.open(part) as file:
-            _Part(model, part, part == main).parse(file)
-        waiting += sorted(model.parts() - seen)
-        seen |= model.parts()
-    return model
-
-
-def _main(archive: zipfile.ZipFile) -> str:
-    """Name of the archive's main part."""
-    found: list[str] = []
-
-    def start(name: str, values: dict[str, str]) -> None:
-        if name.endswith("}Relationship") and values.get("Type") == _NAMESPACES["model"]:
-            found.append(values.get("Target", "").lstrip("/"))
-
-    parser = expat.ParserCreate(namespace_separator="}")
-    parser.StartElementHandler = start
-    parser.Parse(archive.read("_rels/.rels"), True)
-    if not found:
-        raise InputError("the archive names no 3MF model.")
-    return found[0]
-
-
-class _Part:
-    """Adds the definitions in one part of an archive to a model; only the main part may build objects."""
-
-    def __init__(self, model: _Model, name: str, main: bool) -> None:
-        self._model, self._name, self._main = model, name, main
-        self._object = _Object()
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self.objects: dict[Key, _Object] = {}
+        self.items: list[tuple[Key, Float]] = []
+        self._colors: dict[Key, list[int]] = {}
         self._group: list[int] = []
+        self._object = _Object()
+        self._relations: list[str] = []
+        self._parse(archive, "_rels/.rels", self._relation)
+        if not self._relations:
+            raise InputError("the archive names no 3MF model.")
+        self._main = self._part = self._relations[0]
+        waiting, seen = [self._main], {self._main}
+        while waiting:
+            self._part = waiting.pop()
+            self._parse(archive, self._part, self._element)
+            inner = [key for one in self.objects.values() for key, _ in one.parts] + [key for key, _ in self.items]
+            waiting += sorted({part for part, _ in inner} - seen)
+            seen |= {part for part, _ in inner}
 
-    def parse(self, file: IO[bytes]) -> None:
+    def _parse(self, archive: zipfile.ZipFile, part: str, start: Callable[[str, dict[str, str]], None]) -> None:
         parser = expat.ParserCreate(namespace_separator="}")
-        parser.StartElementHandler = self._start
-        parser.ParseFile(file)
+        parser.StartElementHandler = start
+        with archive.open(part) as file:
+            parser.ParseFile(file)
 
-    def _start(self, tag: str, values: dict[str, str]) -> None:
+    def _relation(self, tag: str, values: dict[str, str]) -> None:
+        if tag.endswith("}Relationship") and values.get("Type") == _NAMESPACES["model"]:
+            self._relations.append(values.get("Target", "").lstrip("/"))
+
+    def _element(self, tag: str, values: dict[str, str]) -> None:
         match tag.rpartition("}")[2]:
             case "vertex":
                 self._object.vertices.extend((float(values["x"]), float(values["y"]), float(values["z"])))
@@ -222,20 +173,22 @@ class _Part:
                 self._triangle(values)
             case "object":
                 self._object = _Object(values.get("pid", ""), values.get("pindex", ""))
-                self._model.objects[self._name, values["id"]] = self._object
+                self.objects[self._part, values["id"]] = self._object
             case "colorgroup" | "basematerials":
-                self._group = self._model.colors.setdefault((self._name, values["id"]), [])
+                self._group = self._colors.setdefault((self._part, values["id"]), [])
             case "color" | "base":
-                self._group.append(_rgba(values.get("color", values.get("displaycolor", ""))))
+                # RRGGBB or RRGGBBAA; without an alpha channel, colours are opaque.
+                text = values.get("color", values.get("displaycolor", ""))
+                self._group.append(int(text.lstrip("#").ljust(8, "F")[:8], 16))
             case "component":
                 self._object.parts.append(self._reference(values))
-            case "item" if self._main:
-                self._model.items.append(self._reference(values))
+            case "item" if self._part == self._main:
+                self.items.append(self._reference(values))
 
     def _triangle(self, values: dict[str, str]) -> None:
         current = self._object
         current.corners.extend((int(values["v1"]), int(values["v2"]), int(values["v3"])))
-        known = self._model.colors.get((self._name, values.get("pid", current.group)))
+        known = self._colors.get((self._part, values.get("pid", current.group)))
         first = values.get("p1", current.place)
         if known is None or not first:
             current.colors.extend((-1,) * 3)
@@ -247,8 +200,22 @@ class _Part:
         """The object that a component or an item refers to, and the 4 x 3 matrix that moves rows (x, y, z, 1)."""
         matrix = parse_numbers(values["transform"].split()).reshape(4, 3) if "transform" in values else np.eye(4, 3)
         # With the production extension, the object may be in another part.
-        path = next((value for name, value in values.items() if name.endswith("}path")), self._name)
+        path = next((value for name, value in values.items() if name.endswith("}path")), self._part)
         return (posixpath.normpath(path).lstrip("/"), values["objectid"]), matrix
+
+
+def read_3mf(path: Path) -> Contents:
+    """Read all objects that the model builds into one mesh, each moved by its transform; lengths as stored."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            model = _Model(archive)
+    except (zipfile.BadZipFile, zlib.error, expat.ExpatError, KeyError, EOFError) as error:
+        raise InputError(f"the file is not a well-formed 3MF archive ({error}).") from None
+    _require_bounded(model)
+    found = concatenated([piece for key, matrix in model.items for piece in _transformed(model, key, matrix)])
+    if not len(found.points):
+        raise InputError("the 3MF model builds no mesh.")
+    return replace(found, attributes=without_opaque_alpha(found.attributes) if found.attributes["colors"].any() else {})
 
 
 def _require_bounded(model: _Model, *, most_depth: int = 32, most_instances: int = 100_000) -> None:
@@ -304,9 +271,3 @@ def _mesh(current: _Object, matrix: Float) -> Contents:
     painted = np.flatnonzero(codes != -1)[::-1]
     colors[faces.reshape(-1)[painted]] = codes[painted].astype(">u4").view(np.uint8).reshape(-1, 4)
     return Contents(mesh.vertices, None, mesh.faces, {"colors": colors})
-
-
-def _rgba(text: str) -> int:
-    """RGBA of ``#RRGGBB`` or ``#RRGGBBAA``, as one number."""
-    # Without an alpha channel, colours are opaque.
-    return int(text.lstrip("#").ljust(8, "F")[:8], 16)

@@ -45,13 +45,7 @@ class _PolyData:
 
 
 def read_vtk(path: Path) -> Contents:
-    """Read points with their arrays, and polygons and strips where there are some.
-
-    Raises
-    ------
-    InputError
-        When the file is malformed, ends too early, or holds another kind of data set.
-    """
+    """Read points with their arrays, and polygons and strips where there are some."""
     source = _Source(path.read_bytes())
     data = _PolyData()
     while words := source.words():

@@ -37,13 +37,7 @@ class _File:
 
 
 def read_vtp(path: Path) -> Contents:
-    """Read all pieces into one: points with their arrays, and polygons and strips where there are some.
-
-    Raises
-    ------
-    InputError
-        When the file is malformed, ends too early, or holds another kind of data set.
-    """
+    """Read all pieces into one: points with their arrays, and polygons and strips where there are some."""
     try:
         root, file = _open(path.read_bytes())
         pieces = [_piece(piece, file) for piece in root.iterfind("PolyData/Piece")]
