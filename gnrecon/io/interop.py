@@ -42,16 +42,10 @@ def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
     InputError
         When `obj` is none of these, a file cannot be read, or shapes do not fit.
     """
-    cloud = _from_file(obj, "read_cloud") if isinstance(obj, str | Path) else _cloud_of_object(obj)
-    return cloud if normals is None else cloud.with_normals(_array(normals))
-
-
-def _cloud_of_object(obj: Any) -> PointCloud:
-    """The cloud of anything but a path."""
-    found = _from_library(obj)
-    if found is None:
-        found = _columns(obj) if _names(obj) else _from_array(_array(obj))
-    return PointCloud(found.vertices, found.vertex_normals(), found.attributes) if isinstance(found, Mesh) else found
+    found = _from_file(obj, "read_cloud") if isinstance(obj, str | Path) else as_shape(obj)
+    if isinstance(found, Mesh):
+        found = PointCloud(found.vertices, found.vertex_normals(), found.attributes)
+    return found if normals is None else found.with_normals(_array(normals))
 
 
 def as_mesh(obj: Any) -> Mesh:
@@ -90,8 +84,11 @@ def as_shape(obj: Any) -> Mesh | PointCloud:
     InputError
         As `as_cloud` does.
     """
-    found = _from_library(obj)
-    return _cloud_of_object(obj) if found is None else found
+    if (found := _from_library(obj)) is not None:
+        return found
+    if names := _names(obj):
+        return from_columns({name: _column(obj[name]) for name in names}).shape()
+    return _from_array(_array(obj))
 
 
 def _from_file(path: str | Path, kind: str) -> Any:
@@ -184,14 +181,8 @@ def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
     return _mesh_or_cloud(points, faces, held)
 
 
-def _columns(obj: Any) -> PointCloud:
-    """A cloud from named columns of a structured array, a mapping or a data frame."""
-    shape = from_columns({name: _column(obj[name]) for name in _names(obj)}).shape()
-    assert isinstance(shape, PointCloud), "columns hold no faces"
-    return shape
-
-
 def _names(obj: Any) -> list[str]:
+    """The columns of a structured array, a mapping or a data frame; none of other objects."""
     if getattr(getattr(obj, "dtype", None), "names", None):
         return list(obj.dtype.names)
     return [str(name) for name in obj.keys()] if hasattr(obj, "keys") else []  # noqa: SIM118 - a data frame's are columns

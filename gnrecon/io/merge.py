@@ -100,13 +100,19 @@ def read_scans(
         As `read_cloud` does, and when no point lies in the region.
     """
     thinning = VoxelThinning(parameters.most_points if most is None else most, region)
-    moments = [Moments() for _ in paths]
-    extensions = [
-        _read_into(thinning, sums, Path(path), format, columns, parameters)
-        for path, sums in zip(paths, moments, strict=True)
-    ]
+    moments, extensions = [Moments() for _ in paths], set[str]()
+    for path, sums in zip(map(Path, paths), moments, strict=True):
+        before = thinning.seen
+        with opened(path, format) as (file, extension):
+            for chunk in read_chunks(file, extension, columns, parameters=parameters):
+                sums.add(chunk.points)
+                thinning.add(without_faces(chunk))
+            if thinning.seen == before:
+                raise InputError("the file holds no points.")
+        extensions.add(extension)
+        _log.info("Read %d points of %s as %s.", thinning.seen - before, path, extension)
     found = thinning.result()
-    if {".las", ".laz"} & set(extensions):
+    if {".las", ".laz"} & extensions:
         # A chunk cannot say which attributes were never filled in; only all of its points can.
         found = drop_unused_attributes(found)
     cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
@@ -139,26 +145,6 @@ def require_points_in_region(cloud: PointCloud, before: int) -> None:
     """
     if before and not len(cloud):
         raise UsageError(f"None of the {before:,} points lies in the region; gnrecon info prints the scan's box.")
-
-
-def _read_into(
-    thinning: VoxelThinning,
-    moments: Moments,
-    path: Path,
-    format: str | None,
-    columns: Sequence[str],
-    parameters: IOParameters,
-) -> str:
-    """Add the points of a file, and return the extension by which it was read."""
-    before = thinning.seen
-    with opened(path, format) as (file, extension):
-        for chunk in read_chunks(file, extension, columns, parameters=parameters):
-            moments.add(chunk.points)
-            thinning.add(without_faces(chunk))
-        if thinning.seen == before:
-            raise InputError("the file holds no points.")
-    _log.info("Read %d points of %s as %s.", thinning.seen - before, path, extension)
-    return extension
 
 
 class Moments:

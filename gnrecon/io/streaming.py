@@ -66,16 +66,11 @@ class VoxelThinning:
         if self.side is not None and len(kept.points):
             kept = self._first_in_each_voxel(kept)
         while len(kept.points) and (self.side is None or len(kept.points) > self.most):
-            kept = self._coarser(kept)
-        self._pieces = [replace(kept, faces=kept.faces[:0])]
-
-    def _coarser(self, kept: Contents) -> Contents:
-        """Double the side, or choose the first one, and keep one point in each voxel."""
-        if self.side is None:
-            self._first, self.side = kept.points[0].copy(), 0.0
-        else:
+            if self.side is None:
+                self._first, self.side = kept.points[0].copy(), 0.0
             self.side *= 2
-        return self._first_in_each_voxel(kept)
+            kept = self._first_in_each_voxel(kept)
+        self._pieces = [replace(kept, faces=kept.faces[:0])]
 
     def _first_in_each_voxel(self, kept: Contents) -> Contents:
         keys = self._voxel_keys(kept.points)

@@ -37,13 +37,12 @@ def read_ply(path: Path) -> Contents:
     """Read vertices with all their scalar properties, and the faces where there are some."""
     data = path.read_bytes()
     order, elements, start = parse_header(data)
-    buffer = data[start:]
+    numbers = data[start:]
     if not order:
-        buffer = parse_numbers(buffer.decode("ascii", errors="replace").split()).tobytes()
-    rows: dict[str, _Rows] = {}
-    offset = 0
+        numbers = parse_numbers(numbers.decode("ascii", errors="replace").split()).tobytes()
+    rows, body = dict[str, _Rows](), _Body(numbers, order)
     for element in elements:
-        rows[element.name], offset = _read_rows(buffer, offset, element, order)
+        rows[element.name] = body.next_rows(element)
         if {one.name for one in elements} & {"vertex", "face", "tristrips"} <= rows.keys():
             break  # what follows (range grids, edges, materials) is not used
     if "vertex" not in rows:
@@ -83,88 +82,87 @@ def _unread(elements: list[Element]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _read_rows(buffer: bytes, offset: int, element: Element, order: str) -> tuple[_Rows, int]:
-    """Return the element's rows and the offset after them; `order` is empty for text converted to doubles."""
-    if not element.count or not any(prop.count_type for prop in element.properties):
-        layout = np.dtype([(prop.name, order + prop.type if order else "f8") for prop in element.properties])
-        end = offset + element.count * layout.itemsize
-        # Checked before reading, because a damaged header may declare any number of rows.
-        if end > len(buffer):
-            raise truncation_error(element, (len(buffer) - offset) // layout.itemsize)
-        table = np.frombuffer(buffer[offset:end], layout)
-        return _Rows({p.name: _native(table[p.name], p, order) for p in element.properties}, {}), end
-    # Most files have lists of one length only, so that all rows take as many bytes as the first.
-    starts = _row_starts(buffer, offset, element, order, 1)
-    step = int(starts[1] - offset)
-    rows = None
-    if offset + step * element.count <= len(buffer):
-        starts = offset + step * np.arange(element.count + 1)
-        rows = _rows_at(buffer, starts, element, order)
-    if rows is None:
-        starts = _row_starts(buffer, offset, element, order, element.count)
-        rows = _rows_at(buffer, starts, element, order)
-    assert rows is not None, "rows end where the next ones start"
-    return rows, int(starts[-1])
+class _Body:
+    """The rows of all elements; of a text, as doubles, whatever types the header states."""
 
+    def __init__(self, data: bytes, order: str) -> None:
+        self.data, self.order, self.place = data, order, 0
 
-def _row_starts(buffer: bytes, offset: int, element: Element, order: str, rows: int) -> Int:
-    """The offsets of so many rows, and the one after them, found by the lengths of the lists."""
-    starts, place = [offset], offset
-    kinds = [np.dtype(order + prop.type if order else "f8") for prop in element.properties]
-    counts = [
-        prop.count_type and _view(buffer, np.dtype(order + prop.count_type if order else "f8"))
-        for prop in element.properties
-    ]
-    for row in range(rows):
-        for prop, kind, view in zip(element.properties, kinds, counts, strict=True):
-            length = 1
-            if isinstance(view, np.ndarray):
-                if place >= len(view):
-                    raise truncation_error(element, row)
-                if not (view[place] >= 0 and view[place] % 1 == 0):
-                    raise InputError(f"a list of {prop.name} has the length {view[place]:g}; a count was expected.")
-                length = int(view[place])
-                place += view.itemsize
-            place += length * kind.itemsize
-        if place > len(buffer):
-            raise truncation_error(element, row)
-        starts.append(place)
-    return np.array(starts, np.int64)
+    def kind(self, name: str) -> np.dtype[Any]:
+        """The type of stored numbers, by the name of its type in numpy."""
+        return np.dtype(self.order + name if self.order else "f8")
 
+    def next_rows(self, element: Element) -> _Rows:
+        """The rows of an element, which begin at the current place."""
+        if not element.count or not any(prop.count_type for prop in element.properties):
+            layout = np.dtype([(prop.name, self.kind(prop.type)) for prop in element.properties])
+            start, self.place = self.place, self.place + element.count * layout.itemsize
+            # Checked before reading, because a damaged header may declare any number of rows.
+            if self.place > len(self.data):
+                raise truncation_error(element, (len(self.data) - start) // layout.itemsize)
+            table = np.frombuffer(self.data[start : self.place], layout)
+            return _Rows({prop.name: self._native(table[prop.name], prop) for prop in element.properties}, {})
+        # Most files have lists of one length only, so that all rows take as many bytes as the first.
+        step = int(self._starts(element, 1)[1]) - self.place
+        starts: Int = self.place + step * np.arange(element.count + 1)
+        rows = self._rows_at(starts, element) if starts[-1] <= len(self.data) else None
+        if rows is None:
+            starts = self._starts(element, element.count)
+            rows = self._rows_at(starts, element)
+        assert rows is not None, "rows end where the next ones start"
+        self.place = int(starts[-1])
+        return rows
 
-def _rows_at(buffer: bytes, starts: Int, element: Element, order: str) -> _Rows | None:
-    """The rows between these offsets, of shape (count + 1,); None where a row does not end at the next offset."""
-    found, place = _Rows({}, {}), starts[:-1].copy()
-    for prop in element.properties:
-        kind = np.dtype(order + prop.type if order else "f8")
-        if not prop.count_type:
-            found.scalars[prop.name] = _native(_view(buffer, kind)[place], prop, order)
-            place += kind.itemsize
-            continue
-        counter = np.dtype(order + prop.count_type if order else "f8")
-        lengths = _indices(_view(buffer, counter)[place])
-        place += counter.itemsize
-        after = place + lengths * kind.itemsize
-        if (lengths < 0).any() or (after > starts[1:]).any():
-            return None
-        firsts = place - (np.cumsum(lengths) - lengths) * kind.itemsize
-        items = np.repeat(firsts, lengths) + kind.itemsize * np.arange(lengths.sum())
-        found.lists[prop.name] = lengths, _indices(_view(buffer, kind)[items])
-        place = after
-    return found if (place == starts[1:]).all() else None
+    def _starts(self, element: Element, rows: int) -> Int:
+        """The offsets of so many rows, and the one after them, found by the lengths of the lists."""
+        starts, place = [self.place], self.place
+        sizes = [self.kind(prop.type).itemsize for prop in element.properties]
+        counts = [prop.count_type and self._view(prop.count_type) for prop in element.properties]
+        for row in range(rows):
+            for prop, size, view in zip(element.properties, sizes, counts, strict=True):
+                length = 1
+                if isinstance(view, np.ndarray):
+                    if place >= len(view):
+                        raise truncation_error(element, row)
+                    if not (view[place] >= 0 and view[place] % 1 == 0):
+                        raise InputError(f"a list of {prop.name} has the length {view[place]:g}; a count was expected.")
+                    length = int(view[place])
+                    place += view.itemsize
+                place += length * size
+            if place > len(self.data):
+                raise truncation_error(element, row)
+            starts.append(place)
+        return np.array(starts, np.int64)
 
+    def _rows_at(self, starts: Int, element: Element) -> _Rows | None:
+        """The rows between these offsets, of shape (count + 1,); None where a row does not end at the next offset."""
+        found, place = _Rows({}, {}), starts[:-1].copy()
+        for prop in element.properties:
+            size = self.kind(prop.type).itemsize
+            if not prop.count_type:
+                found.scalars[prop.name] = self._native(self._view(prop.type)[place], prop)
+                place += size
+                continue
+            lengths = _indices(self._view(prop.count_type)[place])
+            place += self.kind(prop.count_type).itemsize
+            after = place + lengths * size
+            if (lengths < 0).any() or (after > starts[1:]).any():
+                return None
+            firsts = place - (np.cumsum(lengths) - lengths) * size
+            items = np.repeat(firsts, lengths) + size * np.arange(lengths.sum())
+            found.lists[prop.name] = lengths, _indices(self._view(prop.type)[items])
+            place = after
+        return found if (place == starts[1:]).all() else None
 
-def _view(buffer: bytes, kind: np.dtype[Any]) -> Values:
-    """The numbers of a type that begin at each byte."""
-    return np.ndarray((max(len(buffer) - kind.itemsize + 1, 0),), kind, buffer, strides=(1,))
+    def _view(self, name: str) -> Values:
+        """The numbers of a type that begin at each byte."""
+        kind = self.kind(name)
+        return np.ndarray((max(len(self.data) - kind.itemsize + 1, 0),), kind, self.data, strides=(1,))
 
-
-def _native(values: Values, prop: Property, order: str) -> Values:
-    """Return a column in this machine's byte order; text keeps all digits even where the header says float."""
-    if not order and prop.type.startswith("f"):
-        return values.astype(np.float64)
-    with np.errstate(invalid="ignore"):  # text may hold nan where the header declares an integer
-        return values.astype(prop.type)
+    def _native(self, values: Values, prop: Property) -> Values:
+        """A column in this machine's byte order; text keeps all digits even where the header says float."""
+        with np.errstate(invalid="ignore"):  # text may hold nan where the header declares an integer
+            return values.astype(np.float64 if not self.order and prop.type.startswith("f") else prop.type)
 
 
 def _indices(values: Values) -> Int:

@@ -55,6 +55,8 @@ def parse_conf(text: str) -> list[Pose]:
     InputError
         When a line is malformed.
     """
+    from scipy.spatial.transform import Rotation
+
     poses = []
     for line in text.splitlines():
         words = line.split()
@@ -64,18 +66,10 @@ def parse_conf(text: str) -> list[Pose]:
         length = float(np.linalg.norm(values[3:])) if len(values) == 7 else 0.0
         if not (np.isfinite(values).all() and length > 0):
             raise InputError(f"the line {line.strip()[:80]!r} does not hold a file, a translation and a quaternion.")
-        poses.append(Pose(words[1], _rotation(values[3:] / length), values[:3]))
+        poses.append(Pose(words[1], Rotation.from_quat(values[3:] / length).inv().as_matrix(), values[:3]))
     if not poses:
         raise InputError("the file names no scan: lines that begin with mesh or bmesh are expected.")
     return poses
-
-
-def _rotation(quaternion: Float) -> Float:
-    """The matrix that rotates column vectors, for a quaternion (x, y, z, w) whose w has the other sign."""
-    x, y, z, w = quaternion * [1, 1, 1, -1]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation: Float = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    return rotation
 
 
 def _posed(pose: Pose, folder: Path) -> Contents:

@@ -8,7 +8,7 @@ and aborts the process on some damaged files, and meshio does not read polydata.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -28,48 +28,36 @@ _TYPES = {
 """Number types, in lower case, and their names in numpy; ids have 32 bits."""
 
 
-@dataclass
-class _PolyData:
-    """Data read so far."""
-
-    points: Float | None = None
-    faces: list[Int] = field(default_factory=list)
-    arrays: dict[str, Values] = field(default_factory=dict)
-    normals: str | None = None
-    of_points: bool = False
-    count: int = 0
-    kind: str = "POLYDATA"
-    numbers: dict[str, Float] = field(default_factory=dict)
-    cells: tuple[Int, Int] | None = None
-    unread: list[str] = field(default_factory=list)
-
-
 def read_vtk(path: Path) -> Contents:
     """Read points with their arrays, and polygons and strips where there are some."""
-    source = _Source(path.read_bytes())
-    data = _PolyData()
-    while words := source.words():
-        _section(source, words, data)
-    if data.kind in ("STRUCTURED_POINTS", "RECTILINEAR_GRID"):
-        data.points = _lattice(data)
-    if data.points is None:
+    file = _File(path.read_bytes())
+    while words := file.words():
+        file.read_section(words[0].upper(), words)
+    points = _lattice(file) if file.kind in ("STRUCTURED_POINTS", "RECTILINEAR_GRID") else file.points
+    if points is None:
         raise InputError("the file declares no points.")
-    faces = np.concatenate(data.faces) if data.faces else no_faces()
-    return assemble_contents(data.points, faces, data.arrays, data.normals, data.unread)
+    return assemble_contents(points, np.concatenate([no_faces(), *file.faces]), file.arrays, file.normals, file.unread)
 
 
-class _Source:
-    """A file's bytes and the current position."""
+class _File:
+    """A file's bytes, the place of what is read next, and what its sections hold."""
 
     def __init__(self, data: bytes) -> None:
         lines = data.split(b"\n", 3)
         if not data.startswith(b"# vtk DataFile") or len(lines) < 4:
             raise InputError("the file does not begin like a legacy VTK file.")
-        kind = lines[2].strip().upper()
-        if kind not in (b"ASCII", b"BINARY"):
-            raise InputError(f"expected ASCII or BINARY, but found {kind[:20].decode('ascii', 'replace')!r}.")
-        self.data, self.binary = data, kind == b"BINARY"
-        self.place = len(data) - len(lines[3])
+        encoding = lines[2].strip().upper()
+        if encoding not in (b"ASCII", b"BINARY"):
+            raise InputError(f"expected ASCII or BINARY, but found {encoding[:20].decode('ascii', 'replace')!r}.")
+        self.data, self.binary, self.place = data, encoding == b"BINARY", len(data) - len(lines[3])
+        self.kind, self.rows, self.of_points = "POLYDATA", 0, False
+        self.points: Float | None = None
+        self.held: dict[str, Float] = {}
+        self.cells: tuple[Int, Int] = (np.empty(0, np.int64), np.empty(0, np.int64))
+        self.faces: list[Int] = []
+        self.arrays: dict[str, Values] = {}
+        self.normals: str | None = None
+        self.unread: list[str] = []
 
     def words(self) -> list[str]:
         """The words of the next line that is neither blank nor metadata, which a blank line ends; none at the end."""
@@ -82,51 +70,114 @@ class _Source:
                 return line.decode("ascii", errors="replace").split()
         return []
 
+    def words_of(self, name: str) -> list[str]:
+        """The words of the next line if it begins with a name; else none, and the line is still to be read."""
+        place, words = self.place, self.words()
+        if words[:1] == [name]:
+            return words
+        self.place = place
+        return []
+
     def numbers(self, count: int, kind: str) -> Values:
         """The next `count` numbers of a VTK type."""
         if kind.lower() not in _TYPES:
             raise InputError(f"the number type {kind[:40]!r} is unknown or not read.")
         dtype = np.dtype(_TYPES[kind.lower()])
-        if self.binary:
-            end = self.place + count * dtype.itemsize
-            if end > len(self.data):
-                raise InputError(f"the file ends within {count} numbers of the type {kind}.")
-            block, self.place = self.data[self.place : end], end
-            return np.frombuffer(block, dtype.newbyteorder(">")).astype(dtype)
-        # Each number takes at least a byte; a larger count is refused before memory is allocated.
-        if count > len(self.data) - self.place:
+        # In text, each takes at least a byte; a larger count is refused before memory is allocated.
+        size = count * (dtype.itemsize if self.binary else 1)
+        if self.place + size > len(self.data):
             raise InputError(f"the file ends within {count} numbers of the type {kind}.")
+        if self.binary:
+            block, self.place = self.data[self.place : self.place + size], self.place + size
+            return np.frombuffer(block, dtype.newbyteorder(">")).astype(dtype)
         words = self.data[self.place :].split(None, count)
         self.place = len(self.data) - (len(words.pop()) if len(words) > count else 0)
         if len(words) < count:
             raise InputError(f"the file ends after {len(words)} of {count} numbers of the type {kind}.")
         return text_numbers([word.decode("ascii", errors="replace") for word in words], dtype)
 
+    def read_section(self, name: str, words: list[str]) -> None:
+        """Read the section that a line of these words begins."""
+        # Colours are bytes in binary files, and shares of full brightness in text.
+        shade = "unsigned_char" if self.binary else "float"
+        title = words[1] if len(words) > 1 else ""
+        match name:
+            case "DATASET":
+                self.kind = "".join(words[1:2]).upper()
+                known = ("POLYDATA", "UNSTRUCTURED_GRID", "STRUCTURED_GRID", "STRUCTURED_POINTS", "RECTILINEAR_GRID")
+                if self.kind not in known:
+                    raise InputError(f"the data set is {self.kind or 'unnamed'}, but {', '.join(known)} are read.")
+            case "DIMENSIONS" | "ORIGIN" | "SPACING" | "ASPECT_RATIO":
+                self.held[name] = parse_numbers(words[1:4])
+            case "X_COORDINATES" | "Y_COORDINATES" | "Z_COORDINATES":
+                self.held[name[0]] = self.numbers(_count(words, 1), _word(words, 2)).astype(np.float64)
+            case "POINTS":
+                self.points = self.numbers(3 * _count(words, 1), _word(words, 2)).astype(np.float64).reshape(-1, 3)
+            case "CELLS" | "VERTICES" | "LINES" | "POLYGONS" | "TRIANGLE_STRIPS":
+                self._read_cells(name, _count(words, 1), _count(words, 2))
+            case "CELL_TYPES":
+                self._choose_faces(self.numbers(_count(words, 1), "int"))
+            case "POINT_DATA" | "CELL_DATA":
+                self.of_points, self.rows = name == "POINT_DATA", _count(words, 1)
+            case "FIELD":
+                for _ in range(_count(words, 2)):
+                    head = self.words()
+                    columns = _count(head, 1)
+                    self._keep(head[0], self.numbers(columns * _count(head, 2), _word(head, 3)), columns)
+            case "SCALARS":
+                columns = _count(words, 3) if len(words) > 3 else 1
+                self.words_of("LOOKUP_TABLE")  # which is optional
+                self._keep(title, self.numbers(columns * self.rows, _word(words, 2)), columns)
+            case "COLOR_SCALARS":
+                columns = _count(words, 2)
+                values = self.numbers(columns * self.rows, shade)
+                values = values if self.binary else np.rint(255 * np.clip(values.astype(np.float64), 0, 1))
+                self._keep(title, values.astype(np.uint8), columns)
+            case "LOOKUP_TABLE":
+                self.numbers(4 * _count(words, 2), shade)
+            case "VECTORS" | "NORMALS" | "TENSORS":
+                columns = 9 if name == "TENSORS" else 3
+                self._keep(title, self.numbers(columns * self.rows, _word(words, 2)), columns)
+                self.normals = unquote(title) if name == "NORMALS" and self.of_points else self.normals
+            case "TEXTURE_COORDINATES":
+                self.numbers(_count(words, 2) * self.rows, _word(words, 3))
+                self.unread.append("texture coordinates")
+            case _:
+                raise InputError(f"the line {' '.join(words)[:60]!r} does not begin a known section.")
 
-def _section(source: _Source, words: list[str], data: _PolyData) -> None:
-    name = words[0].upper()
-    match name:
-        case "DATASET":
-            data.kind = "".join(words[1:2]).upper()
-            known = ("POLYDATA", "UNSTRUCTURED_GRID", "STRUCTURED_GRID", "STRUCTURED_POINTS", "RECTILINEAR_GRID")
-            if data.kind not in known:
-                raise InputError(f"the data set is {data.kind or 'unnamed'}, but {', '.join(known)} are read.")
-        case "DIMENSIONS" | "ORIGIN" | "SPACING" | "ASPECT_RATIO":
-            data.numbers[name] = parse_numbers(words[1:4])
-        case "X_COORDINATES" | "Y_COORDINATES" | "Z_COORDINATES":
-            data.numbers[name[0]] = source.numbers(_count(words, 1), _word(words, 2)).astype(np.float64)
-        case "CELL_TYPES":
-            _faces_of_types(source.numbers(_count(words, 1), "int"), data)
-        case "POINTS":
-            data.points = source.numbers(3 * _count(words, 1), _word(words, 2)).astype(np.float64).reshape(-1, 3)
-        case "POINT_DATA" | "CELL_DATA":
-            data.of_points, data.count = name == "POINT_DATA", _count(words, 1)
-        case "CELLS" | "VERTICES" | "LINES" | "POLYGONS" | "TRIANGLE_STRIPS":
-            _cells(source, words, data)
-        case "FIELD":
-            _fields(source, words, data)
-        case _:
-            _array(source, words, data)
+    def _read_cells(self, name: str, rows: int, size: int) -> None:
+        """Read polygons with interleaved counts or, since version 5, with separate offsets."""
+        if offset_words := self.words_of("OFFSETS"):
+            offsets = self.numbers(rows, _word(offset_words, 1)).astype(np.int64)
+            if not (words := self.words_of("CONNECTIVITY")):
+                raise InputError("expected the line CONNECTIVITY after the offsets.")
+            corners: Int = self.numbers(size, _word(words, 1)).astype(np.int64)
+            counts = counts_from_offsets(offsets, corners)
+        else:
+            counts, corners = _counted(self.numbers(size, "int").astype(np.int64), rows)
+        if name in ("POLYGONS", "TRIANGLE_STRIPS"):
+            self.faces.append(triangulate_cells(counts, corners, strips=name == "TRIANGLE_STRIPS"))
+        elif name == "CELLS":
+            self.cells = counts, corners
+        elif name == "LINES":
+            self.unread.append("lines")
+
+    def _choose_faces(self, types: Values) -> None:
+        """Keep triangles, polygons and quadrangles (types 5, 7, 9), and strips (6), of an unstructured grid."""
+        counts, corners = self.cells
+        if len(counts) != len(types):
+            raise InputError("the types of cells do not match the cells.")
+        for kinds, strips in (((5, 7, 9), False), ((6,), True)):
+            chosen = np.isin(types, kinds)
+            self.faces.append(triangulate_cells(counts[chosen], corners[np.repeat(chosen, counts)], strips=strips))
+        if (others := ~np.isin(types, (1, 2, 5, 6, 7, 9))).any():
+            self.unread.append(f"{int(others.sum())} cells that are no polygons")
+
+    def _keep(self, name: str, values: Values, columns: int) -> None:
+        if self.of_points:
+            self.arrays[unquote(name)] = values if columns == 1 else values.reshape(-1, max(columns, 1))
+        elif "values of polygons or of the whole" not in self.unread:
+            self.unread.append("values of polygons or of the whole")
 
 
 def _count(words: list[str], place: int) -> int:
@@ -142,55 +193,18 @@ def _word(words: list[str], place: int) -> str:
     return words[place]
 
 
-def _cells(source: _Source, words: list[str], data: _PolyData) -> None:
-    """Read polygons with interleaved counts or, since version 5, with separate offsets."""
-    rows, size, start = _count(words, 1), _count(words, 2), source.place
-    following = source.words()
-    if following[:1] == ["OFFSETS"]:
-        offsets = source.numbers(rows, _word(following, 1)).astype(np.int64)
-        following = source.words()
-        if following[:1] != ["CONNECTIVITY"]:
-            raise InputError("expected the line CONNECTIVITY after the offsets.")
-        corners: Int = source.numbers(size, _word(following, 1)).astype(np.int64)
-        counts = counts_from_offsets(offsets, corners)
-    else:
-        source.place = start
-        counts, corners = _counted(source.numbers(size, "int").astype(np.int64), rows)
-    name = words[0].upper()
-    if name in ("POLYGONS", "TRIANGLE_STRIPS"):
-        data.faces.append(triangulate_cells(counts, corners, strips=name == "TRIANGLE_STRIPS"))
-    elif name == "CELLS":
-        data.cells = counts, corners
-    elif name == "LINES":
-        data.unread.append("lines")
-
-
-def _faces_of_types(types: Values, data: _PolyData) -> None:
-    """Keep triangles, polygons and quadrangles (types 5, 7, 9), and strips (6), of an unstructured grid."""
-    if data.cells is None or len(data.cells[0]) != len(types):
-        raise InputError("the types of cells do not match the cells.")
-    counts, corners = data.cells
-    for kinds, strips in (((5, 7, 9), False), ((6,), True)):
-        chosen = np.isin(types, kinds)
-        if chosen.any():
-            data.faces.append(triangulate_cells(counts[chosen], corners[np.repeat(chosen, counts)], strips=strips))
-    if (others := ~np.isin(types, (1, 2, 5, 6, 7, 9))).any():
-        data.unread.append(f"{int(others.sum())} cells that are no polygons")
-
-
-def _lattice(data: _PolyData) -> Float:
+def _lattice(file: _File) -> Float:
     """The points of a regular or rectilinear grid, of shape (N, 3); x varies fastest."""
-    axes = [data.numbers.get(axis, np.zeros(0)) for axis in "XYZ"]
-    shape = np.array([float(len(axis)) for axis in axes])
-    if data.kind == "STRUCTURED_POINTS":
-        shape = data.numbers.get("DIMENSIONS", np.zeros(0))
+    held, regular = file.held, file.kind == "STRUCTURED_POINTS"
+    axes = [held.get(axis, np.zeros(0)) for axis in "XYZ"]
+    shape = held.get("DIMENSIONS", np.zeros(0)) if regular else np.array([float(len(axis)) for axis in axes])
     size = float(np.prod(shape))
     # A few bytes may declare any number of points.
-    if len(shape) != 3 or not (shape >= 1).all() or size != data.count or not data.arrays:
-        raise InputError(f"the grid has {size:.0f} points, but values of {data.count} points; a surface was expected.")
-    if data.kind == "STRUCTURED_POINTS":
-        spacing = data.numbers.get("SPACING", data.numbers.get("ASPECT_RATIO", np.ones(3)))
-        origin = data.numbers.get("ORIGIN", np.zeros(3))
+    if len(shape) != 3 or not (shape >= 1).all() or size != file.rows or not file.arrays:
+        raise InputError(f"the grid has {size:.0f} points, but values of {file.rows} points; a surface was expected.")
+    if regular:
+        spacing = held.get("SPACING", held.get("ASPECT_RATIO", np.ones(3)))
+        origin = held.get("ORIGIN", np.zeros(3))
         axes = [start + step * np.arange(int(one)) for start, step, one in zip(origin, spacing, shape, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
@@ -205,52 +219,6 @@ def _counted(values: Int, rows: int) -> tuple[Int, Int]:
     if place != len(values) or len(starts) < rows:
         raise InputError("the polygons do not have the size that their section declares.")
     return values[starts], np.delete(values, starts)
-
-
-def _fields(source: _Source, words: list[str], data: _PolyData) -> None:
-    for _ in range(_count(words, 2)):
-        head = source.words()
-        columns, rows = _count(head, 1), _count(head, 2)
-        values = source.numbers(columns * rows, _word(head, 3))
-        _keep(data, _word(head, 0), values, columns)
-
-
-def _array(source: _Source, words: list[str], data: _PolyData) -> None:
-    """Read one of the classic attributes of points or of polygons."""
-    name, title = words[0].upper(), _word(words, 1) if len(words) > 1 else ""
-    match name:
-        case "SCALARS":
-            columns = _count(words, 3) if len(words) > 3 else 1
-            start = source.place
-            # The line LOOKUP_TABLE is optional.
-            if source.words()[:1] != ["LOOKUP_TABLE"]:
-                source.place = start
-            _keep(data, title, source.numbers(columns * data.count, _word(words, 2)), columns)
-        case "COLOR_SCALARS":
-            columns = _count(words, 2)
-            values = source.numbers(columns * data.count, "unsigned_char" if source.binary else "float")
-            # Text files store shares of full brightness.
-            shares = values if source.binary else np.rint(255 * np.clip(values.astype(np.float64), 0, 1))
-            _keep(data, title, shares.astype(np.uint8), columns)
-        case "LOOKUP_TABLE":
-            source.numbers(4 * _count(words, 2), "unsigned_char" if source.binary else "float")
-        case "VECTORS" | "NORMALS":
-            _keep(data, title, source.numbers(3 * data.count, _word(words, 2)), 3)
-            data.normals = unquote(title) if name == "NORMALS" and data.of_points else data.normals
-        case "TEXTURE_COORDINATES":
-            source.numbers(_count(words, 2) * data.count, _word(words, 3))
-            data.unread.append("texture coordinates")
-        case "TENSORS":
-            _keep(data, title, source.numbers(9 * data.count, _word(words, 2)), 9)
-        case _:
-            raise InputError(f"the line {' '.join(words)[:60]!r} does not begin a known section.")
-
-
-def _keep(data: _PolyData, name: str, values: Values, columns: int) -> None:
-    if data.of_points:
-        data.arrays[unquote(name)] = values if columns == 1 else values.reshape(-1, max(columns, 1))
-    elif "values of polygons or of the whole" not in data.unread:
-        data.unread.append("values of polygons or of the whole")
 
 
 # The rest is shared with the XML format, see `gnrecon.io.formats.vtp`.
