@@ -58,6 +58,37 @@ def test_what_is_guessed_is_said_and_columns_decide(tmp_path: Path) -> None:
         parse_columns("x,y,-")
 
 
+def test_a_time_before_the_position_is_no_coordinate(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(400, 3))
+    points = np.round(vectors / np.linalg.norm(vectors, axis=1, keepdims=True) * [30, 20, 10] + [100, 50, 5], 4)
+    sweep = np.linspace(0, 2, 400)
+    strip = np.column_stack([512000 + 30 * sweep, 60 * np.sin(40 * sweep), 100 + np.sin(4 * sweep)])
+    time = np.cumsum(rng.uniform(0, 1, 400))
+    shade = rng.integers(0, 256, 400)
+    in_order = points[np.argsort(points[:, 0])]
+    profiles = np.column_stack([np.repeat(np.arange(20), 20), points[:, 1:] - points[:, 1:].mean(axis=0)])
+    for name, columns, formats, place in (
+        ("time", [time, points], "%.4f", 1),
+        ("time", [time, points, shade], "%.4f", 1),
+        ("time", [1.7e9 + sweep, strip], "%.3f", 1),
+        ("time", [sweep + 0.123456, strip], ["%.6f"] + 3 * ["%.3f"], 1),
+        ("intensity", [shade, points], ["%d"] + 3 * ["%.4f"], 1),
+        # Sorted along x, with a time last, in profiles along x, in a volume: x comes first.
+        ("x, y, z", [in_order, shade], "%.4f", 0),
+        ("x, y, z", [in_order, rng.uniform(0, 1, 400)], ["%.4f"] * 3 + ["%.6f"], 0),
+        ("intensity", [points, time], "%.4f", 0),
+        ("x, y, z", [profiles, rng.uniform(0, 1, 400)], ["%.1f"] + 3 * ["%.4f"], 0),
+        ("intensity", [rng.uniform(0, 1, (400, 3)), shade % 3], "%.4f", 0),
+    ):
+        rows = np.column_stack(columns)
+        np.savetxt(tmp_path / "a.txt", rows, formats)
+        cloud, reading = read_scans([tmp_path / "a.txt"])
+        np.testing.assert_allclose(cloud.points, rows[:, place : place + 3], atol=1e-3)
+        assert f"taken for {name}" in reading.remarks()[0]
+        assert (name == "time") == ("time" in cloud.attributes)
+
+
 def test_of_four_columns_the_one_beyond_a_byte_is_the_intensity(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     colors, intensity = rng.integers(0, 256, (20, 3)), rng.integers(0, 4096, (20, 1))

@@ -41,9 +41,15 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
         When there are fewer than 3 columns.
     """
     names: list[str] = ["index"] if _is_index(rows) else []
-    reasons = {"index": "a running number"} if names else {}
+    reasons: dict[str, str] = {}
     if rows.shape[1] - len(names) < 3:
         raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1] - len(names)}.")
+    first = rows[:, len(names) :]
+    grows = first.shape[1] > 3 and _grows(first[:, 0])
+    if _is_before_position(first):
+        names.append("time" if grows else "intensity")
+    elif grows:
+        reasons["x"] = f"column {places[len(names)] + 1} grows, as a time would"
     names += POSITION
     while (at := len(names)) < rows.shape[1]:
         group, reason = _group(rows[:, at:], names, suffix)
@@ -51,22 +57,23 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
         reasons |= {group[0]: reason}
     singles = [at for at, name in enumerate(names) if not name]
     names = [name or f"column_{places[at] + 1}" for at, name in enumerate(names)]
-    if len(singles) == 1:
+    if len(singles) == 1 and "intensity" not in names:
         names[singles[0]] = "intensity"
     return names, _sentences(names, reasons, places)
 
 
 def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int]) -> tuple[str, ...]:
     """One sentence on what was guessed; none where the first three columns are all that there is."""
-    spoken = {"index": "a running number", "x": "x, y, z", "nx": "normals", "red": "colours", "intensity": "intensity"}
+    spoken = {"index": "a running number", "time": "time", "x": "x, y, z", "nx": "normals", "red": "colours"}
+    spoken["intensity"] = "intensity"
     lengths = {"x": 3, "nx": 3, "red": 3}
     found = []
     for at, name in enumerate(names):
-        if name in spoken and (name != "x" or places[at]):
+        if name in spoken and (name != "x" or places[at] or reasons.get("x")):
             first, last = places[at] + 1, places[min(at + lengths.get(name, 1), len(names)) - 1] + 1
             which = f"column {first} is" if first == last else f"columns {first} to {last} are"
-            reason = reasons.get(name, "") if name in ("nx", "red") else ""
-            found.append(f"{which} taken for {spoken[name]}{f' ({reason})' if reason else ''}")
+            reason = f" ({reasons[name]})" if reasons.get(name) else ""
+            found.append(f"{which} taken for {spoken[name]}{reason}")
     if not found:
         return ()
     text = ", ".join(found)
@@ -96,6 +103,70 @@ def _is_index(rows: Float, *, least_rows: int = 10) -> bool:
         return False
     fractions = bool((rows[:, 1:4] % 1 != 0).any())
     return fractions and bool((np.diff(rows[:, 0]) == 1).all()) and float(rows[0, 0]).is_integer()
+
+
+def _grows(values: Float) -> bool:
+    """Whether numbers, of shape (N,), never decrease, as times in the order of measuring."""
+    return bool((np.diff(values) >= 0).all() and values[-1] > values[0])
+
+
+def _is_before_position(
+    rows: Float, *, least_rows: int = 50, most_rows: int = 2000, least_share: float = 0.1, most_thickness: float = 0.05
+) -> bool:
+    """Whether x, y, z are not the first three columns but the next ones, after a time or an intensity.
+
+    They are so where the next three lie on a surface and the first three do not, and the first column grows from row to
+    row or holds whole numbers before fractions. Where both do, as (time, x, y) of a scanner that moves evenly, a column
+    that grows is a time if it is written with other digits than the three, or in even steps, or is far beyond them, as
+    seconds since 1970 are.
+
+    Parameters
+    ----------
+    rows : array of shape (N, C)
+    least_rows, most_rows : fewer rows show no surface; of more, so many are looked at
+    least_share : of the values of x and y that differ, as many must differ in z: a class or a flag has few
+    most_thickness : of a surface, see `_thickness`; points that fill a volume have 0.15
+    """
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if rows.shape[1] < 4 or len(rows) < least_rows or _grows(rows[:, 3]) or _are_normals(rows[:, 3:6]):
+        return False
+    chosen = np.random.default_rng(0).permutation(len(rows))[:most_rows]
+    sample, next_three = rows[chosen, :4], rows[chosen, 1:4]
+    different, digits = [len(np.unique(column)) for column in sample.T], [_digits(column) for column in sample.T]
+    grows, thickness = _grows(rows[:, 0]), _thickness(next_three)
+    if different[3] < least_share * min(different[1:3]) or thickness > most_thickness:
+        return False
+    if _thickness(sample[:, :3]) > max(most_thickness, 3 * thickness):
+        return grows or digits[0] == 0 < min(digits[1:])
+    # A coordinate that grows repeats in the rows of a grid or of a profile.
+    if not grows or different[0] < len(sample) / 2:
+        return False
+    steps = np.diff(rows[:, 0])
+    even = bool(np.quantile(steps, 0.99) <= 2 * np.median(steps))
+    beyond = bool(sample[:, 0].min() > max(1e8, 30 * np.abs(next_three).max()))
+    return even or beyond or digits[0] != digits[1] == digits[2] == digits[3]
+
+
+def _thickness(points: Float, *, neighbors: int = 12) -> float:
+    """How far points, of shape (N, 3), are from a surface, in whatever units each coordinate is measured.
+
+    It is the median share of the least of three variances among neighbours, after each coordinate is scaled to the same
+    spread: 0 on a plane, 1/3 where no direction differs.
+    """
+    from scipy.spatial import cKDTree
+
+    spread = np.std(points, axis=0)
+    scaled = (points - points.mean(axis=0)) / np.where(spread > 0, spread, 1)
+    near = scaled[cKDTree(scaled).query(scaled, neighbors)[1]]
+    offsets = near - near.mean(axis=1, keepdims=True)
+    variances = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", offsets, offsets))
+    return float(np.median(variances[:, 0] / np.maximum(variances.sum(axis=1), np.finfo(np.float64).tiny)))
+
+
+def _digits(values: Float, *, most: int = 9) -> int:
+    """How many digits after the decimal mark the numbers, of shape (N,), were written with."""
+    rounding = 4 * np.finfo(np.float64).eps * np.abs(values)
+    return next((n for n in range(most) if (np.abs(np.round(values, n) - values) <= rounding).all()), most)
 
 
 def _are_normals(vectors: Float, *, least_share: float = 0.9, tolerance: float = 0.05) -> bool:
