@@ -3,8 +3,9 @@
 *Normals* (`flip_contradicted_normals`). A field that is zero at the points and follows the coarse signed distance in
 free space is fitted without normals. A small patch of wrong normals hardly changes the winding number, which gives that
 distance its sign, so that the field's gradient points against them. In a thin wall that the field does not resolve, its
-gradient is short, and the normals stay. The fit is repeated with the new normals. Source: Hou et al., *Iterative
-Poisson Surface Reconstruction for Unoriented Points*, ACM TOG 2022, with this fit instead of Poisson's.
+gradient is short, and the normals stay. So do those of a patch that continues its surroundings smoothly: at the border
+of an open sheet the winding number has no sign. The fit is repeated with the new normals. Source: Hou et al.,
+*Iterative Poisson Surface Reconstruction for Unoriented Points*, ACM TOG 2022, with this fit instead of Poisson's.
 
 *Outliers*: `find_outliers`.
 """
@@ -14,6 +15,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.field_model import NeuralSDF
@@ -50,11 +54,35 @@ def flip_contradicted_normals(
     # A stream of its own: where no normal is turned around, the fit draws the same numbers as without this check.
     rng, before = np.random.default_rng([options.seed, 2]), samples.normals
     for _ in range(rounds):
-        against = _slopes(samples, rows, options, rng, units) < most_slope
+        against = without_smooth_patches(samples, _slopes(samples, rows, options, rng, units) < most_slope)
         samples = replace(samples, normals=np.where(against[:, None], -samples.normals, samples.normals))
         if not against.any():
             break
     return samples, float((samples.normals != before).any(axis=1).mean())
+
+
+def without_smooth_patches(samples: Samples, against: Mask, *, neighbours: int = 8, least_cosine: float = 0.9) -> Mask:
+    """Return a mask of shape (N,) without the patches whose normals agree with those around them.
+
+    Parameters
+    ----------
+    samples : with normals
+    against : mask of shape (N,), normals that a field contradicts; those that are neighbours make a patch
+    neighbours : of a point
+    least_cosine : of the angle, of 25 degrees, up to which normals are of one smooth surface, or of its two sides
+    """
+    if not against.any():
+        return against
+    near = cKDTree(samples.points).query(samples.points, min(neighbours + 1, len(samples)))[1][:, 1:]
+    start, end = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
+    inside, rim = against[start] & against[end], against[start] != against[end]
+    links = coo_array((np.ones(inside.sum(), np.int8), (start[inside], end[inside])), shape=(len(near), len(near)))
+    patches = connected_components(links, directed=False)[1]
+    cosines = np.einsum("ij,ij->i", samples.normals[start[rim]], samples.normals[end[rim]])
+    votes = np.where(np.abs(cosines) < least_cosine, 0.0, np.sign(cosines))
+    of_patch = patches[np.where(against[start[rim]], start[rim], end[rim])]
+    kept: Mask = against & (np.bincount(of_patch, votes, len(near))[patches] <= 0)
+    return kept
 
 
 def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Generator, units: int) -> Float:

@@ -8,7 +8,7 @@ import made_shapes
 import numpy as np
 import pytest
 
-from gnrecon.fit.consistency import flip_contradicted_normals
+from gnrecon.fit.consistency import flip_contradicted_normals, without_smooth_patches
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.arrays import Float
@@ -48,6 +48,20 @@ def test_right_normals_stay(shape: type, rng: np.random.Generator) -> None:
     found, share = flip_contradicted_normals(right, np.arange(900), OPTIONS)
     assert np.array_equal(found.normals, right.normals)
     assert share == 0
+
+
+def test_a_patch_that_continues_its_surroundings_stays(rng: np.random.Generator) -> None:
+    # A gentle hill, of which a corner and a patch in the middle are in question.
+    flat = rng.uniform(-0.6, 0.6, (900, 2))
+    normals = np.column_stack([0.3 * np.sin(2 * flat), np.ones(900)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    height = 0.15 * np.cos(2 * flat).sum(axis=1)
+    right = Samples(np.column_stack([flat, height]), normals, Frame(np.zeros(3), 1.0))
+    corner, middle = (flat > 0.45).all(axis=1), np.linalg.norm(flat, axis=1) < 0.1
+    assert corner.any()
+    assert middle.any()
+    assert not without_smooth_patches(right, corner | middle).any()
+    assert np.array_equal(without_smooth_patches(turned(right, middle), corner | middle), middle)
 
 
 def test_the_default_fit_turns_estimates(rng: np.random.Generator) -> None:
