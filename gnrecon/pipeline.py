@@ -333,7 +333,9 @@ def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedS
             distances = surface.neighbourhood.distances(mesh.vertices)
             points = samples.frame.to_world(samples.points)
             distances = same_side_distances(mesh, distances, points, samples.normals, reach)
-            mesh, trimming = trim(mesh, distances, reach)
+            # A reach that the user gave is where the surface ends.
+            overhang = surface.spacing if run.options.trim is None else None
+            mesh, trimming = trim(mesh, distances, reach, overhang=overhang)
         why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]
         actions = [*surface.actions, *(why if sheet else []), *trimming.describe()]
         surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)

@@ -104,6 +104,8 @@ class TrimParameters:
 
     # Standard deviation of the smoothing of distances: a line at a distance from single points is ragged.
     smoothing_reaches: float = 1 / 3
+    # The same for the distance beyond the outermost points: that from a smooth line is ragged only at its corners.
+    overhang_smoothing_reaches: float = 0.15
     # Area below which a hole is not cut: the points around it support it well enough.
     hole_squared_reaches: float = 1.0
     # Area below which a leftover piece goes: a disk of two reaches, as around a few stray points.

@@ -7,6 +7,10 @@ from both ends, so that no face becomes a sliver. Two kinds of small changes are
 not cut, because the points around it support it well enough; and a leftover piece of less than 4 pi D^2, a disc of
 radius 2 D, is removed too: it surrounds a few outliers.
 
+A reach that spans the gaps between points also leaves a hem of that width around the data, which no point supports and
+which may hang down or curl under. With an overhang E below D, the border is moved back from the first cut by D - E, but
+not where a point is nearer than E: a morphological closing of the data by D, dilated by E.
+
 A closed, oriented 2-manifold cut in this way is an oriented 2-manifold with borders: every vertex that stays keeps all
 its faces, and every new one lies on an edge between two. The entries are `trim`, `clip_to_box` and `unsupported_area`.
 """
@@ -34,8 +38,8 @@ class Trimming:
 
     Parameters
     ----------
-    distance : float
-        The reach, in file units.
+    distance, overhang : float
+        The reach, and how far the border is from the outermost points, in file units.
     area_share : float
         Share of the whole surface that was cut off.
     crumbs, filled : int
@@ -43,6 +47,7 @@ class Trimming:
     """
 
     distance: float
+    overhang: float
     area_share: float
     crumbs: int
     filled: int
@@ -57,15 +62,21 @@ class Trimming:
             return [f"Nothing was cut off: all of the surface lies within {self.distance:.6g} of a point."]
         crumbs = f", with {self.crumbs} small leftover pieces" if self.crumbs else ""
         filled = f" {self.filled} small gaps were left closed." if self.filled else ""
+        hem = f", and what hangs over by more than {self.overhang:.6g}" if self.overhang < self.distance else ""
         return [
             f"Cut off {self.area_share:.1%} of the surface: the parts farther than {self.distance:.6g} from every "
-            f"point that faces the same way{crumbs}.{filled}",
+            f"point that faces the same way{hem}{crumbs}.{filled}",
             "The mesh is open: an oriented edge-manifold with borders, not a solid.",
         ]
 
 
 def trim(
-    mesh: Mesh, distances: Float, reach: float, *, parameters: TrimParameters | None = None
+    mesh: Mesh,
+    distances: Float,
+    reach: float,
+    *,
+    overhang: float | None = None,
+    parameters: TrimParameters | None = None,
 ) -> tuple[Mesh, Trimming]:
     """Cut off what is farther than `reach` from data; return the same mesh where nothing is.
 
@@ -77,6 +88,8 @@ def trim(
         From each vertex to the nearest scanned point, in file units.
     reach : float
         Positive, in file units.
+    overhang : float, optional
+        How far the border may be from the outermost points, in file units; by default the reach.
     parameters : TrimParameters, optional
         By default ``TrimParameters()``.
 
@@ -86,23 +99,50 @@ def trim(
         When nothing would be left.
     """
     parameters = parameters or ExportParameters.trim
-    areas = vertex_areas(mesh)
-    # Small holes first: a piece counts as small only with its own holes filled.
+    level = reach if overhang is None else min(overhang, reach)
     smooth = diffuse(mesh, distances, parameters.smoothing_reaches * reach)
-    least_hole, least_piece = (
-        share * reach**2 for share in (parameters.hole_squared_reaches, parameters.crumb_squared_reaches)
-    )
-    near, filled = _absorb_small_patches(mesh, smooth <= reach, areas, least_hole, of=False)
-    near, crumbs = _absorb_small_patches(mesh, near, areas, least_piece, of=True)
+    near, filled, crumbs = _supported(mesh, smooth <= reach, reach, parameters)
+    if level < reach and near.any() and not near.all():
+        beyond = _beyond_data(mesh, near, distances, reach)
+        smooth = diffuse(mesh, beyond, parameters.overhang_smoothing_reaches * reach)
+        near, more_filled, more_crumbs = _supported(mesh, near & (smooth <= level), level, parameters)
+        filled, crumbs = filled + more_filled, crumbs + more_crumbs
     if not near.any():
         raise UsageError(
             f"Trimming at {reach:.6g} leaves nothing: every point is at least {distances.min():.6g} away. "
             f"Choose a larger distance."
         )
     if near.all():
-        return mesh, Trimming(reach, 0.0, 0, filled)
-    result = cut_at_level(mesh, near, smooth, reach, clearance=parameters.edge_clearance)
-    return result, Trimming(reach, 1 - result.area / mesh.area, crumbs, filled)
+        return mesh, Trimming(reach, level, 0.0, 0, filled)
+    result = cut_at_level(mesh, near, smooth, level, clearance=parameters.edge_clearance)
+    return result, Trimming(reach, level, 1 - result.area / mesh.area, crumbs, filled)
+
+
+def _supported(mesh: Mesh, near: Mask, reach: float, parameters: TrimParameters) -> tuple[Mask, int, int]:
+    """The near vertices without small holes and pieces, and the numbers of both."""
+    areas = vertex_areas(mesh)
+    least_hole, least_piece = (
+        share * reach**2 for share in (parameters.hole_squared_reaches, parameters.crumb_squared_reaches)
+    )
+    # Small holes first: a piece counts as small only with its own holes filled.
+    near, filled = _absorb_small_patches(mesh, near, areas, least_hole, of=False)
+    near, crumbs = _absorb_small_patches(mesh, near, areas, least_piece, of=True)
+    return near, filled, crumbs
+
+
+def _beyond_data(mesh: Mesh, near: Mask, distances: Float, reach: float) -> Float:
+    """How far each vertex is beyond the outermost points, of shape (V,), by its distance from where support ends.
+
+    It is at most the reach, at least minus that, and no more than the distance from the nearest point.
+    """
+    from scipy.spatial import cKDTree
+
+    ends = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    border = mesh.vertices[ends[near[ends[:, 0]] != near[ends[:, 1]]]].mean(axis=1)
+    inside = cKDTree(border).query(mesh.vertices[near])[0]
+    beyond = np.full(len(near), reach)
+    beyond[near] = np.maximum(np.minimum(distances[near], reach - inside), -reach)
+    return beyond
 
 
 def same_side_distances(

@@ -53,12 +53,16 @@ def assert_open_manifold(mesh: Mesh) -> None:
     assert (np.bincount(ends.reshape(-1))[np.unique(ends)] == 2).all()
 
 
-def test_half_a_sphere(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("reach", "overhang"), [(0.1, None), (0.2, 0.1)])
+def test_half_a_sphere(rng: np.random.Generator, reach: float, overhang: float | None) -> None:
     points = points_on_sphere(20_000, rng)
-    points = points[points[:, 2] > 0]
+    # A gap beyond 0.1, which a longer reach spans.
+    gap = np.linalg.norm(points - [0, 0, RADIUS], axis=1) < 0.15
+    points = points[(points[:, 2] > 0) & (~gap if overhang else True)]
     mesh = ball()
-    reach = 0.1
-    result, done = trim(mesh, Neighbourhood(points).distances(mesh.vertices), reach)
+    result, done = trim(mesh, Neighbourhood(points).distances(mesh.vertices), reach, overhang=overhang)
+    reach = overhang or reach
+    assert (done.overhang, done.describe()[0].count("hangs over")) == (reach, int(overhang is not None))
     assert_open_manifold(result)
     assert (done.crumbs, done.filled) == (0, 0)
     # The chord of length D below the equator.
