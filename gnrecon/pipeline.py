@@ -330,12 +330,10 @@ def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedS
     reach = run.options.trim_at(surface.spacing, sheet)
     if reach is not None:
         with run.stages("trim"):
-            distances = surface.neighbourhood.distances(mesh.vertices)
-            points = samples.frame.to_world(samples.points)
+            distances, points = surface.neighbourhood.distances(mesh.vertices), samples.frame.to_world(samples.points)
             distances = same_side_distances(mesh, distances, points, samples.normals, reach)
             # A reach that the user gave is where the surface ends.
-            overhang = surface.spacing if run.options.trim is None else None
-            mesh, trimming = trim(mesh, distances, reach, overhang=overhang)
+            mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else surface.spacing)
         why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]
         actions = [*surface.actions, *(why if sheet else []), *trimming.describe()]
         surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)

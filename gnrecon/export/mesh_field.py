@@ -30,6 +30,7 @@ from gnrecon.export.resolution import (
 from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.ingest.point_spacing import neighbour_spacing
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
@@ -114,11 +115,11 @@ def cells_for_faces(
     cells: int,
     sheet: float | None = None,
     *,
-    least_cells: int = 128,
+    least_cells: int = 64,
     most_cells: int = 224,
     samples: int = 2000,
     chord_ratio: float = 0.07,
-    noise_share: float = 0.05,
+    error_share: float = 0.15,
 ) -> int:
     """Return the cells that the faces need: more for a smooth shape without noise, fewer where noise hides the gain.
 
@@ -141,8 +142,8 @@ def cells_for_faces(
         Most points at which the curvature is evaluated.
     chord_ratio : float
         Mean distance of faces from the surface over its curvature and the square of a cell; 0.072 on spheres.
-    noise_share : float
-        Mean distance of faces, over the deviation of the points' noise, that is small enough.
+    error_share : float
+        Mean distance of faces, over that error of the field, that is small enough.
     """
     data = sdf.data
     if sdf.detail is None or data is None:
@@ -158,7 +159,8 @@ def cells_for_faces(
         least_off = chord_ratio * bend * (longest / ExportParameters.resolution.most_refined_cells) ** 2
         return math.ceil(longest * math.sqrt(chord_ratio * bend / max(off, least_off, np.finfo(np.float64).tiny)))
 
-    if (enough := needed(noise_share * sdf.detail.position * sdf.frame.scale)) < cells:
+    per_length = np.sqrt(np.pi) * float(np.median(sdf.detail.lengths)) * sdf.frame.scale / neighbour_spacing(data)
+    if (enough := needed(error_share * sdf.detail.position * sdf.frame.scale / per_length)) < cells:
         through = 0 if sheet is None else cells_for_sheet(longest, sheet)
         return min(max(enough, least_cells, through), cells)
     if cells >= most_cells:

@@ -130,8 +130,7 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
         assert result.report["options"]["resolution"] == cells
         found[noise] = cells
         by_points = Options().for_scan(scan, box).resolution
-        assert by_points is not None
-        assert cells >= by_points
+        assert by_points == 128
         if noise == 0.0:
             # The faces are then as near to the torus as the field is, or as near as the most cells allow.
             x = result.mesh.vertices[result.mesh.faces].mean(axis=1)
@@ -140,18 +139,19 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
             assert cells_for_faces(result.sdf, 200) == max(200, cells)
             assert cells_for_faces(replace(result.sdf, detail=None), 128) == 128
         else:
-            # The noise hides what more cells gain, but not a sheet that the points show.
-            fewer = cells_for_faces(result.sdf, 512, least_cells=16)
-            assert fewer < 100
-            assert cells_for_faces(result.sdf, 512) == 128
-            box_edge = float(np.ptp(result.sdf.bounds, axis=0).max())
-            assert cells_for_faces(result.sdf, 512, sheet=box_edge / 150) == 300
-            # Half of the cells have four times the distance of the faces, which needs four times the noise.
+            # A field that averages so many points for each length is worth more cells than the points have.
             assert result.sdf.detail is not None
-            noisier = replace(result.sdf.detail, position=4 * result.sdf.detail.position)
-            assert cells_for_faces(replace(result.sdf, detail=noisier), 512, least_cells=16) == pytest.approx(
-                fewer / 2, abs=1
-            )
+            needed = cells_for_faces(result.sdf, 1024, least_cells=16)
+            assert 128 < needed < 1024
+            # Half of the cells have four times the distance of the faces, which needs four times the noise.
+            for factor, cells in ((4, needed / 2), (64, needed / 8)):
+                detail = replace(result.sdf.detail, position=factor * result.sdf.detail.position)
+                noisy = replace(result.sdf, detail=detail)
+                assert cells_for_faces(noisy, 1024, least_cells=16) == pytest.approx(cells, abs=1)
+            # The noise hides what more cells gain, but not a sheet that the points show.
+            assert cells_for_faces(noisy, 1024) == 64
+            box_edge = float(np.ptp(result.sdf.bounds, axis=0).max())
+            assert cells_for_faces(noisy, 1024, sheet=box_edge / 150) == 300
     assert found[0.0] > found[0.02] == 128
     few = reconstruct(points[::8], normals[::8], quality="draft", resolution=24)
     assert few.report["fineness"]["resolution"] == 24

@@ -30,7 +30,7 @@ _TYPES = {
 
 def read_vtk(path: Path) -> Contents:
     """Read points with their arrays, and polygons and strips where there are some."""
-    file = _File(path.read_bytes())
+    file = _VtkLegacy(path.read_bytes())
     while words := file.words():
         file.read_section(words[0].upper(), words)
     points = _lattice(file) if file.kind in ("STRUCTURED_POINTS", "RECTILINEAR_GRID") else file.points
@@ -39,7 +39,7 @@ def read_vtk(path: Path) -> Contents:
     return assemble_contents(points, np.concatenate([no_faces(), *file.faces]), file.arrays, file.normals, file.unread)
 
 
-class _File:
+class _VtkLegacy:
     """A file's bytes, the place of what is read next, and what its sections hold."""
 
     def __init__(self, data: bytes) -> None:
@@ -193,7 +193,7 @@ def _word(words: list[str], place: int) -> str:
     return words[place]
 
 
-def _lattice(file: _File) -> Float:
+def _lattice(file: _VtkLegacy) -> Float:
     """The points of a regular or rectilinear grid, of shape (N, 3); x varies fastest."""
     held, regular = file.held, file.kind == "STRUCTURED_POINTS"
     axes = [held.get(axis, np.zeros(0)) for axis in "XYZ"]

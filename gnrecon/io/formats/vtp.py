@@ -26,7 +26,7 @@ from gnrecon.runtime.errors import InputError
 
 
 @dataclass(frozen=True)
-class _File:
+class _VtkXml:
     """How a file's arrays are stored, and the block that is appended to its XML."""
 
     order: str
@@ -48,7 +48,7 @@ def read_vtp(path: Path) -> Contents:
     return concatenated(pieces)
 
 
-def _open(data: bytes) -> tuple[ElementTree.Element, _File]:
+def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     """Return the XML without the appended block, and how arrays are read."""
     decompressors: dict[str, Callable[[bytes], bytes]] = {
         "vtkZLibDataCompressor": zlib.decompress,
@@ -65,10 +65,10 @@ def _open(data: bytes) -> tuple[ElementTree.Element, _File]:
         raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(decompressors)}, or none.")
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
-    return root, _File(order, header, decompressors.get(compressor), block.partition(b"_")[2], b"raw" in tag)
+    return root, _VtkXml(order, header, decompressors.get(compressor), block.partition(b"_")[2], b"raw" in tag)
 
 
-def _piece(piece: ElementTree.Element, file: _File) -> Contents:
+def _piece(piece: ElementTree.Element, file: _VtkXml) -> Contents:
     count = _whole(piece.get("NumberOfPoints"))
     found = [_values(array, file) for array in piece.iterfind("Points/DataArray")]
     if len(found) != 1 or found[0].shape != (count, 3):
@@ -89,7 +89,7 @@ def _whole(text: str | None) -> int:
     return int(text or 0)
 
 
-def _faces(piece: ElementTree.Element, name: str, file: _File) -> Int:
+def _faces(piece: ElementTree.Element, name: str, file: _VtkXml) -> Int:
     arrays = {array.get("Name"): _values(array, file) for array in piece.iterfind(f"{name}/DataArray")}
     if not {"connectivity", "offsets"} <= arrays.keys():
         return no_faces()
@@ -99,7 +99,7 @@ def _faces(piece: ElementTree.Element, name: str, file: _File) -> Int:
     return triangulate_cells(counts, corners, strips=name == "Strips")
 
 
-def _values(array: ElementTree.Element, file: _File) -> Values:
+def _values(array: ElementTree.Element, file: _VtkXml) -> Values:
     """Return an array of shape (N,), or (N, C) where it has C > 1 components."""
     kind = array.get("type", "")
     if re.fullmatch("U?Int(8|16|32|64)|Float(32|64)", kind) is None:
@@ -114,7 +114,7 @@ def _values(array: ElementTree.Element, file: _File) -> Values:
     return values if columns == 1 else values.reshape(-1, max(columns, 1))
 
 
-def _bytes(array: ElementTree.Element, form: str, file: _File) -> bytes:
+def _bytes(array: ElementTree.Element, form: str, file: _VtkXml) -> bytes:
     """The bytes of an array; in base64, the header of compressed data is encoded separately."""
     if form not in ("appended", "binary"):
         raise InputError(f"the format {form[:20]!r} of an array is unknown.")
@@ -141,7 +141,7 @@ def _bytes(array: ElementTree.Element, form: str, file: _File) -> bytes:
     return b"".join(file.decompress(packed[start:end]) for start, end in itertools.pairwise(ends))
 
 
-def _header(data: bytes, file: _File, count: int) -> list[int]:
+def _header(data: bytes, file: _VtkXml, count: int) -> list[int]:
     if len(data) < count * file.header.itemsize:
         raise InputError("the file ends within the header of an array.")
     found: list[int] = np.frombuffer(data, file.header, count).tolist()
