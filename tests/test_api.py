@@ -31,7 +31,8 @@ def test_signatures_are_written_where_they_are_missing_or_old() -> None:
     assert "### Frame\n\n```text\nFrame(center: Float, scale: float)\n    of(points: Float) -> Frame\n" in made
     assert "```\n\nWhat it is.\n\n## Part\n\n### trim\n" in made
     result = ") -> tuple[Mesh, Trimming]\n```\n\nMore.\n"
-    arguments = ("mesh: Mesh", "distances: Float", "reach: float", "*", "parameters: TrimParameters | None = None")
+    arguments = ["mesh: Mesh", "distances: Float", "reach: float", "*"]
+    arguments += ["overhang: float | None = None", "parameters: TrimParameters | None = None"]
     assert "".join(["trim(\n", *(f"    {argument},\n" for argument in arguments), result]) in made
     assert "old(" not in made
     assert make_api.updated(made) == made
