@@ -116,10 +116,11 @@ def cells_for_faces(
     sheet: float | None = None,
     *,
     least_cells: int = 64,
+    least_spacing_cells: float = 1.5,
     most_cells: int = 224,
     samples: int = 2000,
     chord_ratio: float = 0.07,
-    error_share: float = 0.15,
+    error_share: float = 0.1,
 ) -> int:
     """Return the cells that the faces need: more for a smooth shape without noise, fewer where noise hides the gain.
 
@@ -134,8 +135,8 @@ def cells_for_faces(
         That suit the spacing of the points.
     sheet : float, file units, optional
         Thickness of the thinnest sheet, which the cells resolve whatever the noise is.
-    least_cells : int
-        Least to return because of noise.
+    least_cells, least_spacing_cells : int, float
+        Least to return because of noise: of the whole box, and through a spacing of the points.
     most_cells : int
         Most to return for the sake of smooth faces.
     samples : int
@@ -159,10 +160,11 @@ def cells_for_faces(
         least_off = chord_ratio * bend * (longest / ExportParameters.resolution.most_refined_cells) ** 2
         return math.ceil(longest * math.sqrt(chord_ratio * bend / max(off, least_off, np.finfo(np.float64).tiny)))
 
-    per_length = np.sqrt(np.pi) * float(np.median(sdf.detail.lengths)) * sdf.frame.scale / neighbour_spacing(data)
+    spacing = neighbour_spacing(data)
+    per_length = np.sqrt(np.pi) * float(np.median(sdf.detail.lengths)) * sdf.frame.scale / spacing
     if (enough := needed(error_share * sdf.detail.position * sdf.frame.scale / per_length)) < cells:
         through = 0 if sheet is None else cells_for_sheet(longest, sheet)
-        return min(max(enough, least_cells, through), cells)
+        return min(max(enough, least_cells, math.ceil(least_spacing_cells * longest / spacing), through), cells)
     if cells >= most_cells:
         return cells
     # The coarse field at the data is the detail that the smooth field does not represent.

@@ -141,15 +141,19 @@ def test_smooth_clean_shapes_get_the_cells_that_their_faces_need() -> None:
         else:
             # A field that averages so many points for each length is worth more cells than the points have.
             assert result.sdf.detail is not None
-            needed = cells_for_faces(result.sdf, 1024, least_cells=16)
+            anything = {"least_cells": 16, "least_spacing_cells": 0.1}
+            needed = cells_for_faces(result.sdf, 1024, **anything)
             assert 128 < needed < 1024
             # Half of the cells have four times the distance of the faces, which needs four times the noise.
             for factor, cells in ((4, needed / 2), (64, needed / 8)):
                 detail = replace(result.sdf.detail, position=factor * result.sdf.detail.position)
                 noisy = replace(result.sdf, detail=detail)
-                assert cells_for_faces(noisy, 1024, least_cells=16) == pytest.approx(cells, abs=1)
+                assert cells_for_faces(noisy, 1024, **anything) == pytest.approx(cells, abs=1)
             # The noise hides what more cells gain, but not a sheet that the points show.
             assert cells_for_faces(noisy, 1024) == 64
+            assert cells_for_faces(noisy, 1024, least_spacing_cells=5.0) == pytest.approx(
+                5 * np.ptp(result.sdf.bounds, axis=0).max() / neighbour_spacing(scan), abs=1
+            )
             box_edge = float(np.ptp(result.sdf.bounds, axis=0).max())
             assert cells_for_faces(noisy, 1024, sheet=box_edge / 150) == 300
     assert found[0.0] > found[0.02] == 128
