@@ -125,8 +125,9 @@ def cells_for_faces(
     """Return the cells that the faces need: more for a smooth shape without noise, fewer where noise hides the gain.
 
     The amplitude of the detail field at the data bounds the error of the smooth global field between them. It is far
-    more than the distance of the faces, except on smooth shapes that were scanned without noise. Where faces are nearer
-    to the field than a small share of the noise, finer ones bring them no nearer to the surface.
+    more than the distance of the faces, except on smooth shapes that were scanned without noise. Noise of the points
+    leaves the field an error of about sigma / sqrt(n), with n points within a length scale; where faces are nearer to
+    the field than a small share of that, finer ones bring them no nearer to the surface.
 
     Parameters
     ----------
@@ -144,27 +145,31 @@ def cells_for_faces(
     chord_ratio : float
         Mean distance of faces from the surface over its curvature and the square of a cell; 0.072 on spheres.
     error_share : float
-        Mean distance of faces, over that error of the field, that is small enough.
+        Mean distance of faces from the field, over its error by noise, that is small enough.
     """
     data = sdf.data
     if sdf.detail is None or data is None:
+        return cells
+    longest, spacing = float(np.ptp(sdf.bounds, axis=0).max()), neighbour_spacing(data)
+    if not spacing > 0:  # points that coincide say nothing
+        return cells
+    through = 0 if sheet is None else cells_for_sheet(longest, sheet)
+    least = max(least_cells, math.ceil(least_spacing_cells * longest / spacing), through)
+    if least >= cells >= most_cells:
         return cells
     some = data[:: max(1, len(data) // samples)]
     mean, gauss = curvatures(sdf.gradient(some), sdf.hessian(some))
     # sqrt(k1^2 + k2^2) from the mean and the Gauss curvature.
     bend = float(np.nanmean(np.sqrt((4 * mean**2 - 2 * gauss).clip(0.0))))
-    longest = float(np.ptp(sdf.bounds, axis=0).max())
 
     def needed(off: float) -> int:
         """Return the cells for a mean distance: off = chord_ratio bend (longest / cells)^2."""
         least_off = chord_ratio * bend * (longest / ExportParameters.resolution.most_refined_cells) ** 2
         return math.ceil(longest * math.sqrt(chord_ratio * bend / max(off, least_off, np.finfo(np.float64).tiny)))
 
-    spacing = neighbour_spacing(data)
     per_length = np.sqrt(np.pi) * float(np.median(sdf.detail.lengths)) * sdf.frame.scale / spacing
     if (enough := needed(error_share * sdf.detail.position * sdf.frame.scale / per_length)) < cells:
-        through = 0 if sheet is None else cells_for_sheet(longest, sheet)
-        return min(max(enough, least_cells, math.ceil(least_spacing_cells * longest / spacing), through), cells)
+        return min(max(enough, least), cells)
     if cells >= most_cells:
         return cells
     # The coarse field at the data is the detail that the smooth field does not represent.

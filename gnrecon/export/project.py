@@ -133,10 +133,10 @@ def newton_project(
         rows, trial = _newton_steps(points, value, gradient, start, limit, field.bounds, near_enough)
         if not len(rows):
             break
-        trial_value, slopes = field.sdf(trial), np.linalg.norm(gradient[rows], axis=1)
+        trial_value = field.sdf(trial)
         # A step that does not reduce the field's magnitude is not taken: the linear model failed. A rough value that is
         # smaller than the difference of both fields says nothing about that.
-        allowed = gradient_reuse_limits * limit * slopes if from_rough else 0.0
+        allowed = gradient_reuse_limits * limit * np.linalg.norm(gradient[rows], axis=1) if from_rough else 0.0
         better = np.abs(trial_value) < np.maximum(np.abs(value[rows]), allowed)
         rows, trial, trial_value = rows[better], trial[better], trial_value[better]
         far = np.linalg.norm(trial - points[rows], axis=1) > gradient_reuse_limits * limit
