@@ -52,9 +52,7 @@ def main(arguments: Sequence[str]) -> int:
     chosen = _parser().parse_args(arguments)
     if min(chosen.counts) < 1000:
         raise UsageError("A scan must have at least 1,000 points.")
-    command_line.require_folders(chosen.json, chosen.picture)
-    if chosen.picture:
-        command_line.require_matplotlib()
+    command_line.require_drawable(chosen.json, chosen.picture)
     report: dict[str, Any] = command_line.provenance("blocks", arguments) | {"runs": []}
     console = Console(highlight=False)
     for count in sorted(chosen.counts):

@@ -70,9 +70,7 @@ def main(arguments: Sequence[str]) -> int:
     chosen = parser.parse_args(arguments)
     if min(chosen.counts) < 100:
         raise UsageError("A scan must have at least 100 points.")
-    command_line.require_folders(chosen.json, chosen.picture)
-    if chosen.picture:
-        command_line.require_matplotlib()
+    command_line.require_drawable(chosen.json, chosen.picture)
     console = Console(highlight=False, width=120)
     version = run_command([*GNRECON, "--version"], chosen.threads)
     report: dict[str, Any] = command_line.provenance("speed", arguments) | {"version": version, "scans": []}

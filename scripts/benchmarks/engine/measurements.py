@@ -202,9 +202,7 @@ def _check(chosen: argparse.Namespace) -> None:
         raise UsageError(f"--repeat and --budget must be positive, not {chosen.repeat} and {chosen.budget}.")
     if chosen.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda needs a CUDA GPU and a torch built for it; there is none here.")
-    command_line.require_folders(chosen.json, chosen.plot)
-    if chosen.plot:
-        command_line.require_matplotlib()
+    command_line.require_drawable(chosen.json, chosen.plot)
     missing = _missing(chosen.data)
     if missing and any(name in NEEDS_DATA for name in chosen.only or ()):
         raise InputError(f"There is no file {missing[0]}; name the folder that holds it with --data.")

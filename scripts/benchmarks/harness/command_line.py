@@ -78,6 +78,21 @@ def require_folders(*files: Path | None) -> None:
             raise OutputError(f"{file} cannot be written: its folder does not exist.")
 
 
+def require_drawable(report: Path | None, picture: Path | None) -> None:
+    """Check before the work that both files can be written after it, and the picture drawn, where they were named.
+
+    Raises
+    ------
+    OutputError
+        When the folder of a file does not exist.
+    UsageError
+        When there is no matplotlib for the picture.
+    """
+    require_folders(report, picture)
+    if picture is not None:
+        require_matplotlib()
+
+
 def require_matplotlib() -> None:
     """Check that matplotlib is installed.
 
