@@ -6,8 +6,8 @@ the derivatives of the features' sum, and the noise covariance D, the log margin
 
     -1/2 (y^T (K + D)^-1 y + log det (K + D)) + constant.
 
-The noise that maximises its sum over patches is selected (`MarginalLikelihood.noise`). All points contribute, so that
-it separates noises which validation points cannot, because those have noise of their own. It selects length scales
+The noise that maximises its sum over patches is selected (`MarginalLikelihood.likeliest`). All points contribute, so
+that it separates noises which validation points cannot, because those have noise of their own. It selects length scales
 less well: under it a surface is equally curved everywhere, which no shape is.
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 5.4.1.
 """
@@ -65,14 +65,15 @@ class MarginalLikelihood:
         features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
         return cls(patches, features, radius, device, parameters)
 
-    def noise(self, length: float) -> tuple[float, float]:
-        """Return the noise of positions, unit coordinates, and of normals, radians, of the largest marginal likelihood.
+    def likeliest(self, length: float, near: Place | None = None) -> Place:
+        """Return where the noises of the largest marginal likelihood are in both tables of candidates.
 
-        It is a local maximum over both tables of candidates.
+        It is a local maximum.
 
         Parameters
         ----------
         length : over which the functions vary, unit coordinates
+        near : place of those of a similar length, where the search begins
         """
         kernels = map_in_threads(
             lambda patch: data_kernel(patch, self.features, length, patch.size), self.patches, self.device
@@ -81,16 +82,17 @@ class MarginalLikelihood:
 
         @cache
         def found(place: Place) -> float:
-            position, angle = self._noise_at(place)
+            position, angle = self.noise_at(place)
             return sum(map_in_threads(lambda one: log_density(*one, position, angle), both, self.device))
 
-        best = self.parameters.first_index
-        for stride in self.parameters.strides:
+        best = near or self.parameters.first_index
+        for stride in self.parameters.strides if near is None else self.parameters.strides[-1:]:
             while (better := max(self._around(best, stride), key=found)) != best:
                 best = better
-        return self._noise_at(best)
+        return best
 
-    def _noise_at(self, place: Place) -> tuple[float, float]:
+    def noise_at(self, place: Place) -> tuple[float, float]:
+        """Return the noise of positions, unit coordinates, and of normals, radians, at a place in both tables."""
         positions, angles = self.parameters.position_noises_disk_radii, self.parameters.angle_noises_radians
         return positions[place[0]] * self.radius, angles[place[1]]
 

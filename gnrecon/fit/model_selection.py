@@ -25,7 +25,7 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
-from gnrecon.fit.marginal_likelihood import MarginalLikelihood, clean_noise
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, Place, clean_noise
 from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
@@ -105,7 +105,7 @@ def select_hyperparameters(
     """
     validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
     if outliers:
-        return validation.select(by_likelihood=False)
+        return replace(validation, likelihood=None).select()
     return validation.clean() or validation.select()
 
 
@@ -171,8 +171,8 @@ class CrossValidation:
     held_out : mask of shape (N,), of the validation points
     device : a torch device
     known : noise of positions and normals, if it is known; then no other is tried
-    likelihood : which gives one more candidate of the noise for each length; None of estimated normals, whose errors
-        are correlated
+    likelihood : which decides the noise for each length; None where several are tried, as for estimated normals, whose
+        errors are correlated
     """
 
     residuals: FieldResiduals
@@ -185,6 +185,7 @@ class CrossValidation:
     known: tuple[float, float] | None = None
     likelihood: MarginalLikelihood | None = None
     parameters: ModelSelectionParameters = ModelSelectionParameters()
+    _places: list[Place] = field(default_factory=list, init=False, repr=False)
     _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
@@ -233,8 +234,8 @@ class CrossValidation:
             number += 1
         return Hyperparameters(self._length(number), *noise)
 
-    def select(self, by_likelihood: bool = True) -> Hyperparameters:
-        """Return the hyperparameters that predict best, with the likeliest noise if it is asked for and known."""
+    def select(self) -> Hyperparameters:
+        """Return the hyperparameters that predict best, with the likeliest noise where it is known."""
         scores: dict[int, Float] = {}
 
         def least(number: int) -> float:
@@ -248,15 +249,10 @@ class CrossValidation:
         step = 1 if least(at + 1) < least(at) else -1
         while least(at + step) < least(at):
             at += step
-        if by_likelihood and self.likelihood is not None:
-            number, _ = _smoothest({number: of_length[:, -1:] for number, of_length in scores.items()})
-            # Errors of dense scans are alike among neighbours, as those of estimated normals are.
-            by_place = len(self.residuals) <= self.parameters.sparse_points
-            return Hyperparameters(self._length(number), *self.noises(self._length(number))[-1], by_place)
-        count = len(_noise_candidates(self.parameters))
-        tabled = {number: of_length[:, :count] for number, of_length in scores.items()}
-        number, noise = _smoothest(tabled, parameters=self.parameters)
-        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise])
+        number, noise = _smoothest(scores, parameters=self.parameters)
+        # Errors of dense scans are alike among neighbours, as those of estimated normals are.
+        by_place = self.likelihood is not None and len(self.residuals) <= self.parameters.sparse_points
+        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise], by_place)
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
@@ -271,18 +267,23 @@ class CrossValidation:
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
-        """Return the noises of positions and normals to try with a length, the most likely one last."""
+        """Return the noises of positions and normals to try with a length."""
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
-            tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
-            tried += [] if self.likelihood is None else [self.likelihood.noise(length)]
             # With estimated normals, few validation points hardly tell a smooth field from one that winds through all.
             least, most = 0.0, max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
             if self.residuals.estimated and (shown := self.residuals.noise):
                 least, most = shown / self.parameters.most_noise_factor, shown * self.parameters.most_noise_factor
-            self._noises[length] = [(min(max(position, least), most), angle) for position, angle in tried]
+            self._noises[length] = [(min(max(position, least), most), angle) for position, angle in self._tried(length)]
         return self._noises[length]
+
+    def _tried(self, length: float) -> list[tuple[float, float]]:
+        """Return the likeliest noise of a length, or all candidates where likelihood does not decide."""
+        if self.likelihood is None:
+            return [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
+        self._places.append(self.likelihood.likeliest(length, self._places[-1] if self._places else None))
+        return [self.likelihood.noise_at(self._places[-1])]
 
     def scores(self, length: float) -> Float:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""

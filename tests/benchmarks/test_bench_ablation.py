@@ -20,6 +20,7 @@ def test_each_part_is_left_out_by_parameters_of_its_own() -> None:
     assert len({repr(one) for one in PARTS.values()}) == len(PARTS)
 
 
+@pytest.mark.usefixtures("measured_here")
 def test_the_benchmark_writes_and_prints_what_a_part_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tmp_path / "ablation.json"
     tiny = Protocol(threads=1, samples=2000, options={"resolution": 24, "quality": "draft"})

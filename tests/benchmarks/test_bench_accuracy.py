@@ -295,6 +295,7 @@ def test_what_is_wrong_is_told_before_the_work(tmp_path: Path, capsys: pytest.Ca
     assert len(shown.err.splitlines()) == 4
 
 
+@pytest.mark.usefixtures("measured_here")
 def test_a_small_run_from_cases_to_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures, picture = tmp_path / "figures.json", tmp_path / "sheet.png"
     options = {"resolution": 32, "quality": "draft"}

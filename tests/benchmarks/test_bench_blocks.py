@@ -28,6 +28,7 @@ def test_noise_is_as_large_as_it_says() -> None:
     assert ball.distances(ball.scan(count=5000).points).std() == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.usefixtures("measured_here")
 def test_the_benchmark_measures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report, picture = tmp_path / "blocks.json", tmp_path / "blocks.png"
     words = ["--counts", "1000", "--quality", "draft", "--resolution", "24"]

@@ -51,6 +51,7 @@ def test_files_without_normals_are_oriented_as_their_truths(shared_data: Path) -
         assert sides(CASES[name].problem(shared_data, 0))["gnrecon"]["right"] >= 0.99
 
 
+@pytest.mark.usefixtures("measured_here")
 def test_the_benchmark_writes_and_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tmp_path / "orient.json"
     tiny = Protocol(threads=1, samples=2000, depths=(5,), options={"resolution": 24, "widths": (300,), "steps": 0})

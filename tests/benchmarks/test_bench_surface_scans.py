@@ -129,6 +129,7 @@ def test_an_open_scan_has_its_own_frame_and_a_mesh_may_end_at_its_lid_or_lie_on_
     assert measure(both, truth, samples=2000).hausdorff > 0.5
 
 
+@pytest.mark.usefixtures("measured_here")
 def test_cases_of_files_run_and_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("open3d")
     (tmp_path / "organic").mkdir()
