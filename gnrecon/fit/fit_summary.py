@@ -56,13 +56,18 @@ def describe(summary: FitSummary) -> str:
     return " ".join([*_solved(summary), *_changed_data(summary), *_added_data(summary), *_penalised(summary)])
 
 
-def _solved(summary: FitSummary) -> Iterator[str]:
+def _solved(summary: FitSummary, *, least_unused_degrees: float = 45.0) -> Iterator[str]:
     by_steps = f" by {_counted(summary.steps, 'Gauss-Newton step')}," if summary.steps else ""
     yield f"Fitted a global field{by_steps} and {_counted(summary.cubes, 'local field')} by linear least squares."
     if summary.edge_samples is None:
+        unused = summary.angle_noise > least_unused_degrees
         yield (
-            f"Chosen from the data: length scale {summary.length:.3g}, noise {summary.position_noise:.2g} in position "
-            f"and {summary.angle_noise:.2g} degrees in normals."
+            f"Chosen from the data: length scale {summary.length:.3g}, noise {summary.position_noise:.2g} in position"
+            + (
+                "; estimated normals say which side is outside."
+                if unused
+                else f" and {summary.angle_noise:.2g} degrees in normals."
+            )
         )
         yield from _disagreement(summary)
     else:

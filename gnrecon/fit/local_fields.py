@@ -128,7 +128,7 @@ def solve_cube(
         features = _precise_enough(features, patch, length, hyperparameters, parameters)
     if hyperparameters.by_place and penalties is None:
         length = _likeliest_length(patch, features, length, (position, angle), parameters)
-    system = PatchSystem(patch, features, length, patch.size)
+    system = PatchSystem(patch, features, length, hyperparameters.rms_factor * patch.rms)
     draw = partial(space.near, length, position)
     if penalties is None:
         return length, system.solve_with_bounds(position, angle, draw)

@@ -38,12 +38,14 @@ class Hyperparameters:
     position : of the points' noise along the normal, unit coordinates
     angle : of the normals' noise, radians
     by_place : whether the length is that of the scan on the whole, from which each cube's own may differ
+    rms_factor : prior standard deviation of a cube's correction, over the RMS of the residuals there
     """
 
     length: float
     position: float
     angle: float
     by_place: bool = False
+    rms_factor: float = LocalSolveParameters.correction_rms_factor
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,12 @@ class Patch:
     @property
     def size(self) -> float:
         """Prior standard deviation of the correction; a tiny one where there is nothing to correct."""
-        return LocalSolveParameters.correction_rms_factor * max(float(self.value.square().mean().sqrt()), 1e-6)
+        return LocalSolveParameters.correction_rms_factor * self.rms
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of what the correction should be at the points, or a tiny value."""
+        return max(float(self.value.square().mean().sqrt()), 1e-6)
 
     @property
     def deviation(self) -> Tensor:

@@ -9,22 +9,29 @@ the derivatives of the features' sum, and the noise covariance D, the log margin
 The noise that maximises its sum over patches is selected (`MarginalLikelihood.likeliest`). All points contribute, so
 that it separates noises which validation points cannot, because those have noise of their own. It selects length scales
 less well: under it a surface is equally curved everywhere, which no shape is.
+
+Estimated normals are no data: their errors follow from those of the positions, and are alike among neighbours. By the
+values alone, a correction that cancels the global field in the whole band of noise would explain all points. So values
+count as those of a function on the surface, at the foot points of the scanned ones (`SurfaceLikelihood`). It shows the
+noise, the size of the correction and its length at once.
 Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), section 5.4.1.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.local_solve import Patch, data_kernel
-from gnrecon.fit.parameters import CleanScanParameters, MarginalLikelihoodParameters
+from gnrecon.fit.parameters import CleanScanParameters, MarginalLikelihoodParameters, SurfaceLikelihoodParameters
 from gnrecon.fit.shape_priors.edge_completion import heights_over_planes
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
@@ -102,6 +109,89 @@ class MarginalLikelihood:
         positions, angles = self.parameters.position_noises_disk_radii, self.parameters.angle_noises_radians
         near = [(i, j), (i - stride, j), (i + stride, j), (i, j - stride), (i, j + stride)]
         return [(p, a) for p, a in near if 0 <= p < len(positions) and 0 <= a < len(angles)]
+
+
+@dataclass(frozen=True)
+class SurfaceLikelihood:
+    """Patches of the heights of points over the surface of the global field, a Gaussian process on it plus noise.
+
+    Parameters
+    ----------
+    feet : foot points, of shape (patches, K, 3), unit coordinates
+    heights : of shape (patches, K), unit coordinates
+    features : whose weighted sums are the functions
+    device : a torch device
+    """
+
+    feet: Tensor
+    heights: Tensor
+    features: Features
+    device: str
+    parameters: SurfaceLikelihoodParameters = SurfaceLikelihoodParameters()
+
+    @classmethod
+    def of(
+        cls,
+        points: Float,
+        value: Float,
+        gradient: Float,
+        rng: np.random.Generator,
+        device: str,
+        *,
+        parameters: SurfaceLikelihoodParameters = SurfaceLikelihoodParameters(),
+    ) -> SurfaceLikelihood:
+        """Return the likelihood of random patches of nearest points.
+
+        Parameters
+        ----------
+        points, value, gradient : of shape (N, 3), (N,) and (N, 3), with the global field there, unit coordinates
+        rng : draws patches and features
+        device : a torch device
+        """
+        slope = np.linalg.norm(gradient, axis=1).clip(parameters.least_slope)
+        height = value / slope
+        # Outliers, and parts that the global field lacks, are no noise.
+        near = np.abs(height) <= parameters.most_height_medians * np.median(np.abs(height))
+        feet = (points - (height / slope)[:, None] * gradient)[near]
+        height = height[near]
+        chosen = rng.choice(len(feet), min(parameters.patches, len(feet)), replace=False)
+        ranks = list(range(1, min(parameters.patch_points, len(feet)) + 1))
+        rows = np.sort(cKDTree(feet).query(feet[chosen], ranks)[1])
+        features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
+        arrays = torch.as_tensor(feet[rows], device=device), torch.as_tensor(height[rows], device=device)
+        return cls(*arrays, features, device, parameters)
+
+    def likeliest(self, lengths: Sequence[float]) -> tuple[float, float, float]:
+        """Return the length, size and noise of the largest marginal likelihood, all in unit coordinates.
+
+        Parameters
+        ----------
+        lengths : candidates, unit coordinates
+        """
+        found = [(*self._of_length(length), length) for length in lengths]
+        _, size, noise, length = max(found)
+        return length, size, noise
+
+    def _of_length(self, length: float) -> tuple[float, float, float]:
+        """Return the largest log likelihood of a length, but for a constant, with the size and the noise."""
+
+        def spectrum(number: int) -> tuple[Tensor, Tensor]:
+            """Return the eigenvalues of a patch's covariance of size one, and the squared heights along its axes."""
+            feet = self.feet[number]
+            rows = self.features.phase(feet, feet.mean(dim=0), length).sin()
+            values, axes = torch.linalg.eigh(rows @ rows.T * (2.0 / len(self.features)))
+            return values.clamp_min(0.0), (axes.T @ self.heights[number]).square()
+
+        spectra = map_in_threads(spectrum, range(len(self.feet)), self.device)
+        values, squares = (torch.cat(parts) for parts in zip(*spectra, strict=True))
+        best = (-np.inf, 0.0, 0.0)
+        for ratio in self.parameters.ratios:
+            variance = 1.0 + ratio**2 * values
+            # For a ratio of size and noise, the likeliest noise is known in closed form.
+            noise = float((squares / variance).mean().sqrt())
+            density = -len(values) * math.log(max(noise, 1e-300)) - 0.5 * float(variance.log().sum())
+            best = max(best, (density, ratio * noise, noise))
+        return best
 
 
 def log_density(patch: Patch, kernel: Tensor, position: float, angle: float) -> float:

@@ -25,8 +25,12 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
-from gnrecon.fit.marginal_likelihood import MarginalLikelihood, Place, clean_noise
-from gnrecon.fit.parameters import MarginalLikelihoodParameters, ModelSelectionParameters
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, Place, SurfaceLikelihood, clean_noise
+from gnrecon.fit.parameters import (
+    MarginalLikelihoodParameters,
+    ModelSelectionParameters,
+    SurfaceLikelihoodParameters,
+)
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.geometry.signed_distance import Density
@@ -104,9 +108,29 @@ def select_hyperparameters(
         marginal likelihood is not robust to them.
     """
     validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
-    if outliers:
-        return replace(validation, likelihood=None).select()
-    return validation.clean() or validation.select()
+    clean = None if outliers else validation.clean()
+    if clean is not None:
+        return clean
+    if residuals.estimated and len(residuals) <= validation.parameters.sparse_points:
+        return _by_positions(residuals, radius, rng, device)
+    return (replace(validation, likelihood=None) if outliers else validation).select()
+
+
+def _by_positions(
+    residuals: FieldResiduals,
+    radius: float,
+    rng: np.random.Generator,
+    device: str,
+    *,
+    lengths: Sequence[float] = ModelSelectionParameters.lengths_disk_radii,
+    parameters: SurfaceLikelihoodParameters = SurfaceLikelihoodParameters(),
+) -> Hyperparameters:
+    """Return the hyperparameters of the largest marginal likelihood of the positions; see `select_hyperparameters`."""
+    scan = residuals.points, residuals.value, residuals.gradient
+    likelihood = SurfaceLikelihood.of(*scan, rng, device, parameters=parameters)
+    length, size, noise = likelihood.likeliest([each * radius for each in lengths])
+    noise = max(noise, ModelSelectionParameters.least_position_noise_disk_radii * radius)
+    return Hyperparameters(length, noise, parameters.angle_radians, rms_factor=size / max(residuals.rms, 1e-6))
 
 
 def _marginal_likelihood(

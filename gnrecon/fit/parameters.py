@@ -186,6 +186,19 @@ class MarginalLikelihoodParameters:
 
 
 @dataclass(frozen=True)
+class SurfaceLikelihoodParameters:
+    """Length, size and noise where normals are estimated (`fit.marginal_likelihood`)."""
+
+    patches: int = 20
+    patch_points: int = 200  # nearest foot points of a patch, which several lengths span
+    features: int = 700  # that make up the covariance
+    ratios: tuple[float, ...] = tuple(2.0 ** (step / 2) for step in range(-8, 15))  # of size and noise, candidates
+    most_height_medians: float = 6.0  # of a point over the median of all heights
+    least_slope: float = 0.2  # of the field at a point, in the height |f| / slope
+    angle_radians: float = 1.0  # deviation of estimated normals in the solve: they say which side is out
+
+
+@dataclass(frozen=True)
 class CleanScanParameters:
     """Detection of scans whose noise need not be selected (`fit.marginal_likelihood.clean_noise`)."""
 

@@ -13,9 +13,9 @@ from torch.distributions import MultivariateNormal
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.local_solve import Patch, data_kernel
-from gnrecon.fit.marginal_likelihood import MarginalLikelihood, log_density
-from gnrecon.fit.model_selection import CrossValidation, FieldResiduals
-from gnrecon.fit.parameters import LocalSolveParameters, MarginalLikelihoodParameters
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, SurfaceLikelihood, log_density
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
+from gnrecon.fit.parameters import LocalSolveParameters, MarginalLikelihoodParameters, SurfaceLikelihoodParameters
 
 LENGTH, RADIUS = 0.4, 0.05
 
@@ -115,3 +115,41 @@ def test_size_of_a_kernel(rng: np.random.Generator) -> None:
     assert patch.size == pytest.approx(
         LocalSolveParameters.correction_rms_factor * float(patch.value.square().mean().sqrt())
     )
+
+
+@pytest.mark.parametrize("ripple", [0.0, 0.02])
+def test_positions_show_noise_and_size_of_what_a_sphere_lacks(ripple: float, rng: np.random.Generator) -> None:
+    x = rng.standard_normal((3000, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    height = ripple * np.sqrt(2.0) * np.sin(7.0 * x[:, 0]) + 0.01 * rng.standard_normal(len(x))
+    # A few points are none of the surface.
+    height[::300] = 0.5
+    likelihood = SurfaceLikelihood.of(x * (1 + height[:, None]), height, x, rng, "cpu")
+    length, size, noise = likelihood.likeliest([0.1, 0.2, 0.4, 0.8])
+    assert noise == pytest.approx(0.01, rel=0.1)
+    if ripple:
+        assert length >= 0.2
+        assert 0.5 * ripple < size < 3 * ripple
+    else:
+        assert size < 0.3 * noise
+
+
+def test_estimated_normals_are_left_out_of_the_choice(rng: np.random.Generator) -> None:
+    x = rng.standard_normal((600, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    height = 0.02 * rng.standard_normal(len(x))
+    wrong = x + 0.4 * rng.standard_normal(x.shape)
+    wrong /= np.linalg.norm(wrong, axis=1, keepdims=True)
+    held = np.arange(600) % 6 == 0
+    points = x * (1 + height[:, None])
+    found = [
+        select_hyperparameters(
+            FieldResiduals(points, normals, height, x, estimated=True), held, 0.05, np.random.default_rng(0)
+        )
+        for normals in (x, wrong)
+    ]
+    assert found[0] == found[1]
+    assert found[0].position == pytest.approx(0.02, rel=0.15)
+    assert found[0].angle == SurfaceLikelihoodParameters.angle_radians
+    # The field explains all but the noise.
+    assert found[0].rms_factor < 0.3

@@ -97,7 +97,7 @@ class BlockSolver:
             box=Box(*array("box")),
             partition=Partition(array("origin"), facts["cell"], facts["overlap"]),
             features=Features(frequencies, phases),
-            hyperparameters=Hyperparameters(facts["length"], facts["position"], facts["angle"]),
+            hyperparameters=Hyperparameters(**facts["hyperparameters"]),
             seed=facts["seed"],
             device=device,
         )

@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -145,9 +146,7 @@ def _task_data(
         "cell": partition.cell,
         "overlap": partition.overlap,
         "radius": density.radius,
-        "length": hyperparameters.length,
-        "position": hyperparameters.position,
-        "angle": hyperparameters.angle,
+        "hyperparameters": asdict(hyperparameters),
     }
     return arrays, facts
 
