@@ -16,8 +16,9 @@ import numpy as np
 
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions, network_steps
-from gnrecon.fit.global_network import NetworkLadder, NetworkTerms
+from gnrecon.fit.global_network import NetworkTerms
 from gnrecon.fit.linear_field import fit_linear
+from gnrecon.fit.network_ladder import NetworkLadder
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import GlobalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask

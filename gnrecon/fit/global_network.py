@@ -1,4 +1,4 @@
-"""The global network by Gauss-Newton: its terms, and the ladder of widths that it climbs.
+"""The data of the global network, which `network_ladder` fits by Gauss-Newton: one term for each kind of row.
 
     values       f = 0                       at the points
     normals      grad f = n                  at the points
@@ -16,28 +16,20 @@ Source: Lange, Little and Taylor, *Robust Statistical Modeling Using the t Distr
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.field.widening import mean_of, widened
-from gnrecon.fit.fit_options import FitOptions, network_count, network_starts
-from gnrecon.fit.initialisation import WrongSignSearch, spectral_start
-from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, start_terms
-from gnrecon.fit.parameters import InitialisationParameters, NetworkLadderParameters, NetworkTermParameters
+from gnrecon.fit.initialisation import WrongSignSearch
+from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
+from gnrecon.fit.parameters import NetworkTermParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import sample_near_surface
-from gnrecon.least_squares import layer_scaled
-from gnrecon.least_squares.direct import Cholesky
-from gnrecon.optim import Callback, GainRatioDamping, GaussNewton, Record, Solution, StopRule
 from gnrecon.residuals.constraints import eikonal, interface, normal_vector, value_range
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -125,6 +117,13 @@ class NetworkTerms:
         x, distance = _certain(scene, wrong)
         volume = torch.cat([self.volume, scene.tensor(x)])
         return replace(self, volume=volume, distances=torch.cat([self.distances, scene.tensor(distance)]))
+
+    def joined(self, others: Sequence[NetworkTerms]) -> NetworkTerms:
+        """Return the terms with the samples that others have found in addition to these."""
+        first = len(self.volume)
+        volume = torch.cat([self.volume, *(other.volume[first:] for other in others)])
+        distances = torch.cat([self.distances, *(other.distances[first:] for other in others)])
+        return replace(self, volume=volume, distances=distances)
 
     def noise(self, field: Siren, theta: Tensor) -> Deviations:
         """Return robust deviations of the validation points from the field."""
@@ -224,177 +223,3 @@ def _certain(scene: Scene, x: Float) -> tuple[Float, Float]:
     """Return the places among x, of shape (Q, 3), where distance and sign are known, and the signed distances."""
     known, distance, _, certain = scene.coarse.at(x)
     return x[known][certain], distance[certain]
-
-
-# A ladder of widths, climbed while validation points gain by it.
-#
-# A small network is fast and smooth, and finds the shape as a whole. The best of some starts is widened with its
-# function kept (`field.widening`) and fitted further, until a width gains no more; only to widths with a parameter for
-# each point, because local fields resolve more of denser scans. Sparse points leave much freedom, so that each start
-# ends in another field: the mean of those networks that score best together is nearer to the surface, as their
-# deviations between points are independent.
-# Source: Caruana et al., *Ensemble Selection from Libraries of Models* (2004), for the choice of members.
-
-
-@dataclass
-class NetworkLadder:
-    """A network that is fitted and widened.
-
-    Parameters
-    ----------
-    terms : what it is fitted to
-    options : of which the device and the residual of the normals are used at the start
-    rng : draws the start, new units and the rows of each step
-    callback : called with the record of each step
-    rival : score of the field that is used instead where it is better; then no more networks are fitted
-    """
-
-    terms: NetworkTerms
-    options: FitOptions
-    rng: np.random.Generator
-    callback: Callback | None = None
-    rival: float = np.inf
-    parameters: NetworkLadderParameters = NetworkLadderParameters()
-
-    def __post_init__(self) -> None:
-        self.history: list[Record] = []
-        self.members: list[tuple[Siren, Tensor]] = []
-
-    def fit(self) -> tuple[Siren, Solution, float]:
-        """Return the best mean of networks, its parameters with the history of all steps, and its score.
-
-        Raises
-        ------
-        FitError
-            When a linear start cannot be solved.
-        """
-        found = []
-        for _ in range(network_count(len(self.terms.scene.points), parameters=self.parameters)):
-            found.append(self.climb())
-            if found[-1][1].interrupted or found[-1][2] > self.rival:
-                break
-        last = found[-1][1]
-        found.sort(key=lambda member: member[2])
-        members = [found[0]]
-        field, theta, score = found[0][0], found[0][1].theta, found[0][2]
-        for member in found[1:]:
-            tried = mean_of([(one, solution.theta) for one, solution, _ in (*members, member)])
-            if (of_mean := self.terms.score(*tried)) < score:
-                members.append(member)
-                (field, theta), score = tried, of_mean
-        self.members = [(one, solution.theta) for one, solution, _ in members]
-        scores = ", ".join(f"{one[2]:.3g}" for one in found)
-        _log.info("Networks of scores %s; the mean of %d has %.3g disk radii.", scores, len(members), score)
-        return field, replace(last, theta=theta, history=tuple(self.history)), score
-
-    def refit(self, scene: Scene) -> tuple[Siren, Tensor]:
-        """Return the mean of the networks after some steps on other points, such as all of them, and its parameters.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            On Ctrl-C during the steps; the networks are unchanged.
-        """
-        terms = replace(self.terms, scene=scene)
-        found = []
-        for field, theta in self.members:
-            noise = self.terms.noise(field, theta)
-
-            def problem_at(number: int, theta: Tensor, field: Siren = field, noise: Deviations = noise) -> FieldProblem:
-                del number
-                return terms.problem(field, theta, noise, self.rng)
-
-            steps = StopRule(self.parameters.refit_steps, patience=self.parameters.refit_steps + 1)
-            solution = self._optimiser(self.parameters.refit_length).run(problem_at, theta, steps)
-            if solution.interrupted:
-                raise KeyboardInterrupt
-            found.append((field, solution.theta))
-        return mean_of(found)
-
-    def climb(self) -> tuple[Siren, Solution, float]:
-        """Return the network of the best score, its parameters, and that score.
-
-        Raises
-        ------
-        FitError
-            When the linear start cannot be solved.
-        """
-        widths = self._widths()
-        field, solution = self._started(widths[0])
-        best = field, solution.theta, self.terms.score(field, solution.theta)
-        for width in widths[1:]:
-            if solution.interrupted or best[2] > self.parameters.hopeless_ratio * self.rival:
-                break
-            self.terms = self.terms.with_wrong_signs(field, solution.theta, self.rng)
-            frequency = InitialisationParameters.first_layer_frequency
-            field, theta = widened(field, solution.theta, width, self.rng, frequency)
-            solution = self._fitted(field, theta, self.parameters.steps)
-            found, before = self.terms.prediction(field, solution.theta), self.terms.prediction(*best[:2])
-            # On noisy points a wider network follows the noise, and seems better on the validation points by chance.
-            if not found.is_better_than(before, standard_errors=self.parameters.gain_standard_errors):
-                break
-            best = field, solution.theta, found.score
-        field, theta, score = best
-        _log.info("A network has widths %s, after %d steps.", field.widths, len(self.history))
-        # Whether and why the steps ended is what the last width's say, whichever width is the best.
-        return field, replace(solution, theta=theta), score
-
-    def _started(self, width: int) -> tuple[Siren, Solution]:
-        """Return the best network of one width from random starts, after the first steps.
-
-        The best start takes as many again, as in successive halving (Jamieson and Talwalkar, *Non-stochastic Best Arm
-        Identification and Hyperparameter Optimization*, 2016).
-        """
-        field, found = Siren((width,) * self.parameters.depth), list[Solution]()
-        scene, rng, steps = self.terms.scene, self.rng, self.parameters.first_steps
-        start = partial(start_terms, scene, self.options, rng)
-        for _ in range(network_starts(len(scene.points), parameters=self.parameters)):
-            theta = spectral_start(field, scene, start, rng, InitialisationParameters.hidden_weight_share)
-            # The score rises before it falls, as the damping finds its size: no patience ends these steps.
-            found.append(self._fitted(field, theta, steps, patience=steps))
-            if found[-1].interrupted:
-                break
-        best = min(found, key=lambda one: self.terms.score(field, one.theta)).theta
-        return field, replace(found[-1], theta=best) if found[-1].interrupted else self._fitted(field, best, steps)
-
-    def _widths(self) -> list[int]:
-        """Return the first width, and wider ones with a parameter for each point, and no more of them than rows."""
-        (first, *wider), points = self.parameters.widths, len(self.terms.scene.points)
-        counts = {width: Siren((width,) * self.parameters.depth).layout.count for width in wider}
-        return [first, *(width for width, count in counts.items() if points <= count <= 4 * points)]
-
-    def _fitted(self, field: Siren, theta: Tensor, steps: int, *, patience: int | None = None) -> Solution:
-        """Take at most so many steps of Gauss-Newton; return the parameters of the least score."""
-        noise = self.terms.noise(field, theta)
-        done, seconds = len(self.history), self.history[-1].seconds if self.history else 0.0
-        residual = 0.0
-
-        def problem_at(number: int, theta: Tensor) -> FieldProblem:
-            nonlocal noise
-            del number
-            found = self.terms.noise(field, theta)
-            # Deviations follow the field at half the rate at which they rise, so that one bad step has little effect.
-            noise = Deviations(
-                (min(noise.values, found.values) + found.values) / 2,
-                (min(noise.normals, found.normals) + found.normals) / 2,
-            )
-            return self.terms.problem(field, theta, noise, self.rng)
-
-        def score(theta: Tensor) -> float:
-            nonlocal residual
-            residual = self.terms.eikonal_rms(field, theta)
-            return self.terms.score(field, theta)
-
-        def record(found: Record) -> None:
-            found = replace(found, step=done + found.step, seconds=seconds + found.seconds, eikonal=residual)
-            self.history.append(found)
-            if self.callback is not None:
-                self.callback(found)
-
-        patience = self.parameters.patience_steps if patience is None else patience
-        stop = StopRule(steps, tolerance=self.parameters.least_gain, patience=steps + 1, held_out_patience=patience)
-        return self._optimiser().run(problem_at, theta, stop, record, score)
-
-    def _optimiser(self, length: float = 1.0) -> GaussNewton:
-        damping = self.parameters.damping
-        return GaussNewton(GainRatioDamping(damping, metric=layer_scaled, geodesic=True, length=length), Cholesky())

@@ -7,9 +7,11 @@ of its rows (`least_squares.jacobian`); it is never stored as a matrix.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -26,6 +28,12 @@ from gnrecon.least_squares.layer_products import LayerRows
 from gnrecon.least_squares.layered_jacobian import LayeredJacobian
 from gnrecon.residuals.constraints import Linearised, Residual, eikonal, interface, signed_distance
 from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
+
+Result = TypeVar("Result")
+
+_Piece = tuple[list["ObjectiveTerm"], slice]
+"""Terms that share points, and the rows of some of these."""
 
 
 @dataclass(frozen=True)
@@ -65,19 +73,18 @@ class FieldProblem:
     def residual(self, theta: Tensor) -> Tensor:
         """Return the weighted residuals, of shape (M,), in the order of `linearise`'s rows."""
         whole = self.whole(theta)
-        return torch.cat([rows for group in groups(self.terms) for rows in self._residuals(whole, group)])
 
-    def _residuals(self, whole: Tensor, group: list[ObjectiveTerm]) -> Iterator[Tensor]:
-        needs_gradient = any(not _is_value_only(term) for term in group)
-        for rows in self._chunks(group):
+        def rows_of(piece: _Piece) -> list[Tensor]:
+            group, rows = piece
             points = group[0].points[rows]
-            if needs_gradient:
-                value, gradient = self.field.value_and_gradient(whole, points)
-            else:
+            if all(map(_is_value_only, group)):
                 value, gradient = self.field.value(whole, points), points
-            for term in group:
-                linear, scale = _evaluate(term, rows, value, gradient)
-                yield (linear.residual * scale).T.flatten()
+            else:
+                value, gradient = self.field.value_and_gradient(whole, points)
+            found = (_evaluate(term, rows, value, gradient) for term in group)
+            return [(linear.residual * scale).T.flatten() for linear, scale in found]
+
+        return torch.cat(list(chain.from_iterable(self._map(rows_of, groups(self.terms)))))
 
     def linearise(self, theta: Tensor) -> tuple[LayeredJacobian, Tensor]:
         """Return J, of shape (M, free), and r, of shape (M,), at the free parameters `theta`.
@@ -88,23 +95,34 @@ class FieldProblem:
         whole = self.whole(theta).to(self.precision or theta.dtype)
         gathered = groups([term for group in groups(self.terms) for term in _in_precision(group, whole.dtype)])
 
-        def blocks() -> Iterable[Block]:
-            return self._blocks(whole, gathered)
+        def blocks_of(piece: _Piece) -> list[Block]:
+            """Return the factors of J's rows at some points, one block for each residual of each term."""
+            group, rows = piece
+            jet = self.field.jet(whole, group[0].points[rows])
+            found = [_evaluate(term, rows, jet.value, jet.gradient) for term in group]
+            return [
+                self._free_rows(jet.rows(*_column(linear, column, scale)))
+                for linear, scale in found
+                for column in range(linear.residual.shape[1])
+            ]
 
-        kept = list(blocks()) if self._factor_bytes(whole) <= self.keep_bytes else None
+        def blocks() -> Iterable[Block]:
+            return chain.from_iterable(map(blocks_of, self._pieces(gathered)))
+
+        keeps = self._factor_bytes(whole) <= self.keep_bytes
+        kept = list(chain.from_iterable(self._map(blocks_of, gathered))) if keeps else None
         residual = self.residual(theta)
         source = blocks if kept is None else lambda: kept
-        return LayeredJacobian(source, len(residual), self._layer_sizes(), theta.device, stored=whole.dtype), residual
+        layers, device = self._layer_sizes(), theta.device
+        return LayeredJacobian(source, len(residual), layers, device, stored=whole.dtype, kept=keeps), residual
 
-    def _blocks(self, whole: Tensor, gathered: list[list[ObjectiveTerm]]) -> Iterator[Block]:
-        """Yield the factors of J's rows: for each chunk of points, one block for each residual of each term."""
-        for group in gathered:
-            for rows in self._chunks(group):
-                jet = self.field.jet(whole, group[0].points[rows])
-                for term in group:
-                    linear, scale = _evaluate(term, rows, jet.value, jet.gradient)
-                    for column in range(linear.residual.shape[1]):
-                        yield self._free_rows(jet.rows(*_column(linear, column, scale)))
+    def _map(self, work: Callable[[_Piece], Result], gathered: list[list[ObjectiveTerm]]) -> list[Result]:
+        """Return what a function makes of each piece, in threads."""
+        return map_in_threads(work, self._pieces(gathered), self.theta.device)
+
+    def _pieces(self, gathered: list[list[ObjectiveTerm]]) -> list[_Piece]:
+        """Return groups of terms with some of their points."""
+        return [(group, rows) for group in gathered for rows in self._chunks(group)]
 
     def _free_rows(self, layers: list[LayerRows]) -> list[LayerRows]:
         if self.units is None:

@@ -16,11 +16,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
 
 Pair = tuple[Tensor, Tensor]
@@ -214,16 +215,23 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         above the diagonal
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
-    blocks = [slice(start, min(start + block_columns, size)) for start in range(0, size, block_columns)]
+    # The last blocks come first: they take longest, and threads that share them end at the same time.
+    blocks = slices(size, block_columns)[::-1]
     for rows in chunks:
-
-        def add(block: slice, rows: Tensor = rows) -> None:
-            place = product[block, : block.stop]
-            if rows.dtype == like.dtype:
-                place.addmm_(rows[:, block].T, rows[:, : block.stop])
-            else:
-                place += rows[:, block].T @ rows[:, : block.stop]
-
         # Threads share the blocks and no sum, so that the result is the same for any number of them.
-        map_in_threads(add, blocks, like.device)
+        map_in_threads(partial(_add_block, product, rows), blocks, like.device)
     return product
+
+
+def add_gram(product: Tensor, rows: Tensor, *, block_columns: int = 192) -> None:
+    """Add J^T J of a chunk of rows, of shape (m, p), to the lower triangle of a product, as `gram` does."""
+    for block in slices(len(product), block_columns):
+        _add_block(product, rows, block)
+
+
+def _add_block(product: Tensor, rows: Tensor, block: slice) -> None:
+    place = product[block, : block.stop]
+    if rows.dtype == product.dtype:
+        place.addmm_(rows[:, block].T, rows[:, : block.stop])
+    else:
+        place += rows[:, block].T @ rows[:, : block.stop]

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from gnrecon.least_squares.jacobian import Block, column_slices
-from gnrecon.least_squares.layer_products import gram
+from gnrecon.least_squares.layer_products import add_gram, gram
+from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class LayeredJacobian:
     stored : precision of the factors
     chunk_bytes : memory of the rows that are multiplied out at a time
     tile_rows : rows of the square tiles in which J J^T is formed
+    kept : whether the blocks are in memory
+    pieces : shares of kept blocks whose sums J^T J are made side by side
     """
 
     blocks: Callable[[], Iterable[Block]]
@@ -43,6 +46,8 @@ class LayeredJacobian:
     stored: torch.dtype = torch.float64
     chunk_bytes: int = 64_000_000
     tile_rows: int = 1024
+    kept: bool = False
+    pieces: int = 2
 
     @property
     def columns(self) -> int:
@@ -93,8 +98,9 @@ class LayeredJacobian:
     def _dense(self, blocks: Iterable[Block]) -> Iterator[Tensor]:
         buffer: Tensor | None = None
         for block in blocks:
-            if buffer is None:
-                length = max(1, min(self._chunk(block), self.rows))
+            length = max(1, min(self._chunk(block), len(block[0])))
+            if buffer is None or len(buffer) < length:
+                # No longer than the block: fresh memory costs as much as what is written to it.
                 buffer = torch.empty(length, self.columns, dtype=_stored(block), device=self.device)
             for start in range(0, len(block[0]), len(buffer)):
                 part = [layer.take(slice(start, start + len(buffer))) for layer in block]
@@ -105,7 +111,24 @@ class LayeredJacobian:
 
     def gram(self) -> Tensor:
         """Return J^T J, its lower triangle valid."""
-        return gram(self._dense(map(_without_zero_rows, self.blocks())), self.columns, self._zeros(0))
+        small = self.pieces * self.columns**2 * self.dtype.itemsize <= self.chunk_bytes
+        if not (small and self.kept and self.device.type == "cpu"):
+            return gram(self._dense(map(_without_zero_rows, self.blocks())), self.columns, self._zeros(0))
+        # Threads share the blocks and no sum; which blocks a sum has does not depend on the number of threads.
+        products = [self._zeros(self.columns, self.columns) for _ in range(self.pieces)]
+
+        def add(blocks: Sequence[Block], product: Tensor) -> None:
+            for rows in self._dense(map(_without_zero_rows, blocks)):
+                add_gram(product, rows)
+
+        blocks = list(self.blocks())
+        map_in_threads(
+            lambda number: add(blocks[number :: self.pieces], products[number]), range(self.pieces), self.device
+        )
+        total, *others = products
+        for product in others:
+            total += product
+        return total
 
     def group_grams(self) -> list[Tensor]:
         """Return the layers' blocks of J^T J, each with a valid lower triangle."""

@@ -10,11 +10,12 @@ do.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from functools import cached_property
-from threading import Lock
+from queue import Empty, SimpleQueue
+from threading import Event, Lock
 from typing import TypeVar
 
 import torch
@@ -166,3 +167,100 @@ def map_in_threads(
         wait([future for future in futures if not future.cancel()])
         if workers is not kept:
             workers.close()
+
+
+class _Runs:
+    """What runs that share the time of a caller have in common: its wish to end them, and calls that it makes."""
+
+    def __init__(self) -> None:
+        self.calls: SimpleQueue[Callable[[], object]] = SimpleQueue()
+        self.asked, self.ended = Event(), False
+
+
+_runs: ContextVar[_Runs | None] = ContextVar("_runs", default=None)
+"""Those that a thread is one of."""
+
+
+def run_in_threads(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    device: str | torch.device = "cpu",
+    is_last: Callable[[Result], bool] = lambda _: False,
+    *,
+    check_seconds: float = 0.02,
+) -> list[Result]:
+    """Return ``work(item)`` for long runs that are independent, in their order, up to the first that is the last.
+
+    As many as there are workers run side by side, each in one thread; a run that is left over has all threads for the
+    pieces of its own work. The results are the same for any number of threads.
+
+    Parameters
+    ----------
+    work : function of an item. It calls `end_if_asked` from time to time, and `call_outside` for what must run in the
+        caller's thread
+    items : sequence
+    device : where the work is done; on a GPU the runs follow one another
+    is_last : whether the results after one are not wanted
+    check_seconds : between two looks at the runs
+
+    Raises
+    ------
+    KeyboardInterrupt
+        When the caller is interrupted, and no run has returned what it had.
+    """
+    together = worker_count() if torch.device(device).type == "cpu" else 1
+    found: list[Result] = []
+    for first in range(0, len(items), together):
+        group = items[first : first + together]
+        results = [work(group[0])] if len(group) == 1 else _run_group(work, group, check_seconds)
+        for result in results:
+            found.append(result)
+            if is_last(result):
+                return found
+    return found
+
+
+def _run_group(work: Callable[[Item], Result], items: Sequence[Item], check_seconds: float) -> list[Result]:
+    """Return the results of runs that are all running at the same time."""
+    runs = _Runs()
+
+    def run(item: Item) -> Result:
+        _workers.set(_Workers(1))
+        _runs.set(runs)
+        return work(item)
+
+    def make_calls(futures: Sequence[Future[Result]]) -> None:
+        running = set(futures)
+        while running or not runs.calls.empty():
+            running = wait(running, check_seconds).not_done
+            with suppress(Empty):
+                while True:
+                    runs.calls.get_nowait()()
+
+    with ThreadPoolExecutor(len(items), initializer=set_threads, initargs=(1,)) as pool:
+        futures = [pool.submit(run, item) for item in items]
+        try:
+            make_calls(futures)
+        except BaseException as error:
+            runs.asked.set()
+            wait(futures)
+            if not (isinstance(error, KeyboardInterrupt) and runs.ended):
+                raise
+        return [future.result() for future in futures]
+
+
+def end_if_asked() -> None:
+    """Raise `KeyboardInterrupt` in a run of `run_in_threads` whose caller has been interrupted."""
+    runs = _runs.get()
+    if runs is not None and runs.asked.is_set():
+        runs.ended = True
+        raise KeyboardInterrupt
+
+
+def call_outside(call: Callable[[], object]) -> None:
+    """Let the thread that waits for this run of `run_in_threads` make a call; elsewhere make it at once."""
+    runs = _runs.get()
+    if runs is None:
+        call()
+    else:
+        runs.calls.put(call)

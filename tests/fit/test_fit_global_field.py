@@ -11,10 +11,10 @@ import torch
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit import global_network as networks
 from gnrecon.fit.global_field import GlobalField, fit_global
-from gnrecon.fit.global_network import Deviations, NetworkLadder, NetworkTerms, Prediction
+from gnrecon.fit.global_network import Deviations, NetworkTerms, Prediction
 from gnrecon.fit.initialisation import random_network
+from gnrecon.fit.network_ladder import NetworkLadder
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import (
     FitParameters,
@@ -24,7 +24,7 @@ from gnrecon.fit.parameters import (
 )
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import Frame, Samples
-from gnrecon.optim import Record
+from gnrecon.optim import Record, Solution
 from gnrecon.runtime.progress import ignore_progress
 
 FRAME = Frame(np.array([1.0, 2.0, 3.0]), 2.0)
@@ -173,10 +173,10 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
 ) -> None:
     made: list[tuple[int, ...]] = []
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> networks.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> Solution:
         del self, steps
         made.append(field.widths)
-        return networks.Solution(theta, "", ())
+        return Solution(theta, "", ())
 
     monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
     monkeypatch.setattr(NetworkTerms, "score", lambda *_: 1.0)
@@ -197,9 +197,9 @@ def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
 ) -> None:
     ends = iter([False] * 5 + [True])  # two members, each started, continued and widened; Ctrl-C in the last one
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> networks.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> Solution:
         del self, field, steps
-        return networks.Solution(theta, "Interrupted.", (), interrupted=next(ends))
+        return Solution(theta, "Interrupted.", (), interrupted=next(ends))
 
     scores = itertools.count(1)  # each network is worse than the one before
     monkeypatch.setattr(NetworkLadder, "_fitted", no_steps)
@@ -274,10 +274,10 @@ def test_an_outlier_is_a_point_that_no_field_explains(network: tuple[GlobalField
 def test_the_best_of_the_starts_is_the_network(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     starts: list[torch.Tensor] = []
 
-    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> networks.Solution:
+    def no_steps(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **_: int) -> Solution:
         del self, field, steps
         starts.append(theta)
-        return networks.Solution(theta, "", ())
+        return Solution(theta, "", ())
 
     def score(self: NetworkTerms, field: Siren, theta: torch.Tensor) -> float:
         del self, field

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Barrier
+from threading import Barrier, get_ident
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,15 @@ from threadpoolctl import threadpool_info
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.runtime.compute_limits import limited
-from gnrecon.runtime.parallel import map_in_threads, set_threads, worker_count
+from gnrecon.runtime.parallel import (
+    call_outside,
+    end_if_asked,
+    fixed_sums,
+    map_in_threads,
+    run_in_threads,
+    set_threads,
+    worker_count,
+)
 from gnrecon.runtime.preload import preload
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -179,3 +187,58 @@ def test_importing_gnrecon_imports_no_heavy_library() -> None:
     script = f"import sys, gnrecon\ndir(gnrecon)\nprint([name for name in {HEAVY} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=REPOSITORY, check=True)
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_runs_have_their_results_in_order_up_to_the_last(threads: int) -> None:
+    seen: list[int] = []
+
+    def run(number: int) -> tuple[int, int, list[int]]:
+        inner = map_in_threads(lambda one: one * number, [1, 2])
+        call_outside(lambda: seen.append(get_ident()))
+        return number, worker_count(), inner
+
+    with fixed_sums(threads):
+        found = run_in_threads(run, [1, 2, 3, 4, 5], is_last=lambda result: result[0] == 4)
+    assert [(number, inner) for number, _, inner in found] == [(n, [n, 2 * n]) for n in (1, 2, 3, 4)]
+    if threads == 2:
+        assert {workers for _, workers, _ in found} == {1}, "each run has one thread"
+    # Four were wanted; those that ran beside the last have been in vain.
+    assert set(seen) == {get_ident()}
+    assert len(seen) == {1: 4, 2: 4, 3: 5}[threads]
+
+
+def test_a_run_that_is_left_over_has_all_threads() -> None:
+    with fixed_sums(2):
+        assert run_in_threads(lambda _: worker_count(), [0, 1, 2]) == [1, 1, 2]
+
+
+def test_an_interrupt_of_the_caller_ends_the_runs_with_what_they_have() -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    def run(number: int) -> str:
+        if number == 1:
+            call_outside(interrupt)
+        try:
+            while True:
+                end_if_asked()
+                time.sleep(0.001)
+        except KeyboardInterrupt:
+            return f"{number} ended"
+
+    with fixed_sums(2):
+        assert run_in_threads(run, [0, 1]) == ["0 ended", "1 ended"]
+
+
+def test_an_interrupt_that_no_run_has_seen_is_not_lost() -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with fixed_sums(2), pytest.raises(KeyboardInterrupt):
+        run_in_threads(lambda _: call_outside(interrupt), [0, 1])
+
+
+def test_a_run_that_fails_fails_the_call() -> None:
+    with fixed_sums(2), pytest.raises(ZeroDivisionError):
+        run_in_threads(lambda number: 1 / number, [1, 0])

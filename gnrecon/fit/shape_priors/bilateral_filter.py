@@ -18,6 +18,7 @@ symmetric objective function for ICP (2019), section 3. Entry: `BilateralFilter.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.signed_distance import Density
 from gnrecon.geometry.statistics import robust_deviation
 from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
 
 Neighbourhoods = tuple[slice, Int, Float]
 
@@ -49,10 +51,10 @@ class BilateralFilter:
         """Return points and unit normals, both of shape (N, 3), averaged."""
         parts, sample = self._neighbourhoods(points)
         for _ in range(self.parameters.passes):
-            normals = np.concatenate([self._normals(points, normals, *part) for part in parts])
+            normals = np.concatenate(map_in_threads(partial(self._mean_normals, points, normals), parts))
         for _ in range(self.parameters.passes):
             usual = self._height_deviation(points, normals, *sample)
-            points = np.concatenate([self._points(points, normals, *part, usual) for part in parts])
+            points = np.concatenate(map_in_threads(partial(self._moved, points, normals, usual), parts))
         return points, normals
 
     def _neighbourhoods(self, points: Float) -> tuple[list[Neighbourhoods], Neighbourhoods]:
@@ -79,10 +81,10 @@ class BilateralFilter:
         shares: Float = weights / weights.sum(axis=1, keepdims=True)
         return shares
 
-    def _normals(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float) -> Float:
+    def _mean_normals(self, points: Float, normals: Float, part: Neighbourhoods) -> Float:
         """Return the mean normals of some rows; each counts itself and hardly any opposed ones, so none is zero."""
-        weights = self._weights(points, normals, rows, near, widths)
-        mean = np.einsum("ik,ikd->id", weights, normals[near])
+        weights = self._weights(points, normals, *part)
+        mean = np.einsum("ik,ikd->id", weights, normals[part[1]])
         unit: Float = mean / np.linalg.norm(mean, axis=1, keepdims=True)
         return unit
 
@@ -93,9 +95,9 @@ class BilateralFilter:
         counted = weights > self.parameters.min_weight_share * weights.max(axis=1, keepdims=True, initial=0.0)
         return robust_deviation(heights[counted]) if counted.any() else 0.0
 
-    def _points(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float, usual: float) -> Float:
+    def _moved(self, points: Float, normals: Float, usual: float, part: Neighbourhoods) -> Float:
         """Return some rows of the points, moved along their normals."""
-        p = self.parameters
+        p, (rows, near, widths) = self.parameters, part
         heights = _heights(points, normals, rows, near)
         weights = self._weights(points, normals, rows, near, widths)
         weights *= np.exp(-((heights / np.maximum(p.height_deviations * usual, p.min_height_widths * widths)) ** 2))

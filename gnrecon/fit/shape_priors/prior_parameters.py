@@ -52,7 +52,7 @@ class BilateralParameters:
     min_weight_share: float = 0.2  # of the largest weight, from which on a height counts for that deviation
     min_height_widths: float = 1e-3  # least such height: on exact planes heights are rounding errors
     deviation_points: int = 20_000  # that estimate the deviation; their standard error is below 1 %
-    chunk_points: int = 20_000  # averaged at a time, so that memory does not grow with the scan
+    chunk_points: int = 2_500  # averaged at a time by each thread, so that memory does not grow with the scan
 
 
 @dataclass(frozen=True)

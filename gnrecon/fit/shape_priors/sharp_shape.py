@@ -76,10 +76,12 @@ class SharpShape:
         if edges.roughness > p.max_raw_roughness_radii and not samples.estimated:
             averaging = BilateralFilter(p.averaging_width_radii, p.averaging_normal_scale)
             averaged = averaging.apply(points, normals)
+            if not _is_even_and_sharp(EdgeCompletion(*averaged, parameters.edges), p):
+                return None
             snapped = snap_to_primitives(points, normals, averaged, parameters.snapping)
             points, normals = averaged if snapped is None else (snapped.points, snapped.normals)
             edges = EdgeCompletion(points, normals, parameters.edges)
-        if edges.roughness > p.max_roughness_radii or not _is_sharp(edges, p):
+        if not _is_even_and_sharp(edges, p):
             return None
         holes = complete_holes(points, normals, True, parameters.holes)
         if len(holes):
@@ -110,6 +112,11 @@ def _completed(
     if agreement < parameters.min_agreement:
         return None
     return np.concatenate([edges.points, samples]), np.concatenate([edges.normals, normals])
+
+
+def _is_even_and_sharp(edges: EdgeCompletion, parameters: SharpShapeParameters) -> bool:
+    """Return whether faces are even, and meet at edges."""
+    return edges.roughness <= parameters.max_roughness_radii and _is_sharp(edges, parameters)
 
 
 def _is_sharp(edges: EdgeCompletion, parameters: SharpShapeParameters) -> bool:
