@@ -34,7 +34,7 @@ from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey
+from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey, without_garbage
 from gnrecon.io import (
     Reading,
     as_cloud,
@@ -106,7 +106,7 @@ class Reconstruction:
     uncertainty : Uncertainty, optional
         Standard deviations of the surface, with ``uncertainty=True``.
     cloud : PointCloud, optional
-        The scan as it was read, cropped.
+        The scan as it was read, cropped, without coordinates that are not finite or out of all proportion.
     """
 
     mesh: Mesh
@@ -208,7 +208,7 @@ def reconstruct(
     with limited(chosen.threads):
         run = _PipelineRun(source_name(source), chosen, progress or Progress())
         scan = _read(run, source, normals, format, reference)
-        ingested = _ingest(run, scan)
+        ingested, scan = _ingest(run, scan)
         fitted = _fit(run, ingested)
         surface = _trim(run, ingested, _mesh(run, scan, ingested, fitted))
         finished, uncertainty = _finish(run, scan, ingested, fitted, surface)
@@ -267,8 +267,8 @@ def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, refe
     return scan
 
 
-def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
-    """Clean and thin the points, orient their normals, and choose a resolution from their spacing."""
+def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
+    """Clean and thin the points, orient their normals, choose a resolution; return the scan without garbage, too."""
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         points, noise = samples.frame.to_world(samples.points), (samples.noise or 0.0) * samples.frame.scale
@@ -284,7 +284,7 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
     warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
-    return ingested
+    return ingested, replace(scan, cloud=without_garbage(scan.cloud))
 
 
 def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
