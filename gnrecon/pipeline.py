@@ -282,6 +282,7 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     layers, cells, longest = ingested.layers, run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
+    warnings += coarse_parts_remark(points, longest / cells)
     warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
     return ingested, replace(scan, cloud=without_garbage(scan.cloud))
@@ -313,8 +314,6 @@ def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted)
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
         run.options = replace(run.options, resolution=cells_for_faces(sdf, run.options.resolution, ingested.sheet))
-    cell = float(np.ptp(sdf.bounds, axis=0).max()) / run.options.mesh().cells(sdf.bounds)
-    run.remark([] if sdf.data is None else coarse_parts_remark(sdf.data, cell))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     around = Neighbourhood(scan.cloud.points)

@@ -344,3 +344,16 @@ def test_garbage_in_a_scan_changes_no_distance_and_no_page() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         page_text(dirty.report, dirty.mesh, dirty.cloud)
+
+
+def test_parts_that_no_cells_resolve_are_named_before_the_fit() -> None:
+    class UntilFit(Recorder):
+        def stage(self, name: str) -> None:
+            if name == "fit":
+                raise StopIteration
+
+    points, normals = sphere(100, np.random.default_rng(0))
+    progress = UntilFit()
+    with pytest.raises(StopIteration):
+        reconstruct(np.vstack([points, points + [500, 0, 0]]), np.vstack([normals] * 2), progress=progress, **TINY)
+    assert [remark for remark in progress.remarks if remark.startswith("2 parts of the scan are far smaller")]
