@@ -51,7 +51,7 @@ from gnrecon.io import (
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
-from gnrecon.report.estimate import estimate
+from gnrecon.report.estimate import estimate, mesh_memory_mb
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
@@ -281,6 +281,7 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
         require_memory(expected.memory_mb)
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     layers, cells, longest = ingested.layers, run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
+    require_memory(mesh_memory_mb(cells, bounds))
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
     warnings += coarse_parts_remark(points, longest / cells)
     warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)
