@@ -34,7 +34,7 @@ from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey
+from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey, without_garbage
 from gnrecon.io import (
     Reading,
     as_cloud,
@@ -51,7 +51,7 @@ from gnrecon.io import (
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
-from gnrecon.report.estimate import estimate
+from gnrecon.report.estimate import estimate, mesh_memory_mb
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
@@ -106,7 +106,7 @@ class Reconstruction:
     uncertainty : Uncertainty, optional
         Standard deviations of the surface, with ``uncertainty=True``.
     cloud : PointCloud, optional
-        The scan as it was read, cropped.
+        The scan as it was read, cropped, without coordinates that are not finite or out of all proportion.
     """
 
     mesh: Mesh
@@ -208,7 +208,7 @@ def reconstruct(
     with limited(chosen.threads):
         run = _PipelineRun(source_name(source), chosen, progress or Progress())
         scan = _read(run, source, normals, format, reference)
-        ingested = _ingest(run, scan)
+        ingested, scan = _ingest(run, scan)
         fitted = _fit(run, ingested)
         surface = _trim(run, ingested, _mesh(run, scan, ingested, fitted))
         finished, uncertainty = _finish(run, scan, ingested, fitted, surface)
@@ -267,8 +267,8 @@ def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, refe
     return scan
 
 
-def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
-    """Clean and thin the points, orient their normals, and choose a resolution from their spacing."""
+def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
+    """Clean and thin the points, orient their normals, choose a resolution; return the scan without garbage, too."""
     with run.stages("ingest"):
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         points, noise = samples.frame.to_world(samples.points), (samples.noise or 0.0) * samples.frame.scale
@@ -281,10 +281,12 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> Ingested:
         require_memory(expected.memory_mb)
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     layers, cells, longest = ingested.layers, run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
+    require_memory(mesh_memory_mb(cells, bounds))
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
+    warnings += coarse_parts_remark(points, longest / cells)
     warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)
     run.remark([*scan.reading.remarks(), *counts.remarks(), *warnings])
-    return ingested
+    return ingested, replace(scan, cloud=without_garbage(scan.cloud))
 
 
 def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
@@ -313,8 +315,6 @@ def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted)
     sdf = fitted.sdf
     if run.refines_resolution and run.options.resolution is not None:
         run.options = replace(run.options, resolution=cells_for_faces(sdf, run.options.resolution, ingested.sheet))
-    cell = float(np.ptp(sdf.bounds, axis=0).max()) / run.options.mesh().cells(sdf.bounds)
-    run.remark([] if sdf.data is None else coarse_parts_remark(sdf.data, cell))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     around = Neighbourhood(scan.cloud.points)

@@ -18,7 +18,9 @@ from gnrecon.fit import NeuralSDF
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.options import Options
+from gnrecon.report.estimate import mesh_memory_mb
 from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.memory_budget import require_memory
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 
@@ -85,6 +87,8 @@ def shaped(
     ------
     UsageError
         When the crop misses the field's box, the shape leaves nothing of the solid, or a length is out of reach.
+    MemoryLimitError
+        When the cells are too many for the memory that is left.
     MeshError
         When there is no zero level, or no sound mesh can be made of it.
     """
@@ -96,6 +100,9 @@ def shaped(
         # Whatever closes the surface at the region's border is farther from the crop than any level reaches.
         region = _around(shape.crop, max(map(abs, shape.levels)) + _margin(cell), sdf.bounds)
     replace(options, edge_length=None).require_reachable(region)  # the cells above have been checked
+    for level in (0.0, *shape.levels):
+        around = region + max(level, 0.0) * np.array([[-1.0], [1.0]])
+        require_memory(mesh_memory_mb(float(np.ptp(around, axis=0).max()) / cell, around))
     data, remarks = _data(sdf, region)
     # A mesh that only serves to measure offsets from is not refined.
     plain = options if 0.0 in shape.levels else replace(options, remesh=None, adaptive=False, simplify=None, faces=None)

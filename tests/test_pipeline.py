@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
+from gnrecon.report.html import page_text
 from gnrecon.report.report import SCHEMA_VERSION
 from gnrecon.runtime.errors import InputError, MemoryLimitError, MeshError, UsageError
 from gnrecon.runtime.parallel import worker_count
@@ -327,3 +329,31 @@ def test_an_unsound_mesh_is_neither_returned_nor_saved(
     monkeypatch.setattr("gnrecon.export.mesh_field.remove_handles", torn)
     with pytest.raises(MeshError, match="open: 3 edges"):
         reconstruct(*scan, **TINY)
+
+
+def test_garbage_in_a_scan_changes_no_distance_and_no_page() -> None:
+    points, _ = sphere(300, np.random.default_rng(0))
+    smallest = {"widths": (40,), "steps": 0, "resolution": 16, "keep_handles": True}
+    options: dict[str, Any] = {**smallest, "attributes": "distance", "open": False}
+    clean = reconstruct(points, **options)
+    dirty = reconstruct(np.vstack([points, [[0.0, 1e150, 0.0]]]), **options)
+    assert dirty.cloud is not None
+    assert len(dirty.cloud) == len(points)
+    np.testing.assert_array_equal(dirty.mesh.attributes["distance"], clean.mesh.attributes["distance"])
+    assert dirty.report["mesh"] == clean.report["mesh"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        page_text(dirty.report, dirty.mesh, dirty.cloud)
+
+
+def test_parts_that_no_cells_resolve_are_named_before_the_fit() -> None:
+    class UntilFit(Recorder):
+        def stage(self, name: str) -> None:
+            if name == "fit":
+                raise KeyError("fit")
+
+    points, normals = sphere(100, np.random.default_rng(0))
+    progress = UntilFit()
+    with pytest.raises(KeyError):
+        reconstruct(np.vstack([points, points + [500, 0, 0]]), np.vstack([normals] * 2), progress=progress, **TINY)
+    assert [remark for remark in progress.remarks if remark.startswith("2 parts of the scan are far smaller")]

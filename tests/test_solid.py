@@ -13,7 +13,7 @@ from gnrecon.export import require_sound
 from gnrecon.fit import NeuralSDF
 from gnrecon.options import Options
 from gnrecon.pipeline import reconstruct
-from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.errors import MemoryLimitError, MeshError, UsageError
 from gnrecon.solid import Shape, shaped
 
 OPTIONS = Options(resolution=32)
@@ -122,3 +122,9 @@ def test_shapes_that_leave_nothing(sdf: NeuralSDF) -> None:
     for thickness in (0.0, -1.0, float("nan")):
         with pytest.raises(UsageError, match="must be positive"):
             Shape(shell=thickness)
+
+
+@pytest.mark.parametrize(("cells", "offset"), [(16_384, 0.0), (256, 99.0)])
+def test_more_cells_than_memory_holds_are_refused_before_the_work(sdf: NeuralSDF, cells: int, offset: float) -> None:
+    with pytest.raises(MemoryLimitError, match="needs about"):
+        shaped(sdf, Options(resolution=cells), Shape(offset=offset * float(np.ptp(sdf.bounds, axis=0).max())))

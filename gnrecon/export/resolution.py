@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from gnrecon.export.export_parameters import ExportParameters, ResolutionParameters
-from gnrecon.export.project import SignedDistance, face_sample_points, project, side_lengths
+from gnrecon.export.project import SignedDistance, face_sample_points, project, sdf_and_gradient, side_lengths
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
@@ -130,8 +130,8 @@ def chord_error(
         return 0.0
     # First order: |f| / |grad f|. A vanishing gradient gives a large error, which is right: nothing is known there.
     points = face_sample_points(corners)
-    slopes = np.linalg.norm(field.gradient(points), axis=1)
-    distances = np.abs(field.sdf(points)) / np.maximum(slopes, np.finfo(np.float64).tiny)
+    values, gradients = sdf_and_gradient(field, points)
+    distances = np.abs(values) / np.maximum(np.linalg.norm(gradients, axis=1), np.finfo(np.float64).tiny)
     return float(np.quantile(distances, parameters.error_quantile, method="higher"))
 
 

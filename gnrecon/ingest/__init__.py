@@ -1,6 +1,6 @@
 """Ingest: from a cloud as read to oriented samples in the unit ball."""
 
-from gnrecon.ingest.clean import clean, require_mode
+from gnrecon.ingest.clean import clean, require_mode, without_garbage
 from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.double_walls import Layers, layers_of
 from gnrecon.ingest.ingest_parameters import IngestParameters
@@ -38,4 +38,5 @@ __all__ = [
     "sheet_thickness",
     "subsample",
     "survey",
+    "without_garbage",
 ]

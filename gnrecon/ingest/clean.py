@@ -116,6 +116,15 @@ def usable_positions(
     return usable
 
 
+def without_garbage(cloud: PointCloud) -> PointCloud:
+    """Return the points that can be computed with: next to others, distances between them vanish.
+
+    It is the cloud itself where all can; errors are those of `usable_positions`.
+    """
+    usable = usable_positions(cloud.points)
+    return cloud if usable.all() else cloud.select(usable)
+
+
 def distinct_positions(points: Float) -> Int:
     """Return the first row, of shape (M,), of each position of finite points, of shape (N, 3); sorted by position.
 

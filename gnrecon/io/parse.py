@@ -11,6 +11,9 @@ from gnrecon.geometry.arrays import Float, Values
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.runtime.errors import InputError
 
+OPEN_FILES = Path("/proc/self/fd")
+"""The files that this process has open, by number, on Linux: where files without a name are read."""
+
 
 def read_text(path: Path) -> str:
     """Return the file as text, without a byte-order mark.
@@ -85,8 +88,12 @@ def sibling_path(folder: Path, name: str, what: str) -> Path:
     Raises
     ------
     InputError
-        When the name points outside of the folder.
+        When the name points outside of the folder, or the file was unpacked or streamed, so that it lies in none.
     """
+    if folder == OPEN_FILES:
+        raise InputError(
+            f"the {what} {name[:80]!r} lies next to it, which is not searched for compressed files and streams; unpack it."
+        )
     target = folder / name
     if not target.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"the {what} {name[:80]!r} lies outside of the file's folder, so it is not read.")

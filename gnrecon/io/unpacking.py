@@ -2,29 +2,27 @@
 
 Readers seek, compare sizes and pass names to libraries, so what is no plain file is copied into one first. Where the
 system allows, the copy has no name: it is read by its number among the process's open files, and its space is free
-again as soon as the process has ended, also when it was killed. Formats that name files next to them, and readers of
-plugins, get a file with a name in a temporary folder.
+again as soon as the process has ended, also when it was killed. Readers of plugins, which may want a name with an
+extension, get a link to it in a temporary folder.
 """
 
 from __future__ import annotations
 
 import gzip
+import os
 import shutil
 import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from gnrecon.io.format_registry import READERS
+from gnrecon.io.parse import OPEN_FILES
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.files import is_standard_input
-
-NAMED = (".gltf", ".conf")
-"""Formats that name files next to them."""
-
 
 @contextmanager
 def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
@@ -66,14 +64,21 @@ def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
 
 
 @contextmanager
-def _temporary(name: str, extension: str, *, open_files: Path = Path("/proc/self/fd")) -> Iterator[Path]:
+def _temporary(name: str, extension: str) -> Iterator[Path]:
     """Yield the path of an empty temporary file, without a name where that is possible."""
-    if extension in READERS and extension not in NAMED and open_files.is_dir():
-        with tempfile.TemporaryFile(prefix="gnrecon-") as file:
-            yield open_files / str(file.fileno())
-        return
-    with tempfile.TemporaryDirectory(prefix="gnrecon-") as folder:
-        yield Path(folder) / name
+    with ExitStack() as stack:
+        if extension not in READERS or not OPEN_FILES.is_dir():
+            named = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gnrecon-"))) / name
+        if not OPEN_FILES.is_dir():
+            yield named
+            return
+        file = stack.enter_context(tempfile.TemporaryFile(prefix="gnrecon-"))
+        if extension in READERS:
+            yield OPEN_FILES / str(file.fileno())
+            return
+        # A reader may give the name to another process.
+        named.symlink_to(f"/proc/{os.getpid()}/fd/{file.fileno()}")
+        yield named
 
 
 def _is_compressed(path: Path) -> bool:

@@ -9,14 +9,16 @@ Processor seconds of one thread, measured for clouds of 500 to 35,000 points, th
 Two idle cores take half of the sum. Measured against estimated: 24 s against 34 at 2,009 points, 54 against 41 at
 7,189, 42 against 44 at 10,044, and 76 against 84 at 85,127. Shapes differ, so that an estimate is right to within a
 factor of about 1.5 on such a machine. The peak of resident memory was 0.55 to 0.75 GB in the fit of
-a few hundred points, 1.06 to 1.37 GB from 5,000 points on, and 0.5 GB + 0.89 GB (cells / 512)^2 in the mesh; the points
-themselves matter only from millions on.
+a few hundred points, 1.06 to 1.37 GB from 5,000 points on, and 0.5 GB + 0.89 GB (cells / 512)^2 in the mesh, less in a
+long and thin box; the points themselves matter only from millions on.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import Any
+
+import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.options import Options
@@ -72,11 +74,26 @@ def estimate(
     fitting = model.fit_seconds * (points / model.fit_points) ** model.fit_exponent * (0.72 + 0.28 * detail**2)
     meshing = model.mesh_seconds * (cells / model.mesh_cells) ** 2 * (0.51 + 0.49 * detail)
     seconds = model.two_core_share * (starting + fitting + meshing)
-    mesh_memory = model.mesh_memory_mb + model.mesh_cells_memory_mb * (cells / model.mesh_memory_cells) ** 2
+    mesh_memory = mesh_memory_mb(cells, bounds, model=model)
     fit_memory = model.fit_memory_mb + model.dense_fit_memory_mb * min(1.0, points / model.dense_fit_points)
     memory = max(fit_memory, mesh_memory) + read * model.read_point_bytes / 1e6
     parts = (round(model.two_core_share * part, 1) for part in (fitting, meshing))
     return Estimate(round(seconds, 1), round(memory), *parts)
+
+
+def mesh_memory_mb(cells: float, bounds: Float, *, model: CostModel = CostModel()) -> float:
+    """Return the peak of resident memory of a meshing, in MB of 10^6 bytes.
+
+    Parameters
+    ----------
+    cells : along the longest side of the box
+    bounds : the box, of shape (2, 3); one that is long and thin holds less surface than those that were measured
+    model : measured memory
+    """
+    x, y, z = np.ptp(bounds, axis=0) / np.ptp(bounds, axis=0).max()
+    # The faces of the flattest of those boxes had half the area of a cube's.
+    filled = min(1.0, 2.0 * float(x * y + y * z + z * x) / 3.0)
+    return model.mesh_memory_mb + model.mesh_cells_memory_mb * filled * (cells / model.mesh_memory_cells) ** 2
 
 
 def _rounded(seconds: float) -> str:

@@ -26,8 +26,9 @@ def require_field_types(record: Any) -> None:
     UsageError
         When a value has another type than its field; the sentence names the field and the value.
     """
+    types_of = _field_types(record.__class__)
     for option in fields(record):
-        value, kinds, optional = getattr(record, option.name), *_field_types(record.__class__, option.name)
+        value, (kinds, optional) = getattr(record, option.name), types_of[option.name]
         if value is None and optional:
             continue
         found = next((plain for kind in kinds if (plain := _plain(kind, value)) is not None), None)
@@ -71,10 +72,9 @@ def shortened(value: float, *, most_digits: int = 30) -> str:
 
 
 @cache
-def _field_types(record: Any, name: str) -> tuple[tuple[Any, ...], bool]:
-    """The types of a field besides None, and whether it may be None."""
-    hint = get_type_hints(record)[name]
-    return value_types(hint), type(None) in get_args(hint)
+def _field_types(record: Any) -> dict[str, tuple[tuple[Any, ...], bool]]:
+    """The types of each field besides None, and whether it may be None."""
+    return {name: (value_types(hint), type(None) in get_args(hint)) for name, hint in get_type_hints(record).items()}
 
 
 def value_types(hint: Any) -> tuple[Any, ...]:

@@ -39,6 +39,7 @@ from benchmarks.harness.command_line import (
 from gnrecon.batch.child_process import close_fork_servers
 from gnrecon.batch.execute import run_child
 from gnrecon.batch.job import Limits
+from gnrecon.fit.parameters import FitParameters, GlobalFieldParameters, LinearFieldParameters
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.interrupts import polite_ends
 
@@ -51,13 +52,16 @@ OPTIONS = (
     ("--smooth-scan", "6s"),
     ("--spacing", "2s"),
     ("--holdout", "0.2"),
-    ("--widths", "40", "--steps", "2"),
     ("--uncertainty", "--curvature"),
     ("--simplify", "0.01"),
+    ("--keep-handles",),
 )
-"""Options of which each run has one choice, besides the fastest fit and a coarse mesh."""
+"""Options of which each run has one choice, besides a fit and a coarse mesh."""
 
-FASTEST = ("--quality", "draft", "--resolution", "24", "--threads", "1", "--quiet")
+NETWORK = ("--widths", "40", "--steps", "2")
+"""The fit of half of the runs; the others have the default fit, most of them with fewer features."""
+
+FASTEST = ("--quality", "draft", "--threads", "1", "--quiet")
 
 
 @dataclass(frozen=True)
@@ -86,18 +90,30 @@ class Run:
 
 
 def prepare() -> None:
-    """Import in the process from which runs are forked what they need."""
-    import gnrecon.cli.app
-    import gnrecon.run  # noqa: F401
+    """Import in the process from which runs are forked what they need, and refuse a file that holds nothing.
+
+    The refusal fills what Python keeps of modules, commands and options. It starts no threads, which a fork would lose.
+    """
+    import laspy  # noqa: F401
+    import lazrs  # noqa: F401
+
+    from gnrecon.cli.app import main
     from gnrecon.runtime.preload import preload
 
     preload()
+    with scratch_folder() as folder, suppress(SystemExit):
+        (folder / "scan.xyz").touch()
+        main([str(folder / "scan.xyz"), "-o", str(folder / "mesh.ply"), *FASTEST])
 
 
 def work(argument: dict[str, Any]) -> int:
     """Run the command line in a forked process, and return its exit code."""
+    import gnrecon.pipeline
     from gnrecon.cli.app import main
+    from gnrecon.fit import fit
 
+    if argument["few_features"]:
+        gnrecon.pipeline.fit = partial(fit, parameters=FitParameters(global_field=few_features()))
     # The command line hides them from its users; those of the library would see them.
     sys.warnoptions.append("default::RuntimeWarning")
     warnings.simplefilter("ignore")
@@ -108,21 +124,38 @@ def work(argument: dict[str, Any]) -> int:
         return int(end.code or 0)
 
 
+def few_features() -> GlobalFieldParameters:
+    """Return sizes of the global field with which the fit takes the same way in a third of the time."""
+    linear = LinearFieldParameters(
+        units=200, selection_features=120, selection_points=200, selection_volume_samples=400
+    )
+    return GlobalFieldParameters(linear=linear)
+
+
 def run_one(number: int, seed: int, folder: Path, limits: Limits, keep: Path | None) -> Run:
     """Make the scan of a number, reconstruct it, and return how that ended."""
     rng = np.random.default_rng([seed, number])
     place = folder / str(number)
     (place / "out").mkdir(parents=True)
     scan = damaged_scan(place, rng)
-    options = OPTIONS[int(rng.integers(0, len(OPTIONS)))]
+    fit = NETWORK if rng.random() < 0.5 else ()
+    all_features, cells = rng.random() < 0.125, "24" if rng.random() < 0.125 else "16"
+    options = ("--resolution", cells, *fit, *OPTIONS[int(rng.integers(0, len(OPTIONS)))])
     mesh = place / "out" / f"mesh{rng.choice(['.ply', '.obj', '.stl', '.glb'])}"
     report = place / "out" / "report.json"
     words = [str(scan), "-o", str(mesh), "--report", str(report), *FASTEST, *options]
     log = place / "log"
     killed = number % 10 == 9
     if killed:
-        limits = replace(limits, seconds=float(rng.uniform(0.1, 5.0)))
-    end = run_child({"words": words}, threads=1, log=log, environment={}, limits=limits, work="benchmarks.fuzz")
+        limits = replace(limits, seconds=float(rng.uniform(0.05, 2.0)))
+    end = run_child(
+        {"words": words, "few_features": not all_features},
+        threads=1,
+        log=log,
+        environment={},
+        limits=limits,
+        work="benchmarks.fuzz",
+    )
     killed = killed and end.exit_code is None
     if killed:
         fault = "the mesh of a killed run is not whole" if mesh.exists() and not _as_reported(mesh, report) else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -114,6 +115,13 @@ def test_losses_are_reported(suffix: str, sentence: str, mesh: Mesh, tmp_path: P
     assert write_mesh(full, tmp_path / f"m{suffix}") == [sentence]
     assert not supports_attribute(tmp_path / f"m{suffix}", "heat", count)
     assert not set(read_mesh(tmp_path / f"m{suffix}").attributes) - {"colors"}
+
+
+def test_a_number_beyond_single_precision_is_a_loss_without_a_warning(mesh: Mesh, tmp_path: Path) -> None:
+    hot = mesh.with_attributes({"heat": np.full(len(mesh.vertices), 1e200)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert write_mesh(hot, tmp_path / "m.glb") == ["GLB cannot hold heat of the vertices; PLY can."]
 
 
 @pytest.mark.parametrize("suffix", [*COLOURED, ".stl"])

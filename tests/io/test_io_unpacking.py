@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import os
 import shutil
 import signal
-import subprocess
-import sys
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from gnrecon.io import read_cloud, unpacking
+from gnrecon.io.parse import OPEN_FILES
 from gnrecon.runtime.errors import InputError
 
 
@@ -47,26 +48,37 @@ def test_a_full_disk_is_named(packed: Path, monkeypatch: pytest.MonkeyPatch) -> 
         read_cloud(packed)
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs the process's open files by number")
-def test_nothing_is_left_after_a_kill(packed: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(not OPEN_FILES.is_dir(), reason="needs the process's open files by number")
+@pytest.mark.parametrize("extension", [".xyz", ".gltf", ".conf", ".plugin"])
+def test_nothing_of_the_data_is_left_after_a_kill(packed: Path, tmp_path: Path, extension: str) -> None:
     temporary = tmp_path / "temporary"
     temporary.mkdir()
-    script = (
-        "import os, signal; from pathlib import Path; from gnrecon.io.unpacking import uncompressed_file\n"
-        f"with uncompressed_file(Path({str(packed)!r}), '.xyz') as file:\n"
-        "    print(len(file.read_text().splitlines()), flush=True)\n"
-        "    os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], env={"TMPDIR": str(temporary)}, capture_output=True, text=True, timeout=60
-    )
-    assert (done.returncode, done.stdout) == (-signal.SIGKILL, "200\n"), done.stderr
-    assert list(temporary.iterdir()) == []
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        tempfile.tempdir = str(temporary)
+        with unpacking.uncompressed_file(packed, extension) as file:
+            os.write(writer, f"{len(file.read_text().splitlines())} {file.suffix}".encode())
+            os.kill(os.getpid(), signal.SIGKILL)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    assert os.read(reader, 100).decode() == f"200 {extension if extension == '.plugin' else ''}"
+    # A reader of a plugin gets a name, of which a link that leads nowhere remains.
+    assert [path.name for path in temporary.rglob("*") if path.exists() and not path.is_dir()] == []
+    assert extension == ".plugin" or list(temporary.iterdir()) == []
 
 
-def test_formats_that_name_their_siblings_have_a_folder(tmp_path: Path) -> None:
-    path = tmp_path / "scan.gltf.gz"
-    path.write_bytes(gzip.compress(b"{}"))
-    with unpacking.uncompressed_file(path, ".gltf") as file:
-        assert (file.name, file.read_bytes()) == ("unpacked.gltf", b"{}")
+@pytest.mark.parametrize(("name", "content"), [("a.conf", "bmesh 0 0 0 0 0 0 0 1\n"), ("a.gltf", '{"buffers": [%s]}')])
+def test_compressed_files_name_no_files_next_to_them(tmp_path: Path, name: str, content: str) -> None:
+    """Their folder would be that of the process's open files."""
+    (tmp_path / "0").write_text("x")
+    path = tmp_path / f"{name}.gz"
+    path.write_bytes(gzip.compress(content.replace("%s", '{"uri": "0", "byteLength": 1}').encode()))
+    with pytest.raises(InputError, match=r"'0' lies next to it, which is not searched for compressed files"):
+        read_cloud(path)
+
+
+def test_a_copy_has_a_name_where_open_files_have_no_number(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unpacking, "OPEN_FILES", Path("/nowhere"))
+    with unpacking.uncompressed_file(packed, ".xyz") as file:
+        assert (file.name, len(file.read_text().splitlines())) == ("unpacked.xyz", 200)
     assert not file.parent.exists()

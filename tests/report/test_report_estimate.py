@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gnrecon.options import Options
-from gnrecon.report.estimate import Estimate, estimate
+from gnrecon.report.estimate import Estimate, estimate, mesh_memory_mb
 
 BOX = np.array([[0.0, 0, 0], [1.0, 1, 1]])
 
@@ -36,6 +36,13 @@ def test_resolution_and_quality_count() -> None:
 @pytest.mark.parametrize("options", [{"widths": (2000,)}, {"steps": 0}, {"device": "cuda"}, {"max_error": 0.01}])
 def test_runs_that_were_not_measured_have_none(options: dict[str, Any]) -> None:
     assert estimate(5000, 5000, BOX, Options(**options)) is None
+
+
+def test_a_long_and_thin_box_holds_less_surface() -> None:
+    assert mesh_memory_mb(512, BOX) == pytest.approx(1390, rel=0.01)
+    assert mesh_memory_mb(512, BOX * [1, 1, 0.25]) == mesh_memory_mb(512, BOX)
+    thin = mesh_memory_mb(4096, BOX * [1, 0.01, 0.01]) - mesh_memory_mb(0, BOX)
+    assert thin < 0.02 * (mesh_memory_mb(4096, BOX) - mesh_memory_mb(0, BOX))
 
 
 def test_the_sentence() -> None:

@@ -156,7 +156,7 @@ def test_heavy_meshes_and_clouds_are_drawn_lightly_and_said_to_be(mesh: Mesh, mo
 def test_values_and_points_that_are_not_finite() -> None:
     mesh = torus()
     values = np.linspace(0, 1, len(mesh.vertices))
-    values[:10] = [np.nan, np.inf, -np.inf] * 3 + [np.nan]
+    values[:10] = [np.nan, np.inf, -np.inf, 1e300, -1.7e308] * 2
     nothing = np.full(len(values), np.nan)
     cloud = PointCloud(np.array([[np.nan] * 3, CENTRE, [np.inf] * 3]))
     mesh = mesh.with_attributes({"distance": values, "nothing": nothing, "constant": 0 * values[20] + 0 * nothing.real})

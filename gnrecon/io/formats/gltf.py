@@ -40,8 +40,9 @@ def glb_supports(name: str, values: Values) -> bool:
     if values.dtype.kind not in "biuf" or values.ndim > 2 or (values.ndim == 2 and values.shape[1] > 4):
         return False
     numbers = values.astype(np.float64)
-    exact = values.dtype.kind == "f" or bool((numbers.astype(np.float32) == numbers).all())
-    return exact and bool(np.isfinite(numbers.astype(np.float32)).all())
+    with np.errstate(over="ignore"):  # what overflows is not supported
+        single = numbers.astype(np.float32)
+    return bool(np.isfinite(single).all()) and (values.dtype.kind == "f" or bool((single == numbers).all()))
 
 
 def read_gltf(path: Path) -> Contents:

@@ -38,7 +38,7 @@ def read_conf(path: Path) -> Contents:
     Published data sets may lack some scans; these are listed in `Contents.unread`.
     """
     poses = parse_conf(read_text(path))
-    existing = [pose for pose in poses if (path.parent / pose.file).is_file()]
+    existing = [pose for pose in poses if sibling_path(path.parent, pose.file, "scan").is_file()]
     absent = dict.fromkeys(pose.file for pose in poses if not (path.parent / pose.file).is_file())
     missing = tuple(f"the scan {name}, which is missing" for name in absent)
     if not existing:

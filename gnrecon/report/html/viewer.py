@@ -246,6 +246,8 @@ def layers(
 ) -> list[Layer]:
     """Return a layer for every scalar attribute of the mesh that has a finite value, gnrecon's own first.
 
+    Values beyond single precision, in which the page has them, count as missing.
+
     Parameters
     ----------
     mesh : Mesh
@@ -255,10 +257,11 @@ def layers(
         Values of an attribute from which on the surface is hatched.
     """
     scalars = {
-        name: np.asarray(values, dtype=np.float64)
+        name: np.where(np.abs(values) < 1e38, values, np.nan)
         for name, values in mesh.attributes.items()
-        if values.ndim == 1 and np.issubdtype(values.dtype, np.number) and np.isfinite(values).any()
+        if values.ndim == 1 and np.issubdtype(values.dtype, np.number)
     }
+    scalars = {name: values for name, values in scalars.items() if np.isfinite(values).any()}
     order = [*(name for name in KINDS if name in scalars), *(name for name in scalars if name not in KINDS)]
     areas = vertex_areas(mesh)
     return [replace(_layer(name, scalars[name], areas, origins), beyond=beyond.get(name)) for name in order]
