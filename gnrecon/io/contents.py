@@ -1,6 +1,7 @@
 """`Contents`, what a reader returns: the points and all else that a file stores, before it becomes a cloud or a mesh.
 
-Also holds what many readers need: sorting named columns, concatenating scans, and cutting polygons into triangles.
+Also holds what many readers need: sorting named columns, concatenating and moving scans, and cutting polygons into
+triangles. Whatever does not fit together ends in an `InputError`.
 """
 
 from __future__ import annotations
@@ -51,37 +52,34 @@ class Contents:
     remarks: tuple[str, ...] = ()
 
     def shape(self) -> Mesh | PointCloud:
-        """Return a mesh, with colours in 8 bits, where there are faces; else a cloud.
-
-        Raises
-        ------
-        InputError
-            When the arrays do not fit each other.
-        """
-        attributes = dict(self.attributes)
+        """Return a mesh, with colours in 8 bits, where there are faces; else a cloud."""
         if not len(self.faces):
-            return PointCloud(self.points, self.normals, attributes, self.origins)
-        if "colors" in attributes:
-            attributes["colors"] = as_bytes(attributes["colors"])
-        return Mesh(self.points, self.faces, self.normals, attributes)
+            return self.cloud()
+        colors = {name: as_bytes(values) for name, values in self.attributes.items() if name == "colors"}
+        return Mesh(self.points, self.faces, self.normals, {**self.attributes, **colors})
+
+    def cloud(self) -> PointCloud:
+        """Return the points; see `without_faces` for the normals of a mesh."""
+        found = without_faces(self)
+        return PointCloud(found.points, found.normals, dict(found.attributes), found.origins)
+
+    def moved(self, rotation: Float, translation: Float, origin: Float | None = None) -> Contents:
+        """Return the points, rows x, as ``rotation x + translation``, with the position of the scanner, of shape (3,).
+
+        ``rotation`` has shape (3, 3) and turns normals, too; ``translation`` has shape (3,).
+        """
+        points = self.points @ rotation.T + translation
+        normals = None if self.normals is None else self.normals @ rotation.T
+        seen_from = self.origins if origin is None else np.broadcast_to(origin, points.shape)
+        return replace(self, points=points, normals=normals, origins=seen_from)
 
 
 def from_columns(columns: Columns, faces: Int | None = None, points: Values | None = None) -> Contents:
     """Sort named columns, of shape (N,) or (N, C), into positions, normals, ``colors`` and other attributes.
 
     Columns of shape (N, 3) named ``normals`` are normals, and those of three or four named ``colors``, ``rgb`` or the
-    like are colours.
-
-    Parameters
-    ----------
-    columns : by name; see `gnrecon.io.column_names` for the names that positions, normals and colours may have
-    faces : integer array of shape (F, 3); by default none
-    points : array of shape (N, 3); by default the columns x, y and z
-
-    Raises
-    ------
-    InputError
-        When x, y or z is missing, or columns differ in their number of rows.
+    like are colours; see `gnrecon.io.column_names` for the names that single ones may have. ``faces``, of shape (F, 3),
+    are none by default, and ``points``, of shape (N, 3), the columns x, y and z.
     """
     rest = dict(columns)
     if points is None:
@@ -187,11 +185,6 @@ def without_opaque_alpha(attributes: Columns) -> Columns:
 def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:
     """Return contents without faces; where they have no normals, and at least a share of the points is a corner of a
     face, with the area-weighted normals of the faces.
-
-    Raises
-    ------
-    InputError
-        When a face names a point that does not exist.
     """
     normals, faces = contents.normals, contents.faces
     if normals is None and len(faces) and len(np.unique(faces)) >= least_share * len(contents.points):
@@ -203,11 +196,7 @@ def fan_triangles(counts: Int, corners: Int) -> Int:
     """Return the triangles, of shape (F, 3), of polygons that are each cut into a fan.
 
     A polygon v0 v1 ... v(n-1) becomes the n - 2 triangles v0 v(k+1) v(k+2); fewer than three corners give none.
-
-    Parameters
-    ----------
-    counts : integer array of shape (P,), the number of corners of each polygon
-    corners : integer array of shape (counts.sum(),), the concatenated vertex indices of all polygons
+    ``counts``, of shape (P,), are the numbers of corners, and ``corners`` the vertex indices of all polygons.
     """
     triangles = np.maximum(counts - 2, 0)
     polygon = np.repeat(np.arange(len(counts)), triangles)
@@ -227,11 +216,5 @@ def polygon_remarks(counts: Int) -> tuple[str, ...]:
 
 
 def guard_parser(kind: str) -> AbstractContextManager[None]:
-    """Guard a block that parses a file of a kind, such as ``"LAS"``.
-
-    Raises
-    ------
-    InputError
-        When the library in the block raises any exception; see `gnrecon.runtime.plugins.guarded`.
-    """
+    """Turn any exception of a library that parses a file of a kind, such as ``"LAS"``, into an `InputError`."""
     return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({describe_error(error)}).")

@@ -9,7 +9,6 @@ Plugins cannot replace built-in formats.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -142,31 +141,16 @@ def writable() -> list[str]:
 def reader_of(extension: str) -> Callable[[Path], Contents] | None:
     """Return the reader for files of an extension; None where there is none.
 
-    Raises
-    ------
-    UsageError
-        When several packages offer it, or the one that does cannot be loaded.
+    `UsageError` is raised when several packages offer it, or the one that does cannot be loaded.
     """
     plugin = None if extension in READERS else find("reader", extension.removeprefix("."))
-    if plugin is None:
-        return READERS.get(extension)
-    read = plugin.load()
-    return lambda path: _read_with_plugin(plugin, read, path)
+    return READERS.get(extension) if plugin is None else partial(_read_with_plugin, plugin, plugin.load())
 
 
 def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
-    """Return the writer of meshes for files of an extension; None where there is none.
-
-    Raises
-    ------
-    UsageError
-        When several packages offer it, or the one that does cannot be loaded.
-    """
+    """Return the writer of meshes for files of an extension, as `reader_of` does the reader."""
     plugin = None if extension in WRITERS else find("writer", extension.removeprefix("."))
-    if plugin is None:
-        return WRITERS.get(extension)
-    write = plugin.load()
-    return lambda mesh, path: _write_with_plugin(plugin, write, mesh, path)
+    return WRITERS.get(extension) if plugin is None else partial(_write_with_plugin, plugin, plugin.load())
 
 
 def _with_plugins(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
@@ -176,7 +160,6 @@ def _with_plugins(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
 def _read_with_plugin(plugin: Plugin, read: Callable[[Path], Any], path: Path) -> Contents:
     with plugin.guarded(InputError):
         found = read(path)
-    with plugin.guarded(InputError):
         try:
             shape = as_shape(found)
         except InputError as error:
@@ -207,11 +190,12 @@ def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh:
 
 def _read_only(mesh: Mesh) -> Mesh:
     """The same mesh in read-only arrays, because the caller still uses the mesh after it was written."""
-    attributes = {name: values.view() for name, values in mesh.attributes.items()}
-    normals = None if mesh.normals is None else mesh.normals.view()
-    locked = replace(
-        mesh, vertices=mesh.vertices.view(), faces=mesh.faces.view(), normals=normals, attributes=attributes
-    )
-    for values in (locked.vertices, locked.faces, *attributes.values(), *([] if normals is None else [normals])):
-        values.flags.writeable = False
-    return locked
+
+    def locked(values: Any) -> Any:
+        view = values.view()
+        view.flags.writeable = False
+        return view
+
+    attributes = {name: locked(values) for name, values in mesh.attributes.items()}
+    normals = None if mesh.normals is None else locked(mesh.normals)
+    return Mesh(locked(mesh.vertices), locked(mesh.faces), normals, attributes)

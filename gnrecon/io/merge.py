@@ -115,34 +115,22 @@ def read_scans(
     if {".las", ".laz"} & extensions:
         # A chunk cannot say which attributes were never filled in; only all of its points can.
         found = drop_unused_attributes(found)
-    cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
-    require_points_in_region(cloud, thinning.seen)
+    cloud = found.cloud()
+    _require_points(cloud, thinning.seen)
     files = tuple(str(path) for path in paths)
     counts = (thinning.seen, len(cloud), thinning.cropped, thinning.non_finite)
     return cloud, Reading(files, *counts, thinning.side, found.unread, same_scans(files, moments), found.remarks)
 
 
 def cropped(cloud: PointCloud, region: Region) -> tuple[PointCloud, Reading]:
-    """Return the points of a cloud in a region, and what was dropped.
-
-    Raises
-    ------
-    UsageError
-        When there are none.
-    """
+    """Return the points of a cloud in a region, and what was dropped; `UsageError` is raised where there are none."""
     inside = cloud if region.everything else cloud.select(region.holds(cloud.points))
-    require_points_in_region(inside, len(cloud))
+    _require_points(inside, len(cloud))
     return inside, Reading((), len(cloud), len(inside), len(cloud) - len(inside))
 
 
-def require_points_in_region(cloud: PointCloud, before: int) -> None:
-    """Refuse a region that holds none of `before` points.
-
-    Raises
-    ------
-    UsageError
-        When no point is left.
-    """
+def _require_points(cloud: PointCloud, before: int) -> None:
+    """Refuse a region that holds none of `before` points."""
     if before and not len(cloud):
         raise UsageError(f"None of the {before:,} points lies in the region; gnrecon info prints the scan's box.")
 
@@ -185,11 +173,8 @@ class Moments:
     def same_as(self, other: Moments, *, least_points: int = 25, tolerance: float = 1e-5) -> bool:
         """Whether both may be the same scan, moved or not.
 
-        Parameters
-        ----------
-        other : moments of the other scan
-        least_points : in a scan; moments of fewer points may agree by chance
-        tolerance : of the moments, as a share of the largest: what float32 leaves of coordinates
+        Moments of fewer than `least_points` may agree by chance; the tolerance, a share of the largest moment, is what
+        float32 leaves of coordinates.
         """
         if self.count != other.count or self.count < least_points:
             return False

@@ -14,7 +14,7 @@ import numpy as np
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io.contents import Contents, without_faces
+from gnrecon.io.contents import Contents
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
 from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
@@ -43,8 +43,7 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     """
     contents = read_contents(Path(path), format)
     with input_errors_for(Path(path)):
-        found = without_faces(contents)
-    return PointCloud(found.points, found.normals, found.attributes, found.origins)
+        return contents.cloud()
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -62,24 +61,12 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def read_reference(path: str | Path) -> Mesh | PointCloud:
-    """Read a mesh where the file has faces, else a cloud.
-
-    Raises
-    ------
-    InputError
-        As `read_cloud` does.
-    """
+    """Read a mesh where the file has faces, else a cloud; the errors are those of `read_cloud`."""
     return read_any(path)[0]
 
 
 def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
-    """Read a mesh where the file has faces, else a cloud; and describe what else the file holds, which is not read.
-
-    Raises
-    ------
-    InputError
-        As `read_cloud` does.
-    """
+    """Read as `read_reference` does, and describe what else the file holds, which is not read."""
     contents = read_contents(Path(path), None)
     with input_errors_for(Path(path)):
         return contents.shape(), contents.unread

@@ -113,12 +113,7 @@ def read_chunks(
 ) -> Iterator[Contents]:
     """Yield the contents of a file by chunks; small files, and formats that must be read as a whole, in one.
 
-    Raises
-    ------
-    InputError
-        As the format's reader does; not before the first chunk is requested.
-    UsageError
-        When columns are named of a file that is no table.
+    `UsageError` is raised when columns are named of a file that is no table.
     """
     by_chunks = CHUNK_READERS.get(extension)
     if columns and extension in (".npy", ".npz"):

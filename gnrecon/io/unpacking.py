@@ -30,17 +30,8 @@ NAMED = (".gltf", ".conf")
 def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
     """Yield a plain file with the data to read: the file itself, or a temporary copy of compressed data or a stream.
 
-    Parameters
-    ----------
-    path : file to read; ``-`` for standard input
-    extension : how it is to be read, with the dot; a copy with a name has this extension
-
-    Raises
-    ------
-    InputError
-        When compressed data is damaged, or there is more than a scan can hold or the disk takes.
-    UsageError
-        When standard input is a terminal, so that no file is sent.
+    The extension, with its dot, says how it is to be read; a copy with a name has it. Damaged data, and more than a
+    scan can hold or the disk takes, ends in an `InputError`, and a terminal as standard input in a `UsageError`.
     """
     if not is_standard_input(path) and not _is_compressed(path):
         yield path
@@ -93,21 +84,14 @@ def _copy(
     least_suspect_bytes: int = 100_000_000,
     chunk_bytes: int = 1 << 20,
 ) -> None:
-    """Copy a stream into a file.
+    """Copy a stream into a file, by chunks.
 
     Parameters
     ----------
-    source, target : stream and file
     packed_bytes : size of the compressed data, None of other data
     most_disk_share : of the free space that the copy may take, so that other programs have some left
     most_ratio, least_suspect_bytes : larger copies of data that was compressed more than this are refused; gzip reaches
         1,000 with bytes that are all the same, and scans 3 to 20
-    chunk_bytes : copied at a time
-
-    Raises
-    ------
-    InputError
-        When there is more than that.
     """
     folder = tempfile.gettempdir()
     most, copied = int(most_disk_share * shutil.disk_usage(folder).free), 0
