@@ -192,8 +192,8 @@ def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:
     return replace(contents, normals=normals, faces=no_faces())
 
 
-def fan_triangles(counts: Int, corners: Int) -> Int:
-    """Return the triangles, of shape (F, 3), of polygons that are each cut into a fan.
+def fan_triangles(counts: Int, corners: Int, strips: bool = False) -> Int:
+    """Return the triangles, of shape (F, 3), of polygons that are each cut into a fan, or of triangle strips.
 
     A polygon v0 v1 ... v(n-1) becomes the n - 2 triangles v0 v(k+1) v(k+2); fewer than three corners give none.
     ``counts``, of shape (P,), are the numbers of corners, and ``corners`` the vertex indices of all polygons.
@@ -202,7 +202,9 @@ def fan_triangles(counts: Int, corners: Int) -> Int:
     polygon = np.repeat(np.arange(len(counts)), triangles)
     first = (np.cumsum(counts) - counts)[polygon]
     k = np.arange(len(polygon)) - (np.cumsum(triangles) - triangles)[polygon]
-    return np.column_stack([corners[first], corners[first + k + 1], corners[first + k + 2]])
+    # Every other triangle of a strip has the opposite orientation.
+    a, b = (k + k % 2, k + 1 - k % 2) if strips else (0, k + 1)
+    return np.column_stack([corners[first + a], corners[first + b], corners[first + k + 2]])
 
 
 def polygon_remarks(counts: Int) -> tuple[str, ...]:

@@ -107,13 +107,8 @@ def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
 
 def _unread(text: bytes) -> tuple[str, ...]:
     """Describe what else the file's JSON declares."""
-    names = {
-        b"TEXCOORD_0": "texture coordinates",
-        b"textures": "textures",
-        b"animations": "animations",
-        b"skins": "skins",
-    }
-    return tuple(name for word, name in names.items() if b'"' + word + b'"' in text)
+    names = {"TEXCOORD_0": "texture coordinates"} | {name: name for name in ("textures", "animations", "skins")}
+    return tuple(name for word, name in names.items() if f'"{word}"'.encode() in text)
 
 
 def _prepare(tree: dict[str, Any], size: int) -> None:
@@ -166,13 +161,12 @@ def _nodes_with_meshes(tree: dict[str, Any], *, most_steps: int = 500_000) -> li
 
 def _numbers(tree: dict[str, Any], mesh: int) -> int:
     """Coordinates, indices and attributes' values of a mesh."""
-    places = [
-        place
-        for primitive in tree["meshes"][mesh]["primitives"]
-        for place in [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
-    ]
-    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
-    return sum(columns.get(tree["accessors"][place]["type"], 4) * tree["accessors"][place]["count"] for place in places)
+    columns, total = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}, 0
+    for primitive in tree["meshes"][mesh]["primitives"]:
+        for place in [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]:
+            accessor = tree["accessors"][place]
+            total += columns.get(accessor["type"], 4) * int(accessor["count"])
+    return total
 
 
 def _rename(names: dict[str, Any], old: str, new: str) -> None:

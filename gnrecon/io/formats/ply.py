@@ -20,7 +20,6 @@ from gnrecon.geometry.arrays import Int, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, fan_triangles, from_columns, polygon_remarks
-from gnrecon.io.formats.vtk import triangulate_cells
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
@@ -63,7 +62,7 @@ def _strip_triangles(corners: Int) -> Int:
     """The triangles of strips that -1 separates, as Stanford's scans have them; the orientation alternates."""
     ends = np.flatnonzero(np.append(corners, -1) < 0)
     counts = np.diff(ends, prepend=-1) - 1
-    triangles = triangulate_cells(counts, corners[corners >= 0], strips=True)
+    triangles = fan_triangles(counts, corners[corners >= 0], strips=True)
     # Strips repeat a vertex to turn; such triangles have no area.
     a, b, c = triangles.T
     kept: Int = triangles[(a != b) & (b != c) & (c != a)]
@@ -94,23 +93,21 @@ class _Body:
 
     def next_rows(self, element: Element) -> _Rows:
         """The rows of an element, which begin at the current place."""
-        if not element.count or not any(prop.count_type for prop in element.properties):
-            layout = np.dtype([(prop.name, self.kind(prop.type)) for prop in element.properties])
-            start, self.place = self.place, self.place + element.count * layout.itemsize
-            # Checked before reading, because a damaged header may declare any number of rows.
-            if self.place > len(self.data):
-                raise truncation_error(element, (len(self.data) - start) // layout.itemsize)
-            table = np.frombuffer(self.data[start : self.place], layout)
-            return _Rows({prop.name: self._native(table[prop.name], prop) for prop in element.properties}, {})
+        if not element.count or not element.properties:
+            return _Rows({prop.name: np.empty(0, prop.type) for prop in element.properties}, {})
         # Most files have lists of one length only, so that all rows take as many bytes as the first.
         step = int(self._starts(element, 1)[1]) - self.place
-        starts: Int = self.place + step * np.arange(element.count + 1)
-        rows = self._rows_at(starts, element) if starts[-1] <= len(self.data) else None
+        rows: _Rows | None = None
+        # Checked before reading, because a damaged header may declare any number of rows.
+        if (end := self.place + step * element.count) <= len(self.data):
+            rows = self._rows_at(np.arange(self.place, end + 1, step), element, step)
+        elif not any(prop.count_type for prop in element.properties):
+            raise truncation_error(element, (len(self.data) - self.place) // step)
         if rows is None:
             starts = self._starts(element, element.count)
-            rows = self._rows_at(starts, element)
+            rows, end = self._rows_at(starts, element), int(starts[-1])
         assert rows is not None, "rows end where the next ones start"
-        self.place = int(starts[-1])
+        self.place = end
         return rows
 
     def _starts(self, element: Element, rows: int) -> Int:
@@ -134,16 +131,20 @@ class _Body:
             starts.append(place)
         return np.array(starts, np.int64)
 
-    def _rows_at(self, starts: Int, element: Element) -> _Rows | None:
-        """The rows between these offsets, of shape (count + 1,); None where a row does not end at the next offset."""
+    def _rows_at(self, starts: Int, element: Element, step: int | None = None) -> _Rows | None:
+        """The rows between these offsets, of shape (count + 1,); None where a row does not end at the next offset.
+
+        Offsets of one `step` are a slice, which is read several times faster.
+        """
         found, place = _Rows({}, {}), starts[:-1].copy()
         for prop in element.properties:
             size = self.kind(prop.type).itemsize
+            where = place if step is None else slice(place[0], place[-1] + 1, step)
             if not prop.count_type:
-                found.scalars[prop.name] = self._native(self._view(prop.type)[place], prop)
+                found.scalars[prop.name] = self._native(self._view(prop.type)[where], prop)
                 place += size
                 continue
-            lengths = _indices(self._view(prop.count_type)[place])
+            lengths = _indices(self._view(prop.count_type)[where])
             place += self.kind(prop.count_type).itemsize
             after = place + lengths * size
             if (lengths < 0).any() or (after > starts[1:]).any():
@@ -219,13 +220,7 @@ class Element:
 
 
 def parse_header(data: bytes) -> tuple[str, list[Element], int]:
-    """Return the byte order (``<``, ``>``, or nothing for text), the elements, and where the rows begin in `data`.
-
-    Raises
-    ------
-    InputError
-        When the header is malformed.
-    """
+    """Return the byte order (``<``, ``>``, or nothing for text), the elements, and where the rows begin in `data`."""
     if not data.startswith(b"ply"):
         raise InputError("the file does not begin with 'ply', so it is not a PLY file.")
     end = data.find(b"end_header")
@@ -303,15 +298,11 @@ def _ply_type(values: Values) -> str:
         **{"b1": "uchar", "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
         **{"f2": "float", "f4": "float", "f8": "double"},
     }
-    kind = kinds.get(values.dtype.str[1:])
-    if kind is not None:
-        return kind
-    # PLY has no 64-bit integers.
-    if values.dtype.kind in "iu" and len(values):
-        for name, limits in (("int", np.iinfo(np.int32)), ("uint", np.iinfo(np.uint32))):
-            if limits.min <= values.min() and values.max() <= limits.max:
-                return name
-    return "double"
+    code = values.dtype.str[1:]
+    for smaller in ("u4", "i4") if code in ("u8", "i8") and len(values) else ():
+        limits = np.iinfo(smaller)
+        code = smaller if limits.min <= values.min() and values.max() <= limits.max else code
+    return kinds.get(code, "double")
 
 
 def ply_chunks(path: Path, rows: int, *, header_bytes: int = 1 << 16) -> Iterator[Contents]:

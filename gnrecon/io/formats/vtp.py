@@ -20,8 +20,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gnrecon.geometry.arrays import Int, Values
-from gnrecon.io.contents import Contents, concatenated, no_faces
-from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, text_numbers, triangulate_cells
+from gnrecon.io.contents import Contents, concatenated, fan_triangles, no_faces
+from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, text_numbers
 from gnrecon.runtime.errors import InputError
 
 
@@ -96,7 +96,7 @@ def _faces(piece: ElementTree.Element, name: str, file: _VtkXml) -> Int:
     corners = arrays["connectivity"].astype(np.int64).ravel()
     ends = arrays["offsets"].astype(np.int64).ravel()
     counts = counts_from_offsets(np.concatenate([[0], ends]), corners)
-    return triangulate_cells(counts, corners, strips=name == "Strips")
+    return fan_triangles(counts, corners, strips=name == "Strips")
 
 
 def _values(array: ElementTree.Element, file: _VtkXml) -> Values:
@@ -126,7 +126,11 @@ def _bytes(array: ElementTree.Element, form: str, file: _VtkXml) -> bytes:
     block = block if raw else block.lstrip()
 
     def first(size: int, after: int = 0) -> bytes:
-        return block[after : after + size] if raw else _decoded(block[_encoded_size(after) :], size)
+        if raw:
+            return block[after : after + size]
+        # Three bytes take four characters.
+        start, end = (-(-count // 3) * 4 for count in (after, size))
+        return binascii.a2b_base64(block[start : start + end])[:size]
 
     count = _require_plausible(_header(first(width), file, 1)[0], block)
     if file.decompress is None:
@@ -146,16 +150,6 @@ def _header(data: bytes, file: _VtkXml, count: int) -> list[int]:
         raise InputError("the file ends within the header of an array.")
     found: list[int] = np.frombuffer(data, file.header, count).tolist()
     return found
-
-
-def _encoded_size(size: int) -> int:
-    """Number of base64 characters for so many bytes."""
-    return -(-size // 3) * 4
-
-
-def _decoded(text: bytes, size: int) -> bytes:
-    """The first `size` bytes of base64 text."""
-    return binascii.a2b_base64(text[: _encoded_size(size)])[:size]
 
 
 def _require_plausible(count: int, data: bytes) -> int:
