@@ -101,26 +101,21 @@ ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
 }
 """Whether a format can store a vertex attribute, by its name and values."""
 
-SIGNATURES: dict[bytes, str] = {
-    b"ply\n": ".ply",
-    b"ply\r": ".ply",
-    b"# .PCD": ".pcd",
-    b"VERSION .7": ".pcd",
-    b"VERSION 0.7": ".pcd",
-    b"OFF": ".off",
-    b"COFF": ".off",
-    b"NOFF": ".off",
-    b"glTF": ".glb",
-    b"\x89PNG": "PNG image",
-    b"\xff\xd8\xff": "JPEG image",
-    b"%PDF": "PDF document",
-    b"PK\x03\x04": "ZIP archive",
-    b"LASF": ".las",
-    b"ASTM-E57": ".e57",
-    b"# vtk DataFile": ".vtk",
-    b"\x93NUMPY": ".npy",
+SIGNATURES: dict[str, tuple[bytes, ...]] = {
+    ".ply": (b"ply\n", b"ply\r"),
+    ".pcd": (b"# .PCD", b"VERSION .7", b"VERSION 0.7"),
+    ".off": (b"OFF", b"COFF", b"NOFF"),
+    ".glb": (b"glTF",),
+    ".las": (b"LASF",),
+    ".e57": (b"ASTM-E57",),
+    ".vtk": (b"# vtk DataFile",),
+    ".npy": (b"\x93NUMPY",),
+    "PNG image": (b"\x89PNG",),
+    "JPEG image": (b"\xff\xd8\xff",),
+    "PDF document": (b"%PDF",),
+    "ZIP archive": (b"PK\x03\x04",),
 }
-"""First bytes of files, and the extension or kind that they belong to."""
+"""First bytes of files of an extension or another kind."""
 
 
 def is_readable(extension: str) -> bool:

@@ -8,9 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.moments import Moments
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.io.contents import without_faces
 from gnrecon.io.formats.las import drop_unused_attributes
@@ -119,7 +117,7 @@ def read_scans(
     _require_points(cloud, thinning.seen)
     files = tuple(str(path) for path in paths)
     counts = (thinning.seen, len(cloud), thinning.cropped, thinning.non_finite)
-    return cloud, Reading(files, *counts, thinning.side, found.unread, same_scans(files, moments), found.remarks)
+    return cloud, Reading(files, *counts, thinning.side, found.unread, _same_scans(files, moments), found.remarks)
 
 
 def cropped(cloud: PointCloud, region: Region) -> tuple[PointCloud, Reading]:
@@ -135,55 +133,7 @@ def _require_points(cloud: PointCloud, before: int) -> None:
         raise UsageError(f"None of the {before:,} points lies in the region; gnrecon info prints the scan's box.")
 
 
-class Moments:
-    """Moments of the points of one file, which recognise the same scan wherever it lies.
-
-    The number of points and the principal moments of inertia do not change when a scan is moved. They are summed while
-    the chunks pass, relative to the scan's first point, so that far-off coordinates lose no digits.
-    """
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._first: Float | None = None
-        self._sum, self._products = np.zeros(3), np.zeros((3, 3))
-
-    def add(self, points: Float) -> None:
-        """Add a chunk of points, of shape (N, 3); those that are not finite do not count."""
-        finite = np.isfinite(points).all(axis=1)
-        points = points if finite.all() else points[finite]
-        if not len(points):
-            return
-        if self._first is None:
-            self._first = points[0].copy()
-        with np.errstate(over="ignore", invalid="ignore"):
-            offsets = points - self._first
-            self.count += len(points)
-            self._sum += offsets.sum(axis=0)
-            self._products += offsets.T @ offsets
-
-    def principal(self) -> Float:
-        """Return the variances along the principal axes, of shape (3,); NaN where they are not finite."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            mean = self._sum / max(self.count, 1)
-            covariance: Float = self._products / max(self.count, 1) - np.outer(mean, mean)
-        if not np.isfinite(covariance).all():
-            return np.full(3, np.nan)
-        return np.asarray(np.linalg.eigvalsh(covariance), np.float64)
-
-    def same_as(self, other: Moments, *, least_points: int = 25, tolerance: float = 1e-5) -> bool:
-        """Whether both may be the same scan, moved or not.
-
-        Moments of fewer than `least_points` may agree by chance; the tolerance, a share of the largest moment, is what
-        float32 leaves of coordinates.
-        """
-        if self.count != other.count or self.count < least_points:
-            return False
-        mine, theirs = self.principal(), other.principal()
-        # Comparing with NaN is false, so scans whose moments overflow never match.
-        return bool((np.abs(mine - theirs) <= tolerance * mine.max()).all())
-
-
-def same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[str, str], ...]:
+def _same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[str, str], ...]:
     """Return pairs of files that hold the same scan, each file at most once as the second one."""
     found = []
     for index, name in enumerate(files):

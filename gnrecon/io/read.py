@@ -147,7 +147,7 @@ def _check_file(path: Path, extension: str) -> None:
         )
     if extension not in READERS:
         return  # the signatures of plugin formats are unknown
-    kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
+    kind = next((kind for kind, signatures in SIGNATURES.items() if head.startswith(signatures)), extension)
     # LAS and LAZ have the same signature and reader; 3MF files are ZIP archives.
     if kind == extension or {kind, extension} in ({".las", ".laz"}, {"ZIP archive", ".3mf"}, {"ZIP archive", ".npz"}):
         return

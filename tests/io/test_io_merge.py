@@ -11,7 +11,7 @@ from scan_files import torus, write_scan
 from scipy.spatial.transform import Rotation
 
 from gnrecon.io import read_scans
-from gnrecon.io.merge import Moments
+from gnrecon.geometry.moments import Moments
 
 
 def moments(*chunks: np.ndarray) -> Moments:
