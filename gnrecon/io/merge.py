@@ -54,17 +54,13 @@ class Reading:
     def remarks(self) -> list[str]:
         """Return a sentence for everything that was dropped or looks wrong."""
         sentences = [*self.notes, *([f"Not read: {', '.join(self.unread)}."] if self.unread else [])]
-        for first, second in self.same:
-            sentences.append(
-                f"{second} seems to be the same scan as {first}; it adds nothing or, if moved, a second layer."
-            )
+        what = "it adds nothing or, if moved, a second layer"
+        sentences += [f"{second} seems to be the same scan as {first}; {what}." for first, second in self.same]
         if self.cropped:
             sentences.append(f"Dropped {self.cropped:,} of {self.points:,} points outside of the region.")
         if self.side is not None:
-            inside = self.points - self.cropped
-            sentences.append(
-                f"Kept {self.kept:,} of {inside:,} points, the first one in each cube of side {self.side:.4g}."
-            )
+            kept = f"Kept {self.kept:,} of {self.points - self.cropped:,} points"
+            sentences.append(f"{kept}, the first one in each cube of side {self.side:.4g}.")
         return sentences
 
 
@@ -135,9 +131,5 @@ def _require_points(cloud: PointCloud, before: int) -> None:
 
 def _same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[str, str], ...]:
     """Return pairs of files that hold the same scan, each file at most once as the second one."""
-    found = []
-    for index, name in enumerate(files):
-        earlier = (other for other in range(index) if moments[other].same_as(moments[index]))
-        if (first := next(earlier, None)) is not None:
-            found.append((files[first], name))
-    return tuple(found)
+    firsts = [next(k for k in range(i + 1) if k == i or moments[k].same_as(moments[i])) for i in range(len(files))]
+    return tuple((files[first], files[i]) for i, first in enumerate(firsts) if first < i)

@@ -18,12 +18,8 @@ from gnrecon.runtime.errors import InputError
 def input_files(path: Path, format: str | None = None) -> list[Path]:
     """Return a scan's file and all existing files that it refers to, each once, also where they are not read.
 
-    A file that cannot be parsed refers to none; its reader reports what is wrong with it.
-
-    Parameters
-    ----------
-    path : the scan's file
-    format : extension that says how the file is read, such as ``"conf"``; by default its own
+    A file that cannot be parsed refers to none; its reader reports what is wrong with it. `format` is the extension
+    that says how the file is read, such as ``"conf"``; by default its own.
     """
     extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
     parsers = {".conf": _named_by_conf, ".gltf": _named_by_gltf, ".obj": _named_by_obj, ".ply": _named_by_ply}

@@ -56,9 +56,8 @@ def _scan(file: Any, header: Any) -> Contents:
     types = dict.fromkeys(position, "f8") | {name: kind for name, (_, kind) in others.items()}
     values = _read(file, header, types | {name: "i1" for name in states if name in fields})
     valid = np.ones(header.point_count, bool)
-    for name in states:
-        # In state 1, only the direction is known.
-        valid &= values.pop(name, np.zeros(len(valid), np.int8)) == 0
+    for name in fields.intersection(states):
+        valid &= values.pop(name) == 0  # in state 1, only the direction is known
     values = {name: column[valid] for name, column in values.items()}
     points = np.column_stack([values[name] for name in position])
     points = points if position is cartesian else convert_spherical_to_cartesian(points)
