@@ -24,7 +24,7 @@ def read_obj(path: Path) -> Contents:
     # A backslash at the end of a line continues it.
     text = re.sub(r"\\\r?\n", " ", read_text(path))
     # The keyword of each line, and the words that follow it.
-    lines = [(line.partition("#")[0].split(None, 1) + ["", ""])[:2] for line in text.splitlines()]
+    lines = [[*line.partition("#")[0].split(None, 1), "", ""][:2] for line in text.splitlines()]
     points, colors, lost = _vertices([rest for word, rest in lines if word == "v"])
     normals = parse_rows([rest for word, rest in lines if word == "vn"], "the 'vn' lines")
     if not len(points):

@@ -24,12 +24,8 @@ from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
 
-@dataclass
-class _Rows:
-    """Values of one element: scalar columns of shape (count,), lists as (lengths, concatenated values)."""
-
-    scalars: dict[str, Values]
-    lists: dict[str, tuple[Int, Int]]
+Rows = dict[str, Any]
+"""Values of one element by property: columns of shape (count,), and lists as pairs of lengths and all their values."""
 
 
 def read_ply(path: Path) -> Contents:
@@ -39,23 +35,21 @@ def read_ply(path: Path) -> Contents:
     numbers = data[start:]
     if not order:
         numbers = parse_numbers(numbers.decode("ascii", errors="replace").split()).tobytes()
-    rows, body = dict[str, _Rows](), _Body(numbers, order)
+    rows, body = dict[str, Rows](), _Body(numbers, order)
     for element in elements:
         rows[element.name] = body.next_rows(element)
         if {one.name for one in elements} & {"vertex", "face", "tristrips"} <= rows.keys():
             break  # what follows (range grids, edges, materials) is not used
     if "vertex" not in rows:
         raise InputError("the PLY header declares no vertex element.")
-    corners, strips = (_corners(rows[name]) if name in rows else None for name in ("face", "tristrips"))
-    faces = [] if corners is None else [fan_triangles(*corners)]
-    faces += [] if strips is None else [_strip_triangles(strips[1])]
-    contents = from_columns(rows["vertex"].scalars, np.concatenate(faces) if faces else None)
-    unread = _unread(elements) + (() if corners is None else polygon_remarks(corners[0]))
+    lists = (rows.get(name, {}) for name in ("face", "tristrips"))
+    corners, strips = (found.get("vertex_indices", found.get("vertex_index", ())) for found in lists)
+    faces = [fan_triangles(*corners)] if len(corners) == 2 else []
+    faces += [_strip_triangles(strips[1])] if len(strips) == 2 else []
+    columns = {name: values for name, values in rows["vertex"].items() if not isinstance(values, tuple)}
+    contents = from_columns(columns, np.concatenate(faces) if faces else None)
+    unread = _unread(elements) + (polygon_remarks(corners[0]) if faces and len(corners) == 2 else ())
     return replace(contents, unread=contents.unread + unread)
-
-
-def _corners(rows: _Rows) -> tuple[Int, Int] | None:
-    return rows.lists.get("vertex_indices", rows.lists.get("vertex_index"))
 
 
 def _strip_triangles(corners: Int) -> Int:
@@ -71,9 +65,8 @@ def _strip_triangles(corners: Int) -> Int:
 
 def _unread(elements: list[Element]) -> tuple[str, ...]:
     """Describe everything that the header declares and this reader drops."""
-    found = [
-        f"the element {one.name}" for one in elements if one.name not in ("vertex", "face", "tristrips") and one.count
-    ]
+    others = [one.name for one in elements if one.name not in ("vertex", "face", "tristrips") and one.count]
+    found = [f"the element {name}" for name in others]
     for element in elements:
         names = {prop.name for prop in element.properties if element.name == "face" or prop.count_type}
         if element.count and element.name in ("vertex", "face"):
@@ -91,13 +84,13 @@ class _Body:
         """The type of stored numbers, by the name of its type in numpy."""
         return np.dtype(self.order + name if self.order else "f8")
 
-    def next_rows(self, element: Element) -> _Rows:
+    def next_rows(self, element: Element) -> Rows:
         """The rows of an element, which begin at the current place."""
         if not element.count or not element.properties:
-            return _Rows({prop.name: np.empty(0, prop.type) for prop in element.properties}, {})
+            return {prop.name: np.empty(0, prop.type) for prop in element.properties if not prop.count_type}
         # Most files have lists of one length only, so that all rows take as many bytes as the first.
         step = int(self._starts(element, 1)[1]) - self.place
-        rows: _Rows | None = None
+        rows: Rows | None = None
         # Checked before reading, because a damaged header may declare any number of rows.
         if (end := self.place + step * element.count) <= len(self.data):
             rows = self._rows_at(np.arange(self.place, end + 1, step), element, step)
@@ -131,17 +124,17 @@ class _Body:
             starts.append(place)
         return np.array(starts, np.int64)
 
-    def _rows_at(self, starts: Int, element: Element, step: int | None = None) -> _Rows | None:
+    def _rows_at(self, starts: Int, element: Element, step: int | None = None) -> Rows | None:
         """The rows between these offsets, of shape (count + 1,); None where a row does not end at the next offset.
 
         Offsets of one `step` are a slice, which is read several times faster.
         """
-        found, place = _Rows({}, {}), starts[:-1].copy()
+        found, place = Rows(), starts[:-1].copy()
         for prop in element.properties:
             size = self.kind(prop.type).itemsize
             where = place if step is None else slice(place[0], place[-1] + 1, step)
             if not prop.count_type:
-                found.scalars[prop.name] = self._native(self._view(prop.type)[where], prop)
+                found[prop.name] = self._native(self._view(prop.type)[where], prop)
                 place += size
                 continue
             lengths = _indices(self._view(prop.count_type)[where])
@@ -151,8 +144,8 @@ class _Body:
                 return None
             firsts = place - (np.cumsum(lengths) - lengths) * size
             items = np.repeat(firsts, lengths) + size * np.arange(lengths.sum())
-            found.lists[prop.name] = lengths, _indices(self._view(prop.type)[items])
-            place = after
+            found[prop.name] = lengths, _indices(self._view(prop.type)[items])
+            place, step = after, step if (lengths == lengths[0]).all() else None
         return found if (place == starts[1:]).all() else None
 
     def _view(self, name: str) -> Values:

@@ -102,9 +102,9 @@ class _VtkLegacy:
         match name:
             case "DATASET":
                 self.kind = "".join(words[1:2]).upper()
-                known = ("POLYDATA", "UNSTRUCTURED_GRID", "STRUCTURED_GRID", "STRUCTURED_POINTS", "RECTILINEAR_GRID")
-                if self.kind not in known:
-                    raise InputError(f"the data set is {self.kind or 'unnamed'}, but {', '.join(known)} are read.")
+                known = "POLYDATA, UNSTRUCTURED_GRID, STRUCTURED_GRID, STRUCTURED_POINTS, RECTILINEAR_GRID"
+                if self.kind not in known.split(", "):
+                    raise InputError(f"the data set is {self.kind or 'unnamed'}, but {known} are read.")
             case "DIMENSIONS" | "ORIGIN" | "SPACING" | "ASPECT_RATIO":
                 self.held[name] = parse_numbers(words[1:4])
             case "X_COORDINATES" | "Y_COORDINATES" | "Z_COORDINATES":

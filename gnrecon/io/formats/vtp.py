@@ -50,10 +50,7 @@ def read_vtp(path: Path) -> Contents:
 
 def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     """Return the XML without the appended block, and how arrays are read."""
-    decompressors: dict[str, Callable[[bytes], bytes]] = {
-        "vtkZLibDataCompressor": zlib.decompress,
-        "vtkLZMADataCompressor": lzma.decompress,
-    }
+    decompressors = {"vtkZLibDataCompressor": zlib.decompress, "vtkLZMADataCompressor": lzma.decompress}
     xml, _, rest = data.partition(b"<AppendedData")
     tag, _, block = rest.partition(b">")
     # Raw bytes are not XML, so the tree ends before them.
@@ -132,24 +129,23 @@ def _bytes(array: ElementTree.Element, form: str, file: _VtkXml) -> bytes:
         start, end = (-(-count // 3) * 4 for count in (after, size))
         return binascii.a2b_base64(block[start : start + end])[:size]
 
-    count = _require_plausible(_header(first(width), file, 1)[0], block)
+    def header(size: int) -> list[int]:
+        data = first(size * width)
+        if len(data) < size * width:
+            raise InputError("the file ends within the header of an array.")
+        found: list[int] = np.frombuffer(data, file.header, size).tolist()
+        return found
+
+    count = _require_plausible(header(1)[0], block)
     if file.decompress is None:
         data = first(width + count)[width:]
         if len(data) < count:
             raise InputError(f"an array declares {count} bytes, but {len(data)} follow.")
         return data
     # The number of blocks, the size of one, that of the last one, and what each takes when it is compressed.
-    length = (3 + count) * width
-    ends = np.cumsum([0, *_header(first(length), file, 3 + count)[3:]], dtype=np.int64).tolist()
-    packed = first(_require_plausible(ends[-1], block), length)
+    ends = np.cumsum([0, *header(3 + count)[3:]], dtype=np.int64).tolist()
+    packed = first(_require_plausible(ends[-1], block), (3 + count) * width)
     return b"".join(file.decompress(packed[start:end]) for start, end in itertools.pairwise(ends))
-
-
-def _header(data: bytes, file: _VtkXml, count: int) -> list[int]:
-    if len(data) < count * file.header.itemsize:
-        raise InputError("the file ends within the header of an array.")
-    found: list[int] = np.frombuffer(data, file.header, count).tolist()
-    return found
 
 
 def _require_plausible(count: int, data: bytes) -> int:
