@@ -113,14 +113,9 @@ def decoded_normals(
     """Return normals, of shape (N, 3), as float64, and what could not be read of them.
 
     Integers of 8 or 16 bits hold shares of the largest one: signed, or with the middle of the range for zero. So do
-    whole numbers in text. The encoding is that in which at least a share of the non-zero rows has unit
-    length; normals that have it in none are kept where they are signed, because their directions are right.
-
-    Parameters
-    ----------
-    stored : array of shape (N, 3)
-    least_share : of the rows, which must have unit length
-    tolerance : of the length; bytes round to one hundredth
+    whole numbers in text. The encoding is that in which at least a share of the non-zero rows has unit length, within
+    a tolerance, as bytes round to one hundredth; normals that have it in none are kept where they are signed, because
+    their directions are right.
     """
     values = stored.astype(np.float64)
     whole = stored.dtype.kind in "iu" or bool(np.isfinite(values).all() and (values == np.rint(values)).all())
@@ -128,11 +123,9 @@ def decoded_normals(
     if not len(rows):
         return values, ()
     signed = bool((rows < 0).any()) or stored.dtype.kind == "i"
-    tops = (
-        [255 >> signed, 65535 >> signed] if stored.dtype.kind == "f" else [(256**stored.dtype.itemsize - 1) >> signed]
-    )
+    sizes = (1, 2) if stored.dtype.kind == "f" else (stored.dtype.itemsize,)
     scales = [(1.0, 0.0)]
-    for top in tops:
+    for top in ((256**size - 1) >> signed for size in sizes):
         # Zero is the middle of the range, or the whole number above it.
         scales += [(top, 0.0)] if signed else [(top / 2, 1.0), ((top - 1) / 2, (top + 1) / (top - 1))]
     for scale, middle in scales:
@@ -210,11 +203,8 @@ def fan_triangles(counts: Int, corners: Int, strips: bool = False) -> Int:
 def polygon_remarks(counts: Int) -> tuple[str, ...]:
     """Return sentences on what `fan_triangles` changes in polygons of so many corners, an array of shape (P,)."""
     larger, smaller = int((counts > 3).sum()), int((counts < 3).sum())
-    sentences = (
-        (larger, f"{larger} polygons of more than three corners as such (they are cut into triangles)"),
-        (smaller, f"{smaller} polygons of less than three corners"),
-    )
-    return tuple(sentence for count, sentence in sentences if count)
+    cut = (f"{larger} polygons of more than three corners as such (they are cut into triangles)",) if larger else ()
+    return (*cut, *((f"{smaller} polygons of less than three corners",) if smaller else ()))
 
 
 def guard_parser(kind: str) -> AbstractContextManager[None]:

@@ -159,21 +159,14 @@ def _read_with_plugin(plugin: Plugin, read: Callable[[Path], Any], path: Path) -
             shape = as_shape(found)
         except InputError as error:
             raise InputError(f"{plugin} returned something that is not a cloud: {error}") from error
-        attributes = {name: _column(plugin, name, values) for name, values in shape.attributes.items()}
+        attributes = {name: np.asarray(values) for name, values in shape.attributes.items()}
+        for name, column in attributes.items():
+            if column.dtype.kind not in "biuf" or column.ndim > 2:
+                found = f"the attribute {name!r} of type {column.dtype} and shape {column.shape}"
+                raise InputError(f"{plugin} returned {found}, but numbers of shape (N,) or (N, C) were expected.")
         if isinstance(shape, Mesh):
             return Contents(shape.vertices, shape.normals, shape.faces, attributes)
         return Contents(shape.points, shape.normals, attributes=attributes, origins=shape.origins)
-
-
-def _column(plugin: Plugin, name: str, values: Any) -> Values:
-    """The values of an attribute as an array of numbers, of shape (N,) or (N, C)."""
-    column = np.asarray(values)
-    if column.dtype.kind not in "biuf" or column.ndim > 2:
-        raise InputError(
-            f"{plugin} returned the attribute {name!r} of type {column.dtype} and shape {column.shape}, but numbers of "
-            f"shape (N,) or (N, C) were expected."
-        )
-    return column
 
 
 def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh: Mesh, path: Path) -> None:

@@ -77,13 +77,7 @@ def as_mesh(obj: Any) -> Mesh:
 
 
 def as_shape(obj: Any) -> Mesh | PointCloud:
-    """Return a mesh where an object has faces, else a cloud; paths are not read, as plugins' results come here.
-
-    Raises
-    ------
-    InputError
-        As `as_cloud` does.
-    """
+    """Return a mesh where an object has faces, else a cloud; paths are not read, as plugins' results come here."""
     if (found := _from_library(obj)) is not None:
         return found
     if names := _names(obj):

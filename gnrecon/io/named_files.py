@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
@@ -22,7 +22,12 @@ def input_files(path: Path, format: str | None = None) -> list[Path]:
     that says how the file is read, such as ``"conf"``; by default its own.
     """
     extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
-    parsers = {".conf": _named_by_conf, ".gltf": _named_by_gltf, ".obj": _named_by_obj, ".ply": _named_by_ply}
+    parsers: dict[str, Callable[[Path], Iterable[str]]] = {
+        ".conf": lambda scan: [pose.file for pose in parse_conf(read_text(scan))],
+        ".gltf": _named_by_gltf,
+        ".obj": _named_by_obj,
+        ".ply": lambda scan: _words_after(scan, rb"comment[ \t]+TextureFile"),
+    }
     found = [path]
     if extension not in parsers:
         return found
@@ -40,10 +45,6 @@ def all_input_files(paths: Iterable[Path], format: str | None = None) -> list[Pa
     return [file for path in paths for file in input_files(path, format)]
 
 
-def _named_by_conf(path: Path) -> list[str]:
-    return [pose.file for pose in parse_conf(read_text(path))]
-
-
 def _named_by_gltf(path: Path) -> Iterator[str]:
     document = json.loads(path.read_bytes())
     for entry in [*document.get("buffers", []), *document.get("images", [])]:
@@ -58,10 +59,6 @@ def _named_by_obj(path: Path) -> Iterator[str]:
         yield material
         if (path.parent / material).is_file():
             yield from _words_after(path.parent / material, rb"(?:map_\w+|bump|disp|decal|refl|norm)")
-
-
-def _named_by_ply(path: Path) -> list[str]:
-    return _words_after(path, rb"comment[ \t]+TextureFile")
 
 
 def _words_after(path: Path, keyword: bytes, *, head_bytes: int = 1_000_000) -> list[str]:

@@ -1,14 +1,23 @@
 """Reads a file as a cloud, as a mesh, or as whichever it holds; every malformed file gives one `InputError`.
 
-The source may be a file, a gzip-compressed file, or standard input, see `gnrecon.io.unpacking`.
+The source may be a file, a gzip-compressed file, or standard input. Readers seek, compare sizes and pass names to
+libraries, so what is no plain file is copied into one first. Where the system allows, the copy has no name: it is read
+by its number among the process's open files, and its space is free again as soon as the process has ended, also when it
+was killed. Formats that name files next to them, and readers of plugins, get a file with a name in a temporary folder.
 """
 
 from __future__ import annotations
 
+import gzip
 import logging
+import shutil
+import sys
+import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -16,7 +25,6 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import Contents
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
-from gnrecon.io.unpacking import uncompressed_file
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import is_standard_input
 
@@ -91,9 +99,8 @@ def opened(path: Path, format: str | None) -> Iterator[tuple[Path, str]]:
     The arguments are those of `read_cloud`, and so are the errors, into which every failure in the block is turned.
     """
     if format is None and is_standard_input(path):
-        raise UsageError(
-            f"Standard input has no extension: say with --format how to read it, as one of {_supported()}."
-        )
+        how = f"say with --format how to read it, as one of {_supported()}"
+        raise UsageError(f"Standard input has no extension: {how}.")
     extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
     if format is not None and not is_readable(extension):
         raise UsageError(f"The format {format!r} is not supported; expected one of {_supported()}.")
@@ -142,9 +149,8 @@ def _check_file(path: Path, extension: str) -> None:
     if not is_readable(extension):
         if extension == ".gnr":
             raise InputError("this is a fitted field, not a scan or a mesh: gnrecon mesh MODEL -o MESH meshes it.")
-        raise InputError(
-            f"the extension {extension!r} is not supported; expected one of {_supported()} (see --format)."
-        )
+        known = f"expected one of {_supported()} (see --format)"
+        raise InputError(f"the extension {extension!r} is not supported; {known}.")
     if extension not in READERS:
         return  # the signatures of plugin formats are unknown
     kind = next((kind for kind, signatures in SIGNATURES.items() if head.startswith(signatures)), extension)
@@ -159,3 +165,82 @@ def _check_file(path: Path, extension: str) -> None:
 def extension_of(path: Path) -> str:
     """Return the extension that says how a file is read, in lower case; ``.gz`` is skipped."""
     return Path(path.stem if path.suffix.lower() == ".gz" else path.name).suffix.lower()
+
+
+@contextmanager
+def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
+    """Yield a plain file with the data to read: the file itself, or a temporary copy of compressed data or a stream.
+
+    The extension, with its dot, says how it is to be read; a copy with a name has it. Damaged data, and more than a
+    scan can hold or the disk takes, ends in an `InputError`, and a terminal as standard input in a `UsageError`.
+    """
+    if not is_standard_input(path) and not _is_compressed(path):
+        yield path
+        return
+    with _temporary(f"stream{extension}", extension) as stream, _temporary(f"unpacked{extension}", extension) as target:
+        source = path
+        if is_standard_input(path):
+            if sys.stdin.isatty():
+                example = "gnrecon - --format xyz < scan.xyz"
+                raise UsageError(f"Standard input is a terminal; send it a file, as in: {example}")
+            _copy(sys.stdin.buffer, stream, None)
+            source = stream
+        if not _is_compressed(source):
+            yield source
+            return
+        try:
+            with gzip.open(source) as unpacking:
+                _copy(unpacking, target, source.stat().st_size)
+        except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+            raise InputError(f"the compressed data is damaged ({error}).") from None
+        yield target
+
+
+@contextmanager
+def _temporary(name: str, extension: str, *, open_files: Path = Path("/proc/self/fd")) -> Iterator[Path]:
+    """Yield the path of an empty temporary file, without a name where that is possible."""
+    if extension in READERS and extension not in (".gltf", ".conf") and open_files.is_dir():
+        with tempfile.TemporaryFile(prefix="gnrecon-") as file:
+            yield open_files / str(file.fileno())
+        return
+    with tempfile.TemporaryDirectory(prefix="gnrecon-") as folder:
+        yield Path(folder) / name
+
+
+def _is_compressed(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"  # the magic number of gzip
+
+
+def _copy(
+    source: BinaryIO | gzip.GzipFile,
+    target: Path,
+    packed_bytes: int | None,
+    *,
+    most_disk_share: float = 0.9,
+    most_ratio: float = 200.0,
+    least_suspect_bytes: int = 100_000_000,
+    chunk_bytes: int = 1 << 20,
+) -> None:
+    """Copy a stream into a file, by chunks.
+
+    Parameters
+    ----------
+    packed_bytes : size of the compressed data, None of other data
+    most_disk_share : of the free space that the copy may take, so that other programs have some left
+    most_ratio, least_suspect_bytes : larger copies of data that was compressed more than this are refused; gzip reaches
+        1,000 with bytes that are all the same, and scans 3 to 20
+    """
+    folder = tempfile.gettempdir()
+    most, copied = int(most_disk_share * shutil.disk_usage(folder).free), 0
+    too_much = f"it takes more than {most / 1e9:,.1f} GB, {100 * most_disk_share:.0f} % of what is free in {folder}, "
+    with target.open("wb") as file:
+        while chunk := source.read(chunk_bytes):
+            copied += len(chunk)
+            if copied > most:
+                raise InputError(f"unpacked, {too_much}where it is unpacked; TMPDIR names another folder.")
+            if packed_bytes is not None and copied > max(least_suspect_bytes, most_ratio * packed_bytes):
+                raise InputError(f"it unpacks to more than {most_ratio:.0f} times its size, as no scan does.")
+            file.write(chunk)

@@ -12,7 +12,7 @@ from scan_writers import file_of, random_cloud
 
 import gnrecon.io
 from gnrecon.io import IOParameters, read_scans
-from gnrecon.io.streaming import read_chunks
+from gnrecon.io.merge import read_chunks
 from gnrecon.options import Options
 
 

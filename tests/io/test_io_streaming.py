@@ -14,7 +14,7 @@ from gnrecon.io import IOParameters, read_cloud, read_scans
 from gnrecon.io.contents import Contents
 from gnrecon.io.format_registry import CHUNK_READERS
 from gnrecon.io.formats.stanford_conf import parse_conf
-from gnrecon.io.streaming import VoxelThinning
+from gnrecon.io.merge import VoxelThinning
 from gnrecon.runtime.errors import InputError
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"

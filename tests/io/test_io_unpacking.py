@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gnrecon.io import read_cloud, unpacking
+from gnrecon.io import read, read_cloud
 from gnrecon.runtime.errors import InputError
 
 
@@ -35,14 +35,14 @@ def test_what_no_scan_is_like_is_refused(tmp_path: Path) -> None:
     bomb = tmp_path / "bomb.gz"
     bomb.write_bytes(gzip.compress(bytes(1_000_000)))
     with gzip.open(bomb) as source, pytest.raises(InputError, match="more than 200 times its size"):
-        unpacking._copy(source, tmp_path / "copy", bomb.stat().st_size, least_suspect_bytes=100_000)
+        read._copy(source, tmp_path / "copy", bomb.stat().st_size, least_suspect_bytes=100_000)
 
 
 def test_a_full_disk_is_named(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(unpacking, "_copy", full)
+    monkeypatch.setattr(read, "_copy", full)
     with pytest.raises(InputError, match=r"scan.xyz.gz: the file cannot be read: No space left on device"):
         read_cloud(packed)
 
@@ -52,7 +52,7 @@ def test_nothing_is_left_after_a_kill(packed: Path, tmp_path: Path) -> None:
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     script = (
-        "import os, signal; from pathlib import Path; from gnrecon.io.unpacking import uncompressed_file\n"
+        "import os, signal; from pathlib import Path; from gnrecon.io.read import uncompressed_file\n"
         f"with uncompressed_file(Path({str(packed)!r}), '.xyz') as file:\n"
         "    print(len(file.read_text().splitlines()), flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)"
@@ -67,6 +67,6 @@ def test_nothing_is_left_after_a_kill(packed: Path, tmp_path: Path) -> None:
 def test_formats_that_name_their_siblings_have_a_folder(tmp_path: Path) -> None:
     path = tmp_path / "scan.gltf.gz"
     path.write_bytes(gzip.compress(b"{}"))
-    with unpacking.uncompressed_file(path, ".gltf") as file:
+    with read.uncompressed_file(path, ".gltf") as file:
         assert (file.name, file.read_bytes()) == ("unpacked.gltf", b"{}")
     assert not file.parent.exists()

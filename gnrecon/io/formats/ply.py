@@ -23,7 +23,6 @@ from gnrecon.io.contents import Contents, fan_triangles, from_columns, polygon_r
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
-
 Rows = dict[str, Any]
 """Values of one element by property: columns of shape (count,), and lists as pairs of lengths and all their values."""
 
@@ -306,10 +305,12 @@ def ply_chunks(path: Path, rows: int, *, header_bytes: int = 1 << 16) -> Iterato
     with path.open("rb") as file:
         head = file.read(header_bytes)
         order, elements, start = parse_header(head if b"end_header" in head else head + file.read())
-        if not order or not _is_cloud(elements):
+        vertex = elements[0] if elements else Element("", 0)
+        names = {prop.name for prop in vertex.properties if not prop.count_type}
+        meshed = any(element.name in ("face", "tristrips") and element.count for element in elements)
+        if not order or vertex.name != "vertex" or len(names) < len(vertex.properties) or meshed:
             yield read_ply(path)
             return
-        vertex = elements[0]
         layout = np.dtype([(prop.name, order + prop.type) for prop in vertex.properties])
         held = (path.stat().st_size - start) // max(layout.itemsize, 1)
         if held < vertex.count:
@@ -318,12 +319,3 @@ def ply_chunks(path: Path, rows: int, *, header_bytes: int = 1 << 16) -> Iterato
         for first in range(0, vertex.count, rows):
             table = np.fromfile(file, layout, min(rows, vertex.count - first))
             yield from_columns({p.name: table[p.name].astype(p.type) for p in vertex.properties})
-
-
-def _is_cloud(elements: list[Element]) -> bool:
-    """Whether the vertices come first and have no lists, and no face follows."""
-    first = elements[0] if elements else Element("", 0)
-    names = [prop.name for prop in first.properties]
-    plain = all(prop.count_type is None for prop in first.properties) and len(set(names)) == len(names)
-    faces = any(element.name in ("face", "tristrips") and element.count for element in elements)
-    return first.name == "vertex" and plain and not faces

@@ -144,8 +144,8 @@ class _VtkLegacy:
 
     def _read_cells(self, name: str, rows: int, size: int) -> None:
         """Read polygons with interleaved counts or, since version 5, with separate offsets."""
-        if offset_words := self.words_of("OFFSETS"):
-            offsets = self.numbers(rows, _word(offset_words, 1)).astype(np.int64)
+        if words := self.words_of("OFFSETS"):
+            offsets = self.numbers(rows, _word(words, 1)).astype(np.int64)
             if not (words := self.words_of("CONNECTIVITY")):
                 raise InputError("expected the line CONNECTIVITY after the offsets.")
             corners: Int = self.numbers(size, _word(words, 1)).astype(np.int64)
@@ -178,8 +178,7 @@ class _VtkLegacy:
 
 
 def _count(words: list[str], place: int) -> int:
-    text = _word(words, place)
-    if not text.isdecimal():
+    if not (text := _word(words, place)).isdecimal():
         raise InputError(f"the line {' '.join(words)[:60]!r} holds {text[:20]!r} where a count was expected.")
     return int(text)
 
@@ -194,7 +193,7 @@ def _lattice(file: _VtkLegacy) -> Float:
     """The points of a regular or rectilinear grid, of shape (N, 3); x varies fastest."""
     held, regular = file.held, file.kind == "STRUCTURED_POINTS"
     axes = [held.get(axis, np.zeros(0)) for axis in "XYZ"]
-    shape = held.get("DIMENSIONS", np.zeros(0)) if regular else np.array([float(len(axis)) for axis in axes])
+    shape = held.get("DIMENSIONS", np.zeros(0)) if regular else np.array(list(map(len, axes)), np.float64)
     size = float(np.prod(shape))
     # A few bytes may declare any number of points.
     if len(shape) != 3 or not (shape >= 1).all() or size != file.rows or not file.arrays:
