@@ -98,7 +98,7 @@ def read_scans(
     most : points to keep, at least 1; by default ``parameters.most_points``
     region : where points are kept, in the common frame; by default everywhere
     columns : names of the columns of tables, with ``-`` for those to skip; by default, they are found out
-    parameters : when files are read by chunks, and how large these are
+    parameters : how many points are kept and read at a time
 
     Raises
     ------
@@ -234,18 +234,17 @@ def _selected(contents: Contents, rows: Int) -> Contents:
 def read_chunks(
     path: Path, extension: str, columns: Sequence[str] = (), *, parameters: IOParameters = IOParameters()
 ) -> Iterator[Contents]:
-    """Yield the contents of a file by chunks; small files, and formats that must be read as a whole, in one.
+    """Yield the contents of a file by chunks; those of formats that must be read as a whole in one.
 
     `UsageError` is raised when columns are named of a file that is no table.
     """
-    by_chunks = CHUNK_READERS.get(extension)
     if columns and extension in (".npy", ".npz"):
         yield read_npy(path, columns)
     elif columns and extension not in TABLE_SUFFIXES:
         raise UsageError(f"--columns names the columns of tables, but {extension[1:].upper()} files are none.")
     elif columns:
         yield from table_chunks(path, parameters.chunk_points, columns)
-    elif by_chunks is not None and path.stat().st_size >= parameters.chunked_file_bytes:
-        yield from by_chunks(path, parameters.chunk_points)
+    elif extension in CHUNK_READERS:
+        yield from CHUNK_READERS[extension](path, parameters.chunk_points)
     elif read := reader_of(extension):
         yield read(path)

@@ -57,11 +57,6 @@ def format_rows(template: str, rows: Values, *, block_rows: int = 100_000) -> li
     return blocks
 
 
-def content_lines(text: str, comment: str = "#") -> list[str]:
-    """Return the lines that are neither blank nor comments, without trailing comments."""
-    return [line for row in text.splitlines() if (line := row.partition(comment)[0].strip())]
-
-
 def sibling_path(folder: Path, name: str, what: str) -> Path:
     """Return the path of a file named by another in `folder`; `what` describes it in messages.
 

@@ -44,7 +44,7 @@ def write_mesh(
     OutputError
         When the file cannot be written.
     """
-    extension, write = _writer(path)
+    extension = check_writable(path)
     if not len(mesh.faces):
         raise MeshError("The mesh has no faces, so there is nothing to write.")
     if not np.isfinite(mesh.vertices).all():
@@ -52,6 +52,8 @@ def write_mesh(
     # Most formats and readers store indices as signed 32-bit integers.
     if len(mesh.vertices) >= 2**31:
         raise MeshError(f"The mesh has {len(mesh.vertices)} vertices, more than 32-bit indices allow.")
+    write = writer_of(extension)
+    assert write is not None, "other extensions are refused"
     held = {name: values for name, values in mesh.attributes.items() if supports_attribute(path, name, values)}
     visible = IOParameters.visible_rounding_diagonals
     stored = rounding_remark(mesh, visible_diagonals=visible) if extension == ".stl" else []
@@ -113,7 +115,10 @@ def check_writable(path: str | Path) -> str:
     UsageError
         When the extension is not supported, or its plugin cannot be loaded.
     """
-    return _writer(path)[0]
+    extension = Path(path).suffix.lower()
+    if writer_of(extension) is None:
+        raise _unknown("A mesh", extension, writable())
+    return extension
 
 
 def unverified_remark(path: str | Path) -> list[str]:
@@ -122,14 +127,6 @@ def unverified_remark(path: str | Path) -> list[str]:
     if is_readable(extension):
         return []
     return [f"{path} was not read back and verified, because no installed package reads {extension[1:].upper()}."]
-
-
-def _writer(path: str | Path) -> tuple[str, Callable[[Mesh, Path], None]]:
-    """The extension of `path` and its writer; the errors are those of `check_writable`."""
-    extension = Path(path).suffix.lower()
-    if (write := writer_of(extension)) is None:
-        raise _unknown("A mesh", extension, writable())
-    return extension, write
 
 
 def _unknown(what: str, extension: str, known: Iterable[str]) -> UsageError:

@@ -51,7 +51,8 @@ def las_chunks(path: Path, rows: int, *, most_chunk_bytes: int = 1 << 28) -> Ite
         rows = max(1, min(rows, most_chunk_bytes // max(reader.header.point_format.size, 1)))
         for chunk in reader.chunk_iterator(rows):
             left -= len(chunk)
-            yield _contents(chunk)
+            found = _contents(chunk)
+            yield drop_unused_attributes(found) if len(chunk) == reader.header.point_count else found
         if left:
             raise InputError(f"the header declares {reader.header.point_count} points, but {left} of them are missing.")
 

@@ -11,13 +11,13 @@ from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, fan_triangles, no_faces, polygon_remarks
-from gnrecon.io.parse import content_lines, format_rows, parse_numbers, parse_rows, read_text
+from gnrecon.io.parse import format_rows, parse_numbers, parse_rows, read_text
 from gnrecon.runtime.errors import InputError
 
 
 def read_off(path: Path) -> Contents:
     """Read vertices, the normals and colours that NOFF and COFF add, and faces."""
-    lines = content_lines(read_text(path))
+    lines = [line for row in read_text(path).splitlines() if (line := row.partition("#")[0].strip())]
     keyword = re.match(r"(ST)?(C)?(N)?OFF\b", lines[0], re.IGNORECASE) if lines else None
     if keyword is None or "BINARY" in lines[0].upper():
         raise InputError("expected a text file that begins with the word OFF.")

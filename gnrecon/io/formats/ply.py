@@ -318,4 +318,5 @@ def ply_chunks(path: Path, rows: int, *, header_bytes: int = 1 << 16) -> Iterato
         file.seek(start)
         for first in range(0, vertex.count, rows):
             table = np.fromfile(file, layout, min(rows, vertex.count - first))
-            yield from_columns({p.name: table[p.name].astype(p.type) for p in vertex.properties})
+            found = from_columns({p.name: table[p.name].astype(p.type) for p in vertex.properties})
+            yield replace(found, unread=found.unread + _unread(elements))
