@@ -170,9 +170,8 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
 def without_opaque_alpha(attributes: Columns) -> Columns:
     """Return attributes whose ``colors``, bytes of shape (N, 4), have no alpha where all are opaque."""
     colors = attributes.get("colors")
-    if colors is None or (as_bytes(colors)[:, 3:] < 255).any():
-        return attributes
-    return {**attributes, "colors": colors[:, :3]}
+    opaque = colors is not None and (as_bytes(colors)[:, 3:] == 255).all()
+    return {**attributes, "colors": colors[:, :3]} if colors is not None and opaque else attributes
 
 
 def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:

@@ -62,10 +62,8 @@ def as_mesh(obj: Any) -> Mesh:
     InputError
         When `obj` is none of these, has no faces, or shapes do not fit.
     """
-    expected = (
-        "a mesh of open3d, trimesh, pymeshlab, pyvista or meshio, its file, or a pair of vertices, of shape (V, 3), "
-        "and faces, of shape (F, 3)"
-    )
+    pair = "a pair of vertices, of shape (V, 3), and faces, of shape (F, 3)"
+    expected = f"a mesh of open3d, trimesh, pymeshlab, pyvista or meshio, its file, or {pair}"
     found = _from_file(obj, "read_mesh") if isinstance(obj, str | Path) else _from_library(obj)
     if found is None and isinstance(obj, tuple | list) and len(obj) == 2:
         vertices, faces = (_array(part, expected) for part in obj)
@@ -231,14 +229,10 @@ def _column(values: Any) -> npt.NDArray[Any]:
     return column
 
 
-def _array(
-    obj: Any,
-    expected: str = (
-        "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, a file's path, or a cloud of "
-        "open3d, trimesh, pymeshlab, pyvista or meshio"
-    ),
-) -> Float:
-    """An array of float64; `expected` is what the message on anything else asks for."""
+def _array(obj: Any, expected: str = "") -> Float:
+    """An array of float64; `expected` is what the message on anything else asks for, by default points."""
+    points = "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, a file's path"
+    expected = expected or f"{points}, or a cloud of open3d, trimesh, pymeshlab, pyvista or meshio"
     if hasattr(obj, "detach"):  # a torch tensor, on any device
         obj = obj.detach().cpu().numpy()
     try:
@@ -326,13 +320,11 @@ def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
     if values is not None:
         given["v_scalar_array"] = values.astype(np.float64)
     made = pymeshlab.Mesh(points, faces.astype(np.int32), **given)
-    for name, column in shape.attributes.items():
-        if name in ("colors", "quality") or column.dtype.kind not in "biuf":
-            continue
-        if column.ndim == 1:
-            made.add_vertex_custom_scalar_attribute(column.astype(np.float64), name)
-        elif column.shape[1] == 3:
-            made.add_vertex_custom_point_attribute(column.astype(np.float64), name)
+    others = {name: column for name, column in shape.attributes.items() if name not in ("colors", "quality")}
+    for name, column in others.items():
+        if column.dtype.kind in "biuf" and column.shape[1:] in ((), (3,)):
+            add = made.add_vertex_custom_point_attribute if column.ndim > 1 else made.add_vertex_custom_scalar_attribute
+            add(column.astype(np.float64), name)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(made)
     return meshes

@@ -1,6 +1,6 @@
 """Reads one or several scans into one cloud in common coordinates, in bounded memory, and reports what was read.
 
-Large files are read by chunks. Beyond a number of points, only the first point in each occupied voxel of a grid is kept
+Beyond a number of points, only the first point in each occupied voxel of a grid is kept
 (`VoxelThinning`). Voxels start so small that they hardly ever hold two points. Whenever too many are occupied, their
 side is doubled: eight voxels become one, whose first point is the first of all eight. The result therefore depends on
 the final side only, not on how the scan was cut into chunks or when the side was doubled. The kept points are measured
@@ -87,15 +87,14 @@ def read_scans(
 ) -> tuple[PointCloud, Reading]:
     """Read the points of all files into one cloud, in the files' own units, and report what was read.
 
-    If there are more than `most` points, only the first one in each of about as many equal cubes is kept. Large files
-    are read by chunks where the format allows it, so that memory use does not grow with them. Normals and attributes
-    are kept where all files have them; a mesh without normals gives those of its faces.
+    Files are read by chunks where the format allows it, so that memory use does not grow with them. Normals and
+    attributes are kept where all files have them; a mesh without normals gives those of its faces.
 
     Parameters
     ----------
     paths : files whose coordinates are in a common frame, directly or by the poses that they hold
     format : extension that says how all of them are read; by default each file's own
-    most : points to keep, at least 1; by default ``parameters.most_points``
+    most : points to keep, by default those of the parameters; of more, the first in each of about as many equal cubes
     region : where points are kept, in the common frame; by default everywhere
     columns : names of the columns of tables, with ``-`` for those to skip; by default, they are found out
     parameters : how many points are kept and read at a time

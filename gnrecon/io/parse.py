@@ -71,12 +71,8 @@ def sibling_path(folder: Path, name: str, what: str) -> Path:
 def require_buildable(instances: int, numbers: int, stored: int, most_instances: int) -> None:
     """Refuse a scene that uses what it stores so often that it takes minutes or all memory to build.
 
-    Parameters
-    ----------
-    instances : objects that the scene builds
-    numbers : coordinates, indices and attributes' values of all of them
-    stored : how many of them the file itself can hold
-    most_instances : that are built within a minute
+    It builds so many instances of objects, of which `most_instances` take a minute, with so many coordinates, indices
+    and attributes' values, of which the file itself can hold `stored`.
     """
     if instances > most_instances or numbers > max(IOParameters.most_built_numbers, stored):
         raise InputError(f"the scene builds {instances:,} objects with {numbers:,} numbers, more than can be read.")

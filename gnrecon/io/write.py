@@ -76,15 +76,7 @@ def write_cloud(
     Parameters
     ----------
     cloud : in file units
-    path : file to write; its extension gives the format
-    overwrite, verify : as for `write_mesh`
-
-    Raises
-    ------
-    UsageError
-        When a cloud cannot be written with that extension.
-    OutputError
-        When the file cannot be written.
+    path, overwrite, verify : as for `write_mesh`, and so are the errors
     """
     extension = Path(path).suffix.lower()
     if extension not in CLOUD_WRITERS:
@@ -108,13 +100,7 @@ def written_origin(mesh: Mesh, path: str | Path) -> Float | None:
 
 
 def check_writable(path: str | Path) -> str:
-    """Return the extension of `path` if meshes can be written in that format.
-
-    Raises
-    ------
-    UsageError
-        When the extension is not supported, or its plugin cannot be loaded.
-    """
+    """Return the extension of `path` if meshes can be written in that format; raise `UsageError` otherwise."""
     extension = Path(path).suffix.lower()
     if writer_of(extension) is None:
         raise _unknown("A mesh", extension, writable())

@@ -69,7 +69,9 @@ def read_gltf(path: Path) -> Contents:
         _prepare(tree, len(data) + sum(map(len, buffers.values())))
         file = trimesh.util.wrap_as_stream(json.dumps(tree))
         scene = trimesh.load_scene(file, file_type="gltf", resolver=buffers, process=False, skip_materials=True)
-        return _collected(scene, _unread(text))
+        names = {"TEXCOORD_0": "texture coordinates"} | {name: name for name in ("textures", "animations", "skins")}
+        unread = tuple(name for word, name in names.items() if f'"{word}"'.encode() in text)
+        return _collected(scene, unread)
 
 
 def _buffer(uri: str, folder: Path) -> bytes:
@@ -101,12 +103,6 @@ def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
     given = found.normals if found.normals is not None and found.normals.any() else None
     held = without_opaque_alpha(found.attributes)
     return replace(found, normals=given, attributes=held, unread=unread + found.unread)
-
-
-def _unread(text: bytes) -> tuple[str, ...]:
-    """Describe what else the file's JSON declares."""
-    names = {"TEXCOORD_0": "texture coordinates"} | {name: name for name in ("textures", "animations", "skins")}
-    return tuple(name for word, name in names.items() if f'"{word}"'.encode() in text)
 
 
 def _prepare(tree: dict[str, Any], size: int) -> None:

@@ -26,17 +26,8 @@ def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
     with guard_parser("NPY or NPZ"):
         arrays = _arrays(path)
     found = {name.lower(): name for name in arrays}
-    usual = (
-        "points",
-        "xyz",
-        "positions",
-        "coords",
-        "vertices",
-        "pc",
-        "pos",
-        "data",
-        *(found if len(found) == 1 else ()),
-    )
+    usual = ["points", "xyz", "positions", "coords", "vertices", "pc", "pos", "data"]
+    usual += found if len(found) == 1 else []
     if (chosen := next((found[name] for name in usual if name in found), None)) is None:
         if {"x", "y", "z"} <= found.keys():
             return from_columns({name: values for name, values in arrays.items() if values.ndim == 1})

@@ -41,13 +41,14 @@ def read_ply(path: Path) -> Contents:
             break  # what follows (range grids, edges, materials) is not used
     if "vertex" not in rows:
         raise InputError("the PLY header declares no vertex element.")
-    lists = (rows.get(name, {}) for name in ("face", "tristrips"))
-    corners, strips = (found.get("vertex_indices", found.get("vertex_index", ())) for found in lists)
-    faces = [fan_triangles(*corners)] if len(corners) == 2 else []
-    faces += [_strip_triangles(strips[1])] if len(strips) == 2 else []
+    found = [rows.get(name, {}) for name in ("face", "tristrips")]
+    lists = [one.get("vertex_indices", one.get("vertex_index")) for one in found]
+    corners, strips = (one if isinstance(one, tuple) else () for one in lists)
+    faces = [fan_triangles(*corners)] if corners else []
+    faces += [_strip_triangles(strips[1])] if strips else []
     columns = {name: values for name, values in rows["vertex"].items() if not isinstance(values, tuple)}
     contents = from_columns(columns, np.concatenate(faces) if faces else None)
-    unread = _unread(elements) + (polygon_remarks(corners[0]) if faces and len(corners) == 2 else ())
+    unread = _unread(elements) + (polygon_remarks(corners[0]) if corners else ())
     return replace(contents, unread=contents.unread + unread)
 
 

@@ -44,11 +44,9 @@ def _next_line(file: IO[str]) -> str:
 
 
 def _size(line: str, number: int) -> int:
-    if not line.strip().isdecimal():
-        raise InputError(
-            f"scan {number} begins with {line.strip()[:40]!r}, but a number of columns or rows was expected."
-        )
-    return int(line)
+    if not (word := line.strip()).isdecimal():
+        raise InputError(f"scan {number} begins with {word[:40]!r}, but a number of columns or rows was expected.")
+    return int(word)
 
 
 def _pose(lines: list[str], number: int, *, tolerance: float = 1e-3) -> Float:

@@ -119,7 +119,8 @@ def find_dialect(lines: list[str]) -> Dialect:
     rows = [(number, cells) for number, cells in rows if number > title]
     first = rows[0][0]
     _require_unambiguous(dialect, [cells for _, cells in rows])
-    dialect = replace(dialect, skipped=first, count=_count(lines[:first]))
+    counts = [int(line) for line in map(str.strip, lines[:first]) if re.fullmatch("[0-9]{1,18}", line)]
+    dialect = replace(dialect, skipped=first, count=counts[-1] if counts else None)
     if names is not None:
         dialect = _fitted(dialect, names)
     else:
@@ -190,11 +191,6 @@ def _require_unambiguous(dialect: Dialect, rows: list[list[str]]) -> None:
         raise InputError(
             "commas seem to separate the columns and to mark decimals as well; save the table with semicolons or tabs."
         )
-
-
-def _count(head: list[str]) -> int | None:
-    counts = [int(line) for line in map(str.strip, head) if re.fullmatch("[0-9]{1,18}", line)]
-    return counts[-1] if counts else None
 
 
 def _header(dialect: Dialect, head: list[str]) -> tuple[int, list[str] | None]:

@@ -92,7 +92,6 @@ def _model(mesh: Mesh) -> Iterator[str]:
 def _shift(mesh: Mesh) -> Float:
     """What is subtracted from the coordinates, of shape (3,): zero, unless float32 rounding would be visible."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    # Readers may convert coordinates to float32.
     rounding = float(np.abs(mesh.vertices).max()) * float(np.finfo(np.float32).eps)
     visible = IOParameters.visible_rounding_diagonals * float(np.linalg.norm(high - low))
     return (low + high) / 2 if rounding > visible else np.zeros(3)

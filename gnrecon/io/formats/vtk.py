@@ -173,7 +173,7 @@ class _VtkLegacy:
     def _keep(self, name: str, values: Values, columns: int) -> None:
         if self.of_points:
             self.arrays[unquote(name)] = values if columns == 1 else values.reshape(-1, max(columns, 1))
-        elif "values of polygons or of the whole" not in self.unread:
+        else:
             self.unread.append("values of polygons or of the whole")
 
 
@@ -235,7 +235,7 @@ def assemble_contents(
     if shown:
         columns = {"colors": columns.pop(shown[0]), **columns}
     found = from_columns(columns, faces, points)
-    return replace(found, unread=(*unread, *found.unread))
+    return replace(found, unread=(*dict.fromkeys(unread), *found.unread))
 
 
 def text_numbers(words: list[str], dtype: np.dtype[Any]) -> Values:

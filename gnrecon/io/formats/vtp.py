@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -50,7 +51,7 @@ def read_vtp(path: Path) -> Contents:
 
 def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     """Return the XML without the appended block, and how arrays are read."""
-    decompressors = {"vtkZLibDataCompressor": zlib.decompress, "vtkLZMADataCompressor": lzma.decompress}
+    libraries: dict[str, Any] = {"vtkZLibDataCompressor": zlib, "vtkLZMADataCompressor": lzma}
     xml, _, rest = data.partition(b"<AppendedData")
     tag, _, block = rest.partition(b">")
     # Raw bytes are not XML, so the tree ends before them.
@@ -58,11 +59,13 @@ def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise InputError(f"expected a VTKFile of the type PolyData, but found {root.get('type', root.tag)!r}.")
     compressor = root.get("compressor", "")
-    if compressor and compressor not in decompressors:
-        raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(decompressors)}, or none.")
+    if compressor and compressor not in libraries:
+        raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(libraries)}, or none.")
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
-    return root, _VtkXml(order, header, decompressors.get(compressor), block.partition(b"_")[2], b"raw" in tag)
+    return root, _VtkXml(
+        order, header, libraries[compressor].decompress if compressor else None, block.partition(b"_")[2], b"raw" in tag
+    )
 
 
 def _piece(piece: ElementTree.Element, file: _VtkXml) -> Contents:
