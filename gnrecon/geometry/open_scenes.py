@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.arrays import Float, Int
 
 
 @dataclass(frozen=True)
@@ -76,23 +76,42 @@ def sheet_dipoles(points: Float, normals: Float, disks: Float, *, least_facing: 
     disks : array of shape (N,), radius of the disk that each point represents
     least_facing : share of the normals within 90 degrees of their mean, of a sheet that was seen from one side
     """
-    from scipy.spatial import Delaunay, QhullError
-
     towards = normals.mean(axis=0)
     if (normals @ towards > 0).mean() < least_facing:
         return normals, disks
-    axes = np.linalg.svd(towards[None])[2][1:]
-    try:
-        triangles = Delaunay(points @ axes.T).simplices
-    except QhullError:  # points on a line
+    triangles, _ = sheet_triangles(points, towards)
+    if not len(triangles):
         return normals, disks
     a, b, c = (points[corner] for corner in triangles.T)
-    areas = np.cross(b - a, c - a) / 2
-    areas *= np.where(areas @ towards < 0, -1.0, 1.0)[:, None]
     # A third of each triangle belongs to each of its corners.
-    sums = np.column_stack(
-        [np.bincount(triangles.ravel(), np.repeat(areas[:, k] / 3, 3), len(points)) for k in range(3)]
-    )
+    shares, corners = np.repeat(np.cross(b - a, c - a) / 6, 3, axis=0), triangles.ravel()
+    sums = np.column_stack([np.bincount(corners, share, len(points)) for share in shares.T])
     sizes = np.linalg.norm(sums, axis=1)
     used = sizes > 0
     return np.where(used[:, None], sums / np.where(used, sizes, 1.0)[:, None], normals), np.sqrt(sizes / np.pi)
+
+
+def sheet_triangles(points: Float, towards: Float) -> tuple[Int, Float]:
+    """Return the triangles between points as they are seen from one side, and the points as they are seen.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3)
+    towards : array of shape (3,), the direction to that side
+
+    Returns
+    -------
+    Rows of points, of shape (F, 3), counter-clockwise from that side, none of points on a line; and places in the
+    plane, of shape (N, 2).
+    """
+    from scipy.spatial import Delaunay, QhullError
+
+    flat: Float = points @ np.linalg.svd(towards[None])[2][1:].T
+    try:
+        triangles: Int = Delaunay(flat).simplices.astype(np.int64)
+    except QhullError:
+        return np.empty((0, 3), np.int64), flat
+    a, b, c = (points[corner] for corner in triangles.T)
+    away = np.cross(b - a, c - a) @ towards < 0
+    triangles[away] = triangles[away][:, ::-1]
+    return triangles, flat
