@@ -20,6 +20,7 @@ from gnrecon.export import (
     Attribute,
     Metrics,
     Neighbourhood,
+    distances_between_points,
     measure,
     require_bordered,
     require_sound,
@@ -325,13 +326,16 @@ def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted)
 def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedScan:
     """Cut off what no points on the same side support, where ``trim`` or ``open`` was given, or the scan is a sheet."""
     samples, mesh = ingested.samples, surface.mesh
-    by_itself = run.options.trim is None and run.options.open is None
-    sheet = by_itself and ingested.layers is None and is_single_sheet(samples.points, samples.normals)
+    may_be_open = run.options.trim is None and run.options.open is not False
+    one_sided = may_be_open and is_single_sheet(samples.points, samples.normals)
+    sheet = one_sided and run.options.open is None and ingested.layers is None
     reach = run.options.trim_at(surface.spacing, sheet)
     if reach is not None:
         with run.stages("trim"):
             distances, points = surface.neighbourhood.distances(mesh.vertices), samples.frame.to_world(samples.points)
             distances = same_side_distances(mesh, distances, points, samples.normals, reach)
+            if one_sided:
+                distances = distances_between_points(mesh, distances, points, samples.normals, reach)
             # A reach that the user gave is where the surface ends.
             mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else surface.spacing)
         why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]

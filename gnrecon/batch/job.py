@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from gnrecon.io.named_files import input_files
+from gnrecon.io import all_input_files
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import write_text
 from gnrecon.version import __version__
@@ -145,10 +145,10 @@ def identity_of(job: Job) -> dict[str, Any]:
     OSError
         When a file cannot be read.
     """
-    reference = [] if job.reference is None else input_files(job.reference)
+    reference = [] if job.reference is None else all_input_files([job.reference])
     return {
         "version": __version__,
-        "inputs": {str(path.name): file_hash(path) for path in input_files(job.scan)},
+        "inputs": {str(path.name): file_hash(path) for path in all_input_files([job.scan])},
         "reference": [file_hash(path) for path in reference],
         # Through JSON, so that it compares equal to what is read back from a record.
         "options": json.loads(json.dumps(dict(job.options))),

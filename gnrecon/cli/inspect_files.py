@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from gnrecon.cli.conversion_losses import round_trip_losses
 from gnrecon.export import examine, measure
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
@@ -24,8 +25,7 @@ from gnrecon.io import (
     write_mesh,
     written_origin,
 )
-from gnrecon.io.origin import origin_remark
-from gnrecon.io.write import round_trip_losses
+from gnrecon.io.formats.stl import origin_remark
 from gnrecon.runtime.errors import ExitCode, MeshError, UsageError
 from gnrecon.runtime.files import require_files, write_text
 

@@ -146,7 +146,7 @@ class CubeSpace:
         disks = self.disks[nearest]
         kept = distance > clear_disks * disks + clear
         x, distance, disks = x[kept], distance[kept], disks[kept]
-        winding = winding_number(x, *self._seen_dipoles)
+        winding = self.dipoles.sides.centred(winding_number(x, *self._seen_dipoles), distance)
         # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         if self.signed_by is not None:

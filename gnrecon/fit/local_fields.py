@@ -27,6 +27,7 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.octree import DipoleTree
+from gnrecon.geometry.signed_distance import scene_dipoles
 from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
@@ -201,7 +202,8 @@ class _Cubes:
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
         features, seed = Features.draw(count, rng, like), int(rng.integers(2**32))
-        dipoles = DipoleTree.of(residuals.points, residuals.normals, residuals.density.disks)
+        disks = residuals.density.disks
+        dipoles = DipoleTree.of(residuals.points, *scene_dipoles(residuals.points, residuals.normals, disks))
         return cls(sdf, residuals, dipoles, hyperparameters, features, partition, seed, device, penalties, parameters)
 
     def detail(self, advance: ProgressCallback) -> Detail:

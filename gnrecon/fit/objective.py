@@ -353,7 +353,7 @@ class Scene:
     def of(cls, samples: Samples, device: str, rng: np.random.Generator) -> Scene:
         """Put samples on a device."""
         points, normals = (torch.as_tensor(rows, device=device) for rows in (samples.points, samples.normals))
-        coarse = CoarseDistance(samples.points, samples.normals, rng)
+        coarse = CoarseDistance(samples.points, samples.normals, rng, may_be_open=True)
         return cls(points, normals, samples, coarse, _box(samples))
 
     def volume(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:

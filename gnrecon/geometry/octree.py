@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.open_scenes import WindingLevel
 
 MORTON_BITS = 21
 """Bits of a cell's number along an axis: three of them fit a code of 64 bits."""
@@ -97,9 +98,10 @@ class DipoleLevel:
 
 @dataclass(frozen=True)
 class DipoleTree:
-    """Levels of cubes, the largest first."""
+    """Levels of cubes, the largest first, and the level of the winding number that divides inside from outside."""
 
     levels: tuple[DipoleLevel, ...]
+    sides: WindingLevel = WindingLevel()
 
     @classmethod
     def of(
@@ -107,6 +109,7 @@ class DipoleTree:
         points: Float,
         normals: Float,
         disks: Float,
+        sides: WindingLevel = WindingLevel(),
         *,
         leaf_side_radii: float = 0.5,
         root_cubes: int = 64,
@@ -117,6 +120,7 @@ class DipoleTree:
         ----------
         points, normals : arrays of shape (N, 3)
         disks : array of shape (N,), radius of the disk that each represents
+        sides : the level of the winding number that divides inside from outside
         leaf_side_radii : side of the smallest cubes, in the median of these radii; with points that are so near to
             each other, the sign is right from about a radius off the surface on
         root_cubes : of the largest size at most
@@ -139,13 +143,14 @@ class DipoleTree:
             codes, sums, first = _connected(codes >> np.uint64(3), sums)
             side *= 2
             levels.append(_level(sums, first, origin, side))
-        return cls(tuple(reversed(levels)))
+        return cls(tuple(reversed(levels)), sides)
 
     @classmethod
-    def of_arrays(cls, array: Callable[[str], npt.NDArray[Any]], count: int) -> DipoleTree:
+    def of_arrays(cls, array: Callable[[str], npt.NDArray[Any]], count: int, sides: WindingLevel) -> DipoleTree:
         """Return the tree from its arrays, which a function returns by the names of `arrays`."""
         names = [field.name for field in fields(DipoleLevel)]
-        return cls(tuple(DipoleLevel(*(array(f"level{number}_{name}") for name in names)) for number in range(count)))
+        levels = (DipoleLevel(*(array(f"level{number}_{name}") for name in names)) for number in range(count))
+        return cls(tuple(levels), sides)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return the arrays of all levels, by name."""

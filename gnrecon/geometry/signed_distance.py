@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.open_scenes import WindingLevel, sheet_dipoles
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
 
@@ -131,6 +132,7 @@ class CoarseDistance:
     points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
     rng : draws the points that the winding number sums over
     density : of the points, if it is known already
+    may_be_open : whether the sides of an open scene are told apart as in `gnrecon.geometry.open_scenes`
     max_sources : number of these points at most, which bounds the cost of a sum
     """
 
@@ -141,14 +143,17 @@ class CoarseDistance:
         rng: np.random.Generator,
         density: Density | None = None,
         *,
+        may_be_open: bool = False,
         max_sources: int = 4000,
     ) -> None:
         self._density = density or Density(points)
         self.spacing = self._density.spacing
         chosen = np.sort(rng.permutation(len(points))[:max_sources])
         self._sources = points[chosen]
-        self._radii = Density(self._sources).disks
-        self._dipoles = normals[chosen] * (self._radii**2 / 4)[:, None]
+        directions, self._radii, self._level = normals[chosen], Density(self._sources).disks, WindingLevel()
+        if may_be_open:
+            directions, self._radii, self._level = scene_dipoles(self._sources, directions, self._radii)
+        self._dipoles = directions * (self._radii**2 / 4)[:, None]
 
     @property
     def radius(self) -> float:
@@ -191,9 +196,30 @@ class CoarseDistance:
         return sign_of_winding(self.winding_number(x))
 
     def winding_number(self, x: Float, batch: int = 64) -> Float:
-        """Return w, of shape (Q,), at points x, of shape (Q, 3); see the function `winding_number`."""
+        """Return w, of shape (Q,), at points x, of shape (Q, 3), such that 1/2 divides inside from outside."""
         # With so few sources, disks are large enough for single precision.
-        return winding_number(x, self._sources, self._dipoles, self._radii, batch, torch.float32)
+        found = winding_number(x, self._sources, self._dipoles, self._radii, batch, torch.float32)
+        return self._level.centred(found, self._density.tree.query(x)[0]) if self._level.is_open else found
+
+
+def scene_dipoles(
+    points: Float, normals: Float, disks: Float, *, max_sources: int = 4000, max_queries: int = 400
+) -> tuple[Float, Float, WindingLevel]:
+    """Return the directions and disks that points represent, and the winding number's level; see `open_scenes`.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
+    disks : array of shape (N,), radius of the disk that each point represents
+    max_sources, max_queries : random points that the sum runs over, and at which it is evaluated
+    """
+    chosen = np.random.default_rng(0).permutation(len(points))[:max_sources]
+    if len(chosen) < 3:
+        return normals, disks, WindingLevel()
+    sources, radii = points[chosen], Density(points[chosen]).disks
+    dipoles = normals[chosen] * (radii**2 / 4)[:, None]
+    level = WindingLevel.at_points(winding_number(sources[:max_queries], sources, dipoles, radii))
+    return (*sheet_dipoles(points, normals, disks), level) if level.is_open else (normals, disks, level)
 
 
 def sign_of_winding(winding: Float) -> Float:

@@ -75,10 +75,7 @@ def _first(simple: dict[str, str], pattern: str) -> str | None:
 def parse_columns(text: str | None) -> tuple[str, ...]:
     """Return the names in ``x,y,z,nx,ny,nz,-``, the option ``--columns``; none for None.
 
-    Raises
-    ------
-    UsageError
-        When x, y or z is missing, or a name comes twice.
+    `UsageError` is raised when x, y or z is missing, or a name comes twice.
     """
     names = tuple(name.strip() for name in text.split(",")) if text is not None else ()
     read = [name for name in names if name != "-"]
@@ -88,13 +85,7 @@ def parse_columns(text: str | None) -> tuple[str, ...]:
 
 
 def require_position(names: Iterable[str], hint: str = "") -> list[str]:
-    """Return the names of the columns of x, y and z.
-
-    Raises
-    ------
-    InputError
-        When one is missing, or their units differ.
-    """
+    """Return the names of the columns of x, y and z; `InputError` is raised when one is missing, or units differ."""
     names = list(names)
     position = columns_of_role(names, POSITION)
     if position is None:

@@ -1,6 +1,7 @@
 """`Contents`, what a reader returns: the points and all else that a file stores, before it becomes a cloud or a mesh.
 
-Also holds what many readers need: sorting named columns, concatenating scans, and cutting polygons into triangles.
+Also holds what many readers need: sorting named columns, concatenating and moving scans, and cutting polygons into
+triangles. Whatever does not fit together ends in an `InputError`.
 """
 
 from __future__ import annotations
@@ -51,37 +52,34 @@ class Contents:
     remarks: tuple[str, ...] = ()
 
     def shape(self) -> Mesh | PointCloud:
-        """Return a mesh, with colours in 8 bits, where there are faces; else a cloud.
-
-        Raises
-        ------
-        InputError
-            When the arrays do not fit each other.
-        """
-        attributes = dict(self.attributes)
+        """Return a mesh, with colours in 8 bits, where there are faces; else a cloud."""
         if not len(self.faces):
-            return PointCloud(self.points, self.normals, attributes, self.origins)
-        if "colors" in attributes:
-            attributes["colors"] = as_bytes(attributes["colors"])
-        return Mesh(self.points, self.faces, self.normals, attributes)
+            return self.cloud()
+        colors = {name: as_bytes(values) for name, values in self.attributes.items() if name == "colors"}
+        return Mesh(self.points, self.faces, self.normals, {**self.attributes, **colors})
+
+    def cloud(self) -> PointCloud:
+        """Return the points; see `without_faces` for the normals of a mesh."""
+        found = without_faces(self)
+        return PointCloud(found.points, found.normals, dict(found.attributes), found.origins)
+
+    def moved(self, rotation: Float, translation: Float, origin: Float | None = None) -> Contents:
+        """Return the points, rows x, as ``rotation x + translation``, with the position of the scanner, of shape (3,).
+
+        ``rotation`` has shape (3, 3) and turns normals, too; ``translation`` has shape (3,).
+        """
+        points = self.points @ rotation.T + translation
+        normals = None if self.normals is None else self.normals @ rotation.T
+        seen_from = self.origins if origin is None else np.broadcast_to(origin, points.shape)
+        return replace(self, points=points, normals=normals, origins=seen_from)
 
 
 def from_columns(columns: Columns, faces: Int | None = None, points: Values | None = None) -> Contents:
     """Sort named columns, of shape (N,) or (N, C), into positions, normals, ``colors`` and other attributes.
 
     Columns of shape (N, 3) named ``normals`` are normals, and those of three or four named ``colors``, ``rgb`` or the
-    like are colours.
-
-    Parameters
-    ----------
-    columns : by name; see `gnrecon.io.column_names` for the names that positions, normals and colours may have
-    faces : integer array of shape (F, 3); by default none
-    points : array of shape (N, 3); by default the columns x, y and z
-
-    Raises
-    ------
-    InputError
-        When x, y or z is missing, or columns differ in their number of rows.
+    like are colours; see `gnrecon.io.column_names` for the names that single ones may have. ``faces``, of shape (F, 3),
+    are none by default, and ``points``, of shape (N, 3), the columns x, y and z.
     """
     rest = dict(columns)
     if points is None:
@@ -115,14 +113,9 @@ def decoded_normals(
     """Return normals, of shape (N, 3), as float64, and what could not be read of them.
 
     Integers of 8 or 16 bits hold shares of the largest one: signed, or with the middle of the range for zero. So do
-    whole numbers in text. The encoding is that in which at least a share of the non-zero rows has unit
-    length; normals that have it in none are kept where they are signed, because their directions are right.
-
-    Parameters
-    ----------
-    stored : array of shape (N, 3)
-    least_share : of the rows, which must have unit length
-    tolerance : of the length; bytes round to one hundredth
+    whole numbers in text. The encoding is that in which at least a share of the non-zero rows has unit length, within
+    a tolerance, as bytes round to one hundredth; normals that have it in none are kept where they are signed, because
+    their directions are right.
     """
     values = stored.astype(np.float64)
     whole = stored.dtype.kind in "iu" or bool(np.isfinite(values).all() and (values == np.rint(values)).all())
@@ -130,11 +123,9 @@ def decoded_normals(
     if not len(rows):
         return values, ()
     signed = bool((rows < 0).any()) or stored.dtype.kind == "i"
-    tops = (
-        [255 >> signed, 65535 >> signed] if stored.dtype.kind == "f" else [(256**stored.dtype.itemsize - 1) >> signed]
-    )
+    sizes = (1, 2) if stored.dtype.kind == "f" else (stored.dtype.itemsize,)
     scales = [(1.0, 0.0)]
-    for top in tops:
+    for top in ((256**size - 1) >> signed for size in sizes):
         # Zero is the middle of the range, or the whole number above it.
         scales += [(top, 0.0)] if signed else [(top / 2, 1.0), ((top - 1) / 2, (top + 1) / (top - 1))]
     for scale, middle in scales:
@@ -179,19 +170,13 @@ def concatenated(pieces: Sequence[Contents]) -> Contents:
 def without_opaque_alpha(attributes: Columns) -> Columns:
     """Return attributes whose ``colors``, bytes of shape (N, 4), have no alpha where all are opaque."""
     colors = attributes.get("colors")
-    if colors is None or (as_bytes(colors)[:, 3:] < 255).any():
-        return attributes
-    return {**attributes, "colors": colors[:, :3]}
+    opaque = colors is not None and (as_bytes(colors)[:, 3:] == 255).all()
+    return {**attributes, "colors": colors[:, :3]} if colors is not None and opaque else attributes
 
 
 def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:
     """Return contents without faces; where they have no normals, and at least a share of the points is a corner of a
     face, with the area-weighted normals of the faces.
-
-    Raises
-    ------
-    InputError
-        When a face names a point that does not exist.
     """
     normals, faces = contents.normals, contents.faces
     if normals is None and len(faces) and len(np.unique(faces)) >= least_share * len(contents.points):
@@ -199,39 +184,28 @@ def without_faces(contents: Contents, *, least_share: float = 0.5) -> Contents:
     return replace(contents, normals=normals, faces=no_faces())
 
 
-def fan_triangles(counts: Int, corners: Int) -> Int:
-    """Return the triangles, of shape (F, 3), of polygons that are each cut into a fan.
+def fan_triangles(counts: Int, corners: Int, strips: bool = False) -> Int:
+    """Return the triangles, of shape (F, 3), of polygons that are each cut into a fan, or of triangle strips.
 
     A polygon v0 v1 ... v(n-1) becomes the n - 2 triangles v0 v(k+1) v(k+2); fewer than three corners give none.
-
-    Parameters
-    ----------
-    counts : integer array of shape (P,), the number of corners of each polygon
-    corners : integer array of shape (counts.sum(),), the concatenated vertex indices of all polygons
+    ``counts``, of shape (P,), are the numbers of corners, and ``corners`` the vertex indices of all polygons.
     """
     triangles = np.maximum(counts - 2, 0)
     polygon = np.repeat(np.arange(len(counts)), triangles)
     first = (np.cumsum(counts) - counts)[polygon]
     k = np.arange(len(polygon)) - (np.cumsum(triangles) - triangles)[polygon]
-    return np.column_stack([corners[first], corners[first + k + 1], corners[first + k + 2]])
+    # Every other triangle of a strip has the opposite orientation.
+    a, b = (k + k % 2, k + 1 - k % 2) if strips else (0, k + 1)
+    return np.column_stack([corners[first + a], corners[first + b], corners[first + k + 2]])
 
 
 def polygon_remarks(counts: Int) -> tuple[str, ...]:
     """Return sentences on what `fan_triangles` changes in polygons of so many corners, an array of shape (P,)."""
     larger, smaller = int((counts > 3).sum()), int((counts < 3).sum())
-    sentences = (
-        (larger, f"{larger} polygons of more than three corners as such (they are cut into triangles)"),
-        (smaller, f"{smaller} polygons of less than three corners"),
-    )
-    return tuple(sentence for count, sentence in sentences if count)
+    cut = (f"{larger} polygons of more than three corners as such (they are cut into triangles)",) if larger else ()
+    return (*cut, *((f"{smaller} polygons of less than three corners",) if smaller else ()))
 
 
 def guard_parser(kind: str) -> AbstractContextManager[None]:
-    """Guard a block that parses a file of a kind, such as ``"LAS"``.
-
-    Raises
-    ------
-    InputError
-        When the library in the block raises any exception; see `gnrecon.runtime.plugins.guarded`.
-    """
+    """Turn any exception of a library that parses a file of a kind, such as ``"LAS"``, into an `InputError`."""
     return guarded(InputError, lambda error: f"the file is not a well-formed {kind} file ({describe_error(error)}).")

@@ -9,7 +9,6 @@ Plugins cannot replace built-in formats.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -102,26 +101,21 @@ ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
 }
 """Whether a format can store a vertex attribute, by its name and values."""
 
-SIGNATURES: dict[bytes, str] = {
-    b"ply\n": ".ply",
-    b"ply\r": ".ply",
-    b"# .PCD": ".pcd",
-    b"VERSION .7": ".pcd",
-    b"VERSION 0.7": ".pcd",
-    b"OFF": ".off",
-    b"COFF": ".off",
-    b"NOFF": ".off",
-    b"glTF": ".glb",
-    b"\x89PNG": "PNG image",
-    b"\xff\xd8\xff": "JPEG image",
-    b"%PDF": "PDF document",
-    b"PK\x03\x04": "ZIP archive",
-    b"LASF": ".las",
-    b"ASTM-E57": ".e57",
-    b"# vtk DataFile": ".vtk",
-    b"\x93NUMPY": ".npy",
+SIGNATURES: dict[str, tuple[bytes, ...]] = {
+    ".ply": (b"ply\n", b"ply\r"),
+    ".pcd": (b"# .PCD", b"VERSION .7", b"VERSION 0.7"),
+    ".off": (b"OFF", b"COFF", b"NOFF"),
+    ".glb": (b"glTF",),
+    ".las": (b"LASF",),
+    ".e57": (b"ASTM-E57",),
+    ".vtk": (b"# vtk DataFile",),
+    ".npy": (b"\x93NUMPY",),
+    "PNG image": (b"\x89PNG",),
+    "JPEG image": (b"\xff\xd8\xff",),
+    "PDF document": (b"%PDF",),
+    "ZIP archive": (b"PK\x03\x04",),
 }
-"""First bytes of files, and the extension or kind that they belong to."""
+"""First bytes of files of an extension or another kind."""
 
 
 def is_readable(extension: str) -> bool:
@@ -142,31 +136,16 @@ def writable() -> list[str]:
 def reader_of(extension: str) -> Callable[[Path], Contents] | None:
     """Return the reader for files of an extension; None where there is none.
 
-    Raises
-    ------
-    UsageError
-        When several packages offer it, or the one that does cannot be loaded.
+    `UsageError` is raised when several packages offer it, or the one that does cannot be loaded.
     """
     plugin = None if extension in READERS else find("reader", extension.removeprefix("."))
-    if plugin is None:
-        return READERS.get(extension)
-    read = plugin.load()
-    return lambda path: _read_with_plugin(plugin, read, path)
+    return READERS.get(extension) if plugin is None else partial(_read_with_plugin, plugin, plugin.load())
 
 
 def writer_of(extension: str) -> Callable[[Mesh, Path], None] | None:
-    """Return the writer of meshes for files of an extension; None where there is none.
-
-    Raises
-    ------
-    UsageError
-        When several packages offer it, or the one that does cannot be loaded.
-    """
+    """Return the writer of meshes for files of an extension, as `reader_of` does the reader."""
     plugin = None if extension in WRITERS else find("writer", extension.removeprefix("."))
-    if plugin is None:
-        return WRITERS.get(extension)
-    write = plugin.load()
-    return lambda mesh, path: _write_with_plugin(plugin, write, mesh, path)
+    return WRITERS.get(extension) if plugin is None else partial(_write_with_plugin, plugin, plugin.load())
 
 
 def _with_plugins(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
@@ -176,26 +155,18 @@ def _with_plugins(built_in: dict[str, Any], kind: PluginKind) -> list[str]:
 def _read_with_plugin(plugin: Plugin, read: Callable[[Path], Any], path: Path) -> Contents:
     with plugin.guarded(InputError):
         found = read(path)
-    with plugin.guarded(InputError):
         try:
             shape = as_shape(found)
         except InputError as error:
             raise InputError(f"{plugin} returned something that is not a cloud: {error}") from error
-        attributes = {name: _column(plugin, name, values) for name, values in shape.attributes.items()}
+        attributes = {name: np.asarray(values) for name, values in shape.attributes.items()}
+        for name, column in attributes.items():
+            if column.dtype.kind not in "biuf" or column.ndim > 2:
+                found = f"the attribute {name!r} of type {column.dtype} and shape {column.shape}"
+                raise InputError(f"{plugin} returned {found}, but numbers of shape (N,) or (N, C) were expected.")
         if isinstance(shape, Mesh):
             return Contents(shape.vertices, shape.normals, shape.faces, attributes)
         return Contents(shape.points, shape.normals, attributes=attributes, origins=shape.origins)
-
-
-def _column(plugin: Plugin, name: str, values: Any) -> Values:
-    """The values of an attribute as an array of numbers, of shape (N,) or (N, C)."""
-    column = np.asarray(values)
-    if column.dtype.kind not in "biuf" or column.ndim > 2:
-        raise InputError(
-            f"{plugin} returned the attribute {name!r} of type {column.dtype} and shape {column.shape}, but numbers of "
-            f"shape (N,) or (N, C) were expected."
-        )
-    return column
 
 
 def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh: Mesh, path: Path) -> None:
@@ -207,11 +178,12 @@ def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh:
 
 def _read_only(mesh: Mesh) -> Mesh:
     """The same mesh in read-only arrays, because the caller still uses the mesh after it was written."""
-    attributes = {name: values.view() for name, values in mesh.attributes.items()}
-    normals = None if mesh.normals is None else mesh.normals.view()
-    locked = replace(
-        mesh, vertices=mesh.vertices.view(), faces=mesh.faces.view(), normals=normals, attributes=attributes
-    )
-    for values in (locked.vertices, locked.faces, *attributes.values(), *([] if normals is None else [normals])):
-        values.flags.writeable = False
-    return locked
+
+    def locked(values: Any) -> Any:
+        view = values.view()
+        view.flags.writeable = False
+        return view
+
+    attributes = {name: locked(values) for name, values in mesh.attributes.items()}
+    normals = None if mesh.normals is None else locked(mesh.normals)
+    return Mesh(locked(mesh.vertices), locked(mesh.faces), normals, attributes)

@@ -1,13 +1,14 @@
-"""Converts clouds and meshes from and to trimesh, open3d and pymeshlab, and from arrays, tensors and data frames.
-
-pyvista and meshio have a module of their own, `gnrecon.io.interop_grids`.
+"""Converts clouds and meshes from and to trimesh, open3d, pymeshlab, pyvista and meshio, and from arrays and tables.
 
 An object's type is recognised by the module that defines it, so that no library is imported that the caller has not
-loaded. Nothing is processed: vertices and faces stay the same, in the same order.
+loaded. Nothing is processed: vertices and faces stay the same, in the same order. Of the many kinds of cells that
+pyvista and meshio have, triangles and polygons are surfaces; volumes give their outer surface, and grids whose points
+are implied by a spacing are refused, because they hold values in a volume and not a scan.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnrecon.geometry.arrays import Float, Values
+from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io.contents import from_columns, no_faces
-from gnrecon.io.interop_grids import meshio_parts, pyvista_parts
+from gnrecon.io.contents import fan_triangles, from_columns, no_faces
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.quiet_imports import import_open3d
 
@@ -62,10 +62,8 @@ def as_mesh(obj: Any) -> Mesh:
     InputError
         When `obj` is none of these, has no faces, or shapes do not fit.
     """
-    expected = (
-        "a mesh of open3d, trimesh, pymeshlab, pyvista or meshio, its file, or a pair of vertices, of shape (V, 3), "
-        "and faces, of shape (F, 3)"
-    )
+    pair = "a pair of vertices, of shape (V, 3), and faces, of shape (F, 3)"
+    expected = f"a mesh of open3d, trimesh, pymeshlab, pyvista or meshio, its file, or {pair}"
     found = _from_file(obj, "read_mesh") if isinstance(obj, str | Path) else _from_library(obj)
     if found is None and isinstance(obj, tuple | list) and len(obj) == 2:
         vertices, faces = (_array(part, expected) for part in obj)
@@ -77,13 +75,7 @@ def as_mesh(obj: Any) -> Mesh:
 
 
 def as_shape(obj: Any) -> Mesh | PointCloud:
-    """Return a mesh where an object has faces, else a cloud; paths are not read, as plugins' results come here.
-
-    Raises
-    ------
-    InputError
-        As `as_cloud` does.
-    """
+    """Return a mesh where an object has faces, else a cloud; paths are not read, as plugins' results come here."""
     if (found := _from_library(obj)) is not None:
         return found
     if names := _names(obj):
@@ -112,17 +104,22 @@ def _from_library(obj: Any) -> Mesh | PointCloud | None:
     if "pymeshlab" in libraries and (hasattr(obj, "current_mesh") or hasattr(obj, "vertex_matrix")):
         return _from_pymeshlab(obj)
     if "pyvista" in libraries and hasattr(obj, "bounds"):
-        return _mesh_or_cloud(*pyvista_parts(obj))
+        return _from_pyvista(obj)
     if "meshio" in libraries and hasattr(obj, "cells"):
-        return _mesh_or_cloud(*meshio_parts(obj))
+        return _from_meshio(obj)
     return None
 
 
-def _mesh_or_cloud(points: Any, faces: Any, attributes: dict[str, npt.NDArray[Any]]) -> Mesh | PointCloud:
-    """A mesh where there are faces, else a cloud, with the attributes as `from_columns` sorts them."""
-    normals = attributes.pop("normals", None)
+def _mesh_or_cloud(points: Any, faces: Any, attributes: Mapping[str, Any]) -> Mesh | PointCloud:
+    """A mesh where there are faces, else a cloud, with the attributes as `from_columns` sorts them.
+
+    Attributes that are no number or row of numbers at each point are left out.
+    """
+    held = {name: np.array(values) for name, values in attributes.items()}
+    held = {name: values for name, values in held.items() if values.dtype.kind in "biuf" and values.ndim <= 2}
+    normals = held.pop("normals", None)
     indices = no_faces() if faces is None else np.asarray(faces, np.int64)
-    found = from_columns(attributes, indices, np.asarray(points))
+    found = from_columns(held, indices, np.array(points))
     return (found if normals is None else replace(found, normals=normals)).shape()
 
 
@@ -133,7 +130,7 @@ def _from_open3d(obj: Any) -> Mesh | PointCloud:
         kind = geometry.PointCloud if hasattr(obj, "points") else geometry.TriangleMesh
         obj = kind.from_legacy(obj, import_open3d().core.float64)
     carrier = obj.point if hasattr(obj, "point") else obj.vertex
-    arrays = {name: carrier[name].cpu().numpy().copy() for name in carrier}
+    arrays = {name: carrier[name].cpu().numpy() for name in carrier}
     if "positions" not in arrays:
         raise InputError("The open3d point cloud or mesh holds no positions.")
     faces = obj.triangle.indices.cpu().numpy() if hasattr(obj, "triangle") and "indices" in obj.triangle else None
@@ -141,13 +138,13 @@ def _from_open3d(obj: Any) -> Mesh | PointCloud:
 
 
 def _from_trimesh(obj: Any) -> Mesh | PointCloud:
-    colors = np.array(obj.visual.vertex_colors) if obj.visual.kind == "vertex" else np.empty((0, 4))
-    faces = np.array(getattr(obj, "faces", no_faces()))
-    normals = np.array(obj.vertex_normals) if len(faces) else _trimesh_normals(obj)
-    held = {name: np.array(values) for name, values in obj.vertex_attributes.items()} if len(faces) else {}
+    colors = obj.visual.vertex_colors if obj.visual.kind == "vertex" else ()
+    faces = getattr(obj, "faces", no_faces())
+    normals = obj.vertex_normals if len(faces) else _trimesh_normals(obj)
+    held = dict(obj.vertex_attributes) if len(faces) else {}
     # trimesh may report vertex colours for a cloud that has none.
     held |= ({"colors": colors} if len(colors) else {}) | ({} if normals is None else {"normals": normals})
-    return _mesh_or_cloud(np.array(obj.vertices), faces, held)
+    return _mesh_or_cloud(obj.vertices, faces, held)
 
 
 def _trimesh_normals(cloud: Any) -> Float | None:
@@ -181,6 +178,43 @@ def _from_pymeshlab(obj: Any) -> Mesh | PointCloud:
     return _mesh_or_cloud(points, faces, held)
 
 
+def _from_pyvista(obj: Any) -> Mesh | PointCloud:
+    """PolyData, a PointSet, or the outer surface of a structured or unstructured grid; composites are refused."""
+    kind, kinds = type(obj).__name__, {base.__name__ for base in type(obj).__mro__}
+    if not hasattr(obj, "point_data"):
+        raise InputError(f"A pyvista {kind} holds several data sets: pass one of them, or what combine() makes of it.")
+    if kinds & {"ImageData", "UniformGrid", "RectilinearGrid"}:
+        raise InputError(f"A pyvista {kind} holds values in a volume, not points on a surface: pass its contour().")
+    if kinds & {"StructuredGrid", "UnstructuredGrid"}:
+        obj = _surface(obj)
+    faces = None
+    if hasattr(obj, "faces") and (len(obj.faces) or len(getattr(obj, "strips", ()))):
+        faces = np.array(obj.triangulate().faces, np.int64).reshape(-1, 4)[:, 1:]
+    held = {name: values for name, values in obj.point_data.items() if not name.startswith("vtkOriginal")}
+    if (name := obj.point_data.active_normals_name) is not None:
+        held["normals"] = held.pop(name)
+    return _mesh_or_cloud(obj.points, faces, held)
+
+
+def _surface(grid: Any) -> Any:
+    """The outer surface of a grid's cells; its points alone where it has no cells of two or three dimensions."""
+    try:
+        surface = grid.extract_surface(algorithm="dataset_surface")
+    except TypeError:  # before pyvista 0.47 there was one algorithm
+        surface = grid.extract_surface()
+    return surface if len(surface.faces) else grid
+
+
+def _from_meshio(obj: Any) -> Mesh | PointCloud:
+    """Triangles and polygons, which are cut into fans."""
+    if np.ndim(obj.points) != 2 or np.shape(obj.points)[1] != 3:
+        raise InputError(f"The meshio mesh has points of shape {np.shape(obj.points)}, but (N, 3) was expected.")
+    cells = [cell for block in obj.cells if block.type in ("triangle", "quad", "polygon") for cell in block.data]
+    counts = np.array([len(cell) for cell in cells], np.int64)
+    faces = fan_triangles(counts, np.concatenate(cells).astype(np.int64)) if cells else None
+    return _mesh_or_cloud(obj.points, faces, obj.point_data)
+
+
 def _names(obj: Any) -> list[str]:
     """The columns of a structured array, a mapping or a data frame; none of other objects."""
     if getattr(getattr(obj, "dtype", None), "names", None):
@@ -195,14 +229,10 @@ def _column(values: Any) -> npt.NDArray[Any]:
     return column
 
 
-def _array(
-    obj: Any,
-    expected: str = (
-        "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, a file's path, or a cloud of "
-        "open3d, trimesh, pymeshlab, pyvista or meshio"
-    ),
-) -> Float:
-    """An array of float64; `expected` is what the message on anything else asks for."""
+def _array(obj: Any, expected: str = "") -> Float:
+    """An array of float64; `expected` is what the message on anything else asks for, by default points."""
+    points = "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, a file's path"
+    expected = expected or f"{points}, or a cloud of open3d, trimesh, pymeshlab, pyvista or meshio"
     if hasattr(obj, "detach"):  # a torch tensor, on any device
         obj = obj.detach().cpu().numpy()
     try:
@@ -215,6 +245,13 @@ def _from_array(rows: Float) -> PointCloud:
     if rows.ndim != 2 or rows.shape[1] not in (3, 6):
         raise InputError(f"Expected points of shape (N, 3) or (N, 6), but got {rows.shape}.")
     return PointCloud(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
+
+
+def _parts(shape: Mesh | PointCloud) -> tuple[Float, Int, Float | None]:
+    """Points, faces, and normals, which a mesh always has."""
+    if isinstance(shape, PointCloud):
+        return shape.points, no_faces(), shape.normals
+    return shape.vertices, shape.faces, shape.vertex_normals()
 
 
 def to_trimesh(shape: Mesh | PointCloud) -> Any:
@@ -248,14 +285,13 @@ def to_open3d(shape: Mesh | PointCloud, *, tensor: bool = False) -> Any:
     """
     core: Any = import_open3d().core
     geometry: Any = import_open3d().t.geometry
-    held, colors = dict(shape.attributes), _colors(shape)
+    held, colors, (points, faces, normals) = dict(shape.attributes), _colors(shape), _parts(shape)
     if not tensor:
         held = {} if colors is None else {"colors": colors[:, :3] / 255}
     if isinstance(shape, PointCloud):
-        made, carrier, normals = geometry.PointCloud(core.Tensor(shape.points)), "point", shape.normals
+        made, carrier = geometry.PointCloud(core.Tensor(points)), "point"
     else:
-        made = geometry.TriangleMesh(core.Tensor(shape.vertices), core.Tensor(shape.faces))
-        carrier, normals = "vertex", shape.vertex_normals()
+        made, carrier = geometry.TriangleMesh(core.Tensor(points), core.Tensor(faces)), "vertex"
     held |= {} if normals is None else {"normals": normals}
     for name, values in held.items():
         # Attributes of open3d tensors need two dimensions.
@@ -274,7 +310,7 @@ def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
         import pymeshlab
     except ImportError:
         raise UsageError("This needs the package pymeshlab; install it with: pip install pymeshlab") from None
-    points, faces = (shape.points, no_faces()) if isinstance(shape, PointCloud) else (shape.vertices, shape.faces)
+    points, faces, _ = _parts(shape)
     normals = shape.normals if isinstance(shape, PointCloud) else None
     colors, values = _colors(shape), shape.attributes.get("quality")
     given: dict[str, Values] = {} if normals is None else {"v_normals_matrix": normals}
@@ -284,19 +320,53 @@ def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
     if values is not None:
         given["v_scalar_array"] = values.astype(np.float64)
     made = pymeshlab.Mesh(points, faces.astype(np.int32), **given)
-    for name, column in shape.attributes.items():
-        if name not in ("colors", "quality") and column.dtype.kind in "biuf":
-            _add_attribute(made, name, column.astype(np.float64))
+    others = {name: column for name, column in shape.attributes.items() if name not in ("colors", "quality")}
+    for name, column in others.items():
+        if column.dtype.kind in "biuf" and column.shape[1:] in ((), (3,)):
+            add = made.add_vertex_custom_point_attribute if column.ndim > 1 else made.add_vertex_custom_scalar_attribute
+            add(column.astype(np.float64), name)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(made)
     return meshes
 
 
-def _add_attribute(mesh: Any, name: str, values: Values) -> None:
-    if values.ndim == 1:
-        mesh.add_vertex_custom_scalar_attribute(values, name)
-    elif values.shape[1] == 3:
-        mesh.add_vertex_custom_point_attribute(values, name)
+def to_pyvista(shape: Mesh | PointCloud) -> Any:
+    """Return a ``pyvista.PolyData`` with normals and attributes; colours are its point data ``RGB`` or ``RGBA``.
+
+    Raises
+    ------
+    ImportError
+        When pyvista is not installed; gnrecon itself does not need it.
+    """
+    import pyvista
+
+    points, faces, normals = _parts(shape)
+    cells = np.hstack([np.full((len(faces), 1), 3), faces]).ravel()
+    made = pyvista.PolyData(points.copy(), *([cells] if len(faces) else []))
+    for name, values in shape.attributes.items():
+        if name == "colors":
+            made.point_data["RGB" if values.shape[1] == 3 else "RGBA"] = as_bytes(values)
+        else:
+            made.point_data[name] = values
+    if normals is not None:
+        made.point_data.active_normals = np.array(normals)
+    return made
+
+
+def to_meshio(shape: Mesh | PointCloud) -> Any:
+    """Return a ``meshio.Mesh`` of triangles, or of a cloud one of vertices, with normals and attributes.
+
+    Raises
+    ------
+    ImportError
+        When meshio is not installed; gnrecon itself does not need it.
+    """
+    import meshio
+
+    points, faces, normals = _parts(shape)
+    cells = ("vertex", np.arange(len(points))[:, None]) if isinstance(shape, PointCloud) else ("triangle", faces)
+    held = dict(shape.attributes) | ({} if normals is None else {"normals": normals})
+    return meshio.Mesh(points.copy(), [cells], point_data={name: np.array(values) for name, values in held.items()})
 
 
 def _colors(shape: Mesh | PointCloud) -> npt.NDArray[np.uint8] | None:

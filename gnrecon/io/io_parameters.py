@@ -12,9 +12,6 @@ class IOParameters:
     most_points: int = 2_000_000
     # Points to keep of a scan: far fewer describe a surface well, and all later stages fit into memory.
 
-    chunked_file_bytes: int = 1 << 24
-    # Size of a file from which it is read by chunks; a smaller one fits into memory several times.
-
     chunk_points: int = 1 << 20
     # Points in a chunk: their arrays take some ten megabytes, and libraries read so many at full speed.
 

@@ -1,22 +1,32 @@
-"""Reads one or several scans into one cloud in common coordinates, in bounded memory, and reports what was read."""
+"""Reads one or several scans into one cloud in common coordinates, in bounded memory, and reports what was read.
+
+Beyond a number of points, only the first point in each occupied voxel of a grid is kept
+(`VoxelThinning`). Voxels start so small that they hardly ever hold two points. Whenever too many are occupied, their
+side is doubled: eight voxels become one, whose first point is the first of all eight. The result therefore depends on
+the final side only, not on how the scan was cut into chunks or when the side was doubled. The kept points are measured
+ones, never averages.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.moments import Moments
 from gnrecon.geometry.point_cloud import PointCloud, Region
-from gnrecon.io.contents import without_faces
+from gnrecon.io.contents import Contents, concatenated, without_faces
+from gnrecon.io.format_registry import CHUNK_READERS, reader_of
 from gnrecon.io.formats.las import drop_unused_attributes
+from gnrecon.io.formats.npy import read_npy
+from gnrecon.io.formats.table import TABLE_SUFFIXES, table_chunks
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.read import opened
-from gnrecon.io.streaming import VoxelThinning, read_chunks
 from gnrecon.runtime.errors import InputError, UsageError
 
 _log = logging.getLogger(__name__)
@@ -56,17 +66,13 @@ class Reading:
     def remarks(self) -> list[str]:
         """Return a sentence for everything that was dropped or looks wrong."""
         sentences = [*self.notes, *([f"Not read: {', '.join(self.unread)}."] if self.unread else [])]
-        for first, second in self.same:
-            sentences.append(
-                f"{second} seems to be the same scan as {first}; it adds nothing or, if moved, a second layer."
-            )
+        what = "it adds nothing or, if moved, a second layer"
+        sentences += [f"{second} seems to be the same scan as {first}; {what}." for first, second in self.same]
         if self.cropped:
             sentences.append(f"Dropped {self.cropped:,} of {self.points:,} points outside of the region.")
         if self.side is not None:
-            inside = self.points - self.cropped
-            sentences.append(
-                f"Kept {self.kept:,} of {inside:,} points, the first one in each cube of side {self.side:.4g}."
-            )
+            kept = f"Kept {self.kept:,} of {self.points - self.cropped:,} points"
+            sentences.append(f"{kept}, the first one in each cube of side {self.side:.4g}.")
         return sentences
 
 
@@ -81,18 +87,17 @@ def read_scans(
 ) -> tuple[PointCloud, Reading]:
     """Read the points of all files into one cloud, in the files' own units, and report what was read.
 
-    If there are more than `most` points, only the first one in each of about as many equal cubes is kept. Large files
-    are read by chunks where the format allows it, so that memory use does not grow with them. Normals and attributes
-    are kept where all files have them; a mesh without normals gives those of its faces.
+    Files are read by chunks where the format allows it, so that memory use does not grow with them. Normals and
+    attributes are kept where all files have them; a mesh without normals gives those of its faces.
 
     Parameters
     ----------
     paths : files whose coordinates are in a common frame, directly or by the poses that they hold
     format : extension that says how all of them are read; by default each file's own
-    most : points to keep, at least 1; by default ``parameters.most_points``
+    most : points to keep, by default those of the parameters; of more, the first in each of about as many equal cubes
     region : where points are kept, in the common frame; by default everywhere
     columns : names of the columns of tables, with ``-`` for those to skip; by default, they are found out
-    parameters : when files are read by chunks, and how large these are
+    parameters : how many points are kept and read at a time
 
     Raises
     ------
@@ -115,94 +120,130 @@ def read_scans(
     if {".las", ".laz"} & extensions:
         # A chunk cannot say which attributes were never filled in; only all of its points can.
         found = drop_unused_attributes(found)
-    cloud = PointCloud(found.points, found.normals, found.attributes, found.origins)
-    require_points_in_region(cloud, thinning.seen)
+    cloud = found.cloud()
+    _require_points(cloud, thinning.seen)
     files = tuple(str(path) for path in paths)
     counts = (thinning.seen, len(cloud), thinning.cropped, thinning.non_finite)
-    return cloud, Reading(files, *counts, thinning.side, found.unread, same_scans(files, moments), found.remarks)
+    return cloud, Reading(files, *counts, thinning.side, found.unread, _same_scans(files, moments), found.remarks)
 
 
 def cropped(cloud: PointCloud, region: Region) -> tuple[PointCloud, Reading]:
-    """Return the points of a cloud in a region, and what was dropped.
-
-    Raises
-    ------
-    UsageError
-        When there are none.
-    """
+    """Return the points of a cloud in a region, and what was dropped; `UsageError` is raised where there are none."""
     inside = cloud if region.everything else cloud.select(region.holds(cloud.points))
-    require_points_in_region(inside, len(cloud))
+    _require_points(inside, len(cloud))
     return inside, Reading((), len(cloud), len(inside), len(cloud) - len(inside))
 
 
-def require_points_in_region(cloud: PointCloud, before: int) -> None:
-    """Refuse a region that holds none of `before` points.
-
-    Raises
-    ------
-    UsageError
-        When no point is left.
-    """
+def _require_points(cloud: PointCloud, before: int) -> None:
+    """Refuse a region that holds none of `before` points."""
     if before and not len(cloud):
         raise UsageError(f"None of the {before:,} points lies in the region; gnrecon info prints the scan's box.")
 
 
-class Moments:
-    """Moments of the points of one file, which recognise the same scan wherever it lies.
+def _same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[str, str], ...]:
+    """Return pairs of files that hold the same scan, each file at most once as the second one."""
+    firsts = [next(k for k in range(i + 1) if k == i or moments[k].same_as(moments[i])) for i in range(len(files))]
+    return tuple((files[first], files[i]) for i, first in enumerate(firsts) if first < i)
 
-    The number of points and the principal moments of inertia do not change when a scan is moved. They are summed while
-    the chunks pass, relative to the scan's first point, so that far-off coordinates lose no digits.
+
+class VoxelThinning:
+    """Keeps at most `most` of the points in a region that are added.
+
+    Attributes
+    ----------
+    seen : number of points added
+    cropped : number of points dropped because they lie outside of the region
+    non_finite : number of points dropped because of a coordinate that is not finite, while thinning
+    side : of the voxels, in file units; None while every point is kept
     """
 
-    def __init__(self) -> None:
-        self.count = 0
+    def __init__(self, most: int, region: Region | None = None) -> None:
+        self.most = most
+        self.region = region or Region()
+        self.seen = self.cropped = self.non_finite = 0
+        self.side: float | None = None
+        self._pieces: list[Contents] = []
         self._first: Float | None = None
-        self._sum, self._products = np.zeros(3), np.zeros((3, 3))
 
-    def add(self, points: Float) -> None:
-        """Add a chunk of points, of shape (N, 3); those that are not finite do not count."""
-        finite = np.isfinite(points).all(axis=1)
-        points = points if finite.all() else points[finite]
-        if not len(points):
-            return
-        if self._first is None:
-            self._first = points[0].copy()
-        with np.errstate(over="ignore", invalid="ignore"):
-            offsets = points - self._first
-            self.count += len(points)
-            self._sum += offsets.sum(axis=0)
-            self._products += offsets.T @ offsets
+    def add(self, contents: Contents) -> None:
+        """Add a chunk of points; faces are dropped once there are more points than may be kept."""
+        self.seen += len(contents.points)
+        if not self.region.everything:
+            rows = np.flatnonzero(self.region.holds(contents.points))
+            self.cropped += len(contents.points) - len(rows)
+            contents = _selected(contents, rows)
+        self._pieces.append(contents)
+        if self.side is not None or self.seen - self.cropped > self.most:
+            self._thin()
 
-    def principal(self) -> Float:
-        """Return the variances along the principal axes, of shape (3,); NaN where they are not finite."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            mean = self._sum / max(self.count, 1)
-            covariance: Float = self._products / max(self.count, 1) - np.outer(mean, mean)
-        if not np.isfinite(covariance).all():
-            return np.full(3, np.nan)
-        return np.asarray(np.linalg.eigvalsh(covariance), np.float64)
+    def result(self) -> Contents:
+        """Return the kept points with their normals, attributes and origins, in the order in which they came."""
+        return concatenated(self._pieces)
 
-    def same_as(self, other: Moments, *, least_points: int = 25, tolerance: float = 1e-5) -> bool:
-        """Whether both may be the same scan, moved or not.
+    def _thin(self) -> None:
+        kept = concatenated(self._pieces)
+        finite = np.isfinite(kept.points).all(axis=1)
+        self.non_finite += int((~finite).sum())
+        kept = _selected(kept, np.flatnonzero(finite)) if not finite.all() else kept
+        if self.side is not None and len(kept.points):
+            kept = self._first_in_each_voxel(kept)
+        while len(kept.points) and (self.side is None or len(kept.points) > self.most):
+            if self.side is None:
+                self._first, self.side = kept.points[0].copy(), 0.0
+            self.side *= 2
+            kept = self._first_in_each_voxel(kept)
+        self._pieces = [replace(kept, faces=kept.faces[:0])]
 
-        Parameters
-        ----------
-        other : moments of the other scan
-        least_points : in a scan; moments of fewer points may agree by chance
-        tolerance : of the moments, as a share of the largest: what float32 leaves of coordinates
-        """
-        if self.count != other.count or self.count < least_points:
-            return False
-        mine, theirs = self.principal(), other.principal()
-        # Comparing with NaN is false, so scans whose moments overflow never match.
-        return bool((np.abs(mine - theirs) <= tolerance * mine.max()).all())
+    def _first_in_each_voxel(self, kept: Contents) -> Contents:
+        keys = self._voxel_keys(kept.points)
+        # np.unique returns the first row of each key, and sorting the rows keeps the order of the points.
+        _, rows = np.unique(keys, return_index=True)
+        return kept if len(rows) == len(keys) else _selected(kept, np.sort(rows))
+
+    def _voxel_keys(self, points: Float) -> Int:
+        """A key for each point's voxel, of shape (N,); the side grows where the grid would be too large for 64 bits."""
+        assert self.side is not None
+        assert self._first is not None
+        # Voxels from the first point in each direction: three numbers of 21 bits fit into one key.
+        reach_voxels = 1 << 20
+        # The grid reaches at least this share of the largest coordinate, so that a quotient of the two never overflows.
+        least_share = 2.0**-40
+        # Sides are powers of two, so that dividing by them loses nothing.
+        reach = float(np.maximum(np.abs(points / 2 - self._first / 2), least_share * np.abs(points)).max())
+        least = 2.0 ** np.floor(np.log2(max(reach, np.finfo(np.float64).tiny / least_share)) + 2) / reach_voxels
+        self.side = max(self.side, float(least))
+        corner = np.floor(points / self.side - self._first / self.side)
+        # Numbers from 0 to 2^21 - 1, so that keys order and compare as one integer.
+        x, y, z = corner.astype(np.int64).T + reach_voxels
+        keys: Int = (x << 42) | (y << 21) | z
+        return keys
 
 
-def same_scans(files: Sequence[str], moments: Sequence[Moments]) -> tuple[tuple[str, str], ...]:
-    """Return pairs of files that hold the same scan, each file at most once as the second one."""
-    found = []
-    for index, name in enumerate(files):
-        earlier = (other for other in range(index) if moments[other].same_as(moments[index]))
-        if (first := next(earlier, None)) is not None:
-            found.append((files[first], name))
-    return tuple(found)
+def _selected(contents: Contents, rows: Int) -> Contents:
+    return replace(
+        contents,
+        points=contents.points[rows],
+        normals=None if contents.normals is None else contents.normals[rows],
+        faces=contents.faces[:0],
+        attributes={name: values[rows] for name, values in contents.attributes.items()},
+        origins=None if contents.origins is None else contents.origins[rows],
+    )
+
+
+def read_chunks(
+    path: Path, extension: str, columns: Sequence[str] = (), *, parameters: IOParameters = IOParameters()
+) -> Iterator[Contents]:
+    """Yield the contents of a file by chunks; those of formats that must be read as a whole in one.
+
+    `UsageError` is raised when columns are named of a file that is no table.
+    """
+    if columns and extension in (".npy", ".npz"):
+        yield read_npy(path, columns)
+    elif columns and extension not in TABLE_SUFFIXES:
+        raise UsageError(f"--columns names the columns of tables, but {extension[1:].upper()} files are none.")
+    elif columns:
+        yield from table_chunks(path, parameters.chunk_points, columns)
+    elif extension in CHUNK_READERS:
+        yield from CHUNK_READERS[extension](path, parameters.chunk_points)
+    elif read := reader_of(extension):
+        yield read(path)

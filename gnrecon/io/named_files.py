@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
@@ -15,37 +15,28 @@ from gnrecon.io.read import extension_of
 from gnrecon.runtime.errors import InputError
 
 
-def input_files(path: Path, format: str | None = None) -> list[Path]:
-    """Return a scan's file and all existing files that it refers to, each once, also where they are not read.
-
-    A file that cannot be parsed refers to none; its reader reports what is wrong with it.
-
-    Parameters
-    ----------
-    path : the scan's file
-    format : extension that says how the file is read, such as ``"conf"``; by default its own
-    """
-    extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
-    parsers = {".conf": _named_by_conf, ".gltf": _named_by_gltf, ".obj": _named_by_obj, ".ply": _named_by_ply}
-    found = [path]
-    if extension not in parsers:
-        return found
-    # A name may be longer than the system allows.
-    with suppress(InputError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        # What a pipe holds can be read only once.
-        for name in parsers[extension](path) if path.is_file() else ():
-            if (file := path.parent / name).is_file():
-                found.append(file)
-    return list(dict.fromkeys(found))
-
-
 def all_input_files(paths: Iterable[Path], format: str | None = None) -> list[Path]:
-    """Return all files that scans are read from, see `input_files`; none of them may be overwritten."""
-    return [file for path in paths for file in input_files(path, format)]
+    """Return the files of scans and all existing files that they refer to, each once; none may be overwritten.
 
-
-def _named_by_conf(path: Path) -> list[str]:
-    return [pose.file for pose in parse_conf(read_text(path))]
+    A file that cannot be parsed refers to none; its reader reports what is wrong with it. `format` is the extension
+    that says how the files are read, such as ``"conf"``; by default their own.
+    """
+    parsers: dict[str, Callable[[Path], Iterable[str]]] = {
+        ".conf": lambda scan: [pose.file for pose in parse_conf(read_text(scan))],
+        ".gltf": _named_by_gltf,
+        ".obj": _named_by_obj,
+        ".ply": lambda scan: _words_after(scan, rb"comment[ \t]+TextureFile"),
+    }
+    found: dict[Path, None] = {}
+    for path in paths:
+        found[path] = None
+        extension = extension_of(path) if format is None else f".{format.lower().removeprefix('.')}"
+        # A name may be longer than the system allows, and what a pipe holds can be read only once.
+        with suppress(InputError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            for name in parsers[extension](path) if extension in parsers and path.is_file() else ():
+                if (file := path.parent / name).is_file():
+                    found[file] = None
+    return list(found)
 
 
 def _named_by_gltf(path: Path) -> Iterator[str]:
@@ -62,10 +53,6 @@ def _named_by_obj(path: Path) -> Iterator[str]:
         yield material
         if (path.parent / material).is_file():
             yield from _words_after(path.parent / material, rb"(?:map_\w+|bump|disp|decal|refl|norm)")
-
-
-def _named_by_ply(path: Path) -> list[str]:
-    return _words_after(path, rb"comment[ \t]+TextureFile")
 
 
 def _words_after(path: Path, keyword: bytes, *, head_bytes: int = 1_000_000) -> list[str]:

@@ -1,4 +1,7 @@
-"""Parses and formats numbers in text files, exactly, and resolves names of files within a file."""
+"""Parses and formats numbers in text files, exactly, and resolves names of files within a file.
+
+What is not as it should be ends in an `InputError` of one sentence.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,7 @@ OPEN_FILES = Path("/proc/self/fd")
 
 
 def read_text(path: Path) -> str:
-    """Return the file as text, without a byte-order mark.
-
-    Raises
-    ------
-    InputError
-        When the file holds zero bytes, so it is not text.
-    """
+    """Return the file as text, without a byte-order mark; zero bytes are refused."""
     data = path.read_bytes()
     if b"\0" in data:
         raise InputError("expected text, but the file holds binary data.")
@@ -31,13 +28,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_numbers(words: Sequence[str]) -> Float:
-    """Return the words as an array of shape (len(words),).
-
-    Raises
-    ------
-    InputError
-        At the first word that is not a number.
-    """
+    """Return the words as an array of shape (len(words),)."""
     try:
         return np.fromiter(map(float, words), np.float64, len(words))
     except ValueError as error:
@@ -46,13 +37,7 @@ def parse_numbers(words: Sequence[str]) -> Float:
 
 
 def parse_rows(lines: Sequence[str], what: str) -> Float:
-    """Return the numbers of all lines, as an array of at least 3 columns; `what` names the lines in messages.
-
-    Raises
-    ------
-    InputError
-        When a word is not a number, or lines differ in length or hold fewer than 3.
-    """
+    """Return the numbers of all lines, equally many of at least 3 in each; `what` names the lines in messages."""
     if not lines:
         return np.empty((0, 3))
     columns = len(lines[0].split())
@@ -75,25 +60,13 @@ def format_rows(template: str, rows: Values, *, block_rows: int = 100_000) -> li
     return blocks
 
 
-def content_lines(text: str, comment: str = "#") -> list[str]:
-    """Return the lines that are neither blank nor comments, without trailing comments."""
-    return [line for row in text.splitlines() if (line := row.partition(comment)[0].strip())]
-
-
 def sibling_path(folder: Path, name: str, what: str) -> Path:
     """Return the path of a file named by another in `folder`; `what` describes it in messages.
 
-    A file outside of the folder is never read, whatever the name says.
-
-    Raises
-    ------
-    InputError
-        When the name points outside of the folder, or the file was unpacked or streamed, so that it lies in none.
+    A file outside of the folder is never read, whatever the name says, nor any next to a copy of compressed data.
     """
     if folder == OPEN_FILES:
-        raise InputError(
-            f"the {what} {name[:80]!r} lies next to it, which is not searched for compressed files and streams; unpack it."
-        )
+        raise InputError(f"the {what} {name[:80]!r} lies next to it, where compressed files have none; unpack it.")
     target = folder / name
     if not target.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"the {what} {name[:80]!r} lies outside of the file's folder, so it is not read.")
@@ -103,17 +76,8 @@ def sibling_path(folder: Path, name: str, what: str) -> Path:
 def require_buildable(instances: int, numbers: int, stored: int, most_instances: int) -> None:
     """Refuse a scene that uses what it stores so often that it takes minutes or all memory to build.
 
-    Parameters
-    ----------
-    instances : objects that the scene builds
-    numbers : coordinates, indices and attributes' values of all of them
-    stored : how many of them the file itself can hold
-    most_instances : that are built within a minute
-
-    Raises
-    ------
-    InputError
-        When it does.
+    It builds so many instances of objects, of which `most_instances` take a minute, with so many coordinates, indices
+    and attributes' values, of which the file itself can hold `stored`.
     """
     if instances > most_instances or numbers > max(IOParameters.most_built_numbers, stored):
         raise InputError(f"the scene builds {instances:,} objects with {numbers:,} numbers, more than can be read.")

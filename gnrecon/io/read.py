@@ -1,22 +1,32 @@
 """Reads a file as a cloud, as a mesh, or as whichever it holds; every malformed file gives one `InputError`.
 
-The source may be a file, a gzip-compressed file, or standard input, see `gnrecon.io.unpacking`.
+The source may be a file, a gzip-compressed file, or standard input. Readers seek, compare sizes and pass names to
+libraries, so what is no plain file is copied into one first. Where the system allows, the copy has no name: it is read
+by its number among the process's open files, and its space is free again as soon as the process has ended, also when it
+was killed. Readers of plugins, which may want a name with an extension, get a link to it in a temporary folder.
 """
 
 from __future__ import annotations
 
+import gzip
 import logging
+import os
+import shutil
+import sys
+import tempfile
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.io.contents import Contents, without_faces
+from gnrecon.io.contents import Contents
 from gnrecon.io.format_registry import READERS, SIGNATURES, is_readable, readable, reader_of
-from gnrecon.io.unpacking import uncompressed_file
+from gnrecon.io.parse import OPEN_FILES
 from gnrecon.runtime.errors import InputError, MemoryLimitError, UsageError
 from gnrecon.runtime.files import is_standard_input
 
@@ -43,8 +53,7 @@ def read_cloud(path: str | Path, format: str | None = None) -> PointCloud:
     """
     contents = read_contents(Path(path), format)
     with input_errors_for(Path(path)):
-        found = without_faces(contents)
-    return PointCloud(found.points, found.normals, found.attributes, found.origins)
+        return contents.cloud()
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -62,24 +71,12 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def read_reference(path: str | Path) -> Mesh | PointCloud:
-    """Read a mesh where the file has faces, else a cloud.
-
-    Raises
-    ------
-    InputError
-        As `read_cloud` does.
-    """
+    """Read a mesh where the file has faces, else a cloud; the errors are those of `read_cloud`."""
     return read_any(path)[0]
 
 
 def read_any(path: str | Path) -> tuple[Mesh | PointCloud, tuple[str, ...]]:
-    """Read a mesh where the file has faces, else a cloud; and describe what else the file holds, which is not read.
-
-    Raises
-    ------
-    InputError
-        As `read_cloud` does.
-    """
+    """Read as `read_reference` does, and describe what else the file holds, which is not read."""
     contents = read_contents(Path(path), None)
     with input_errors_for(Path(path)):
         return contents.shape(), contents.unread
@@ -104,9 +101,8 @@ def opened(path: Path, format: str | None) -> Iterator[tuple[Path, str]]:
     The arguments are those of `read_cloud`, and so are the errors, into which every failure in the block is turned.
     """
     if format is None and is_standard_input(path):
-        raise UsageError(
-            f"Standard input has no extension: say with --format how to read it, as one of {_supported()}."
-        )
+        how = f"say with --format how to read it, as one of {_supported()}"
+        raise UsageError(f"Standard input has no extension: {how}.")
     extension = extension_of(path) if format is None else f".{format.lower().lstrip('.')}"
     if format is not None and not is_readable(extension):
         raise UsageError(f"The format {format!r} is not supported; expected one of {_supported()}.")
@@ -155,12 +151,11 @@ def _check_file(path: Path, extension: str) -> None:
     if not is_readable(extension):
         if extension == ".gnr":
             raise InputError("this is a fitted field, not a scan or a mesh: gnrecon mesh MODEL -o MESH meshes it.")
-        raise InputError(
-            f"the extension {extension!r} is not supported; expected one of {_supported()} (see --format)."
-        )
+        known = f"expected one of {_supported()} (see --format)"
+        raise InputError(f"the extension {extension!r} is not supported; {known}.")
     if extension not in READERS:
         return  # the signatures of plugin formats are unknown
-    kind = next((kind for signature, kind in SIGNATURES.items() if head.startswith(signature)), extension)
+    kind = next((kind for kind, signatures in SIGNATURES.items() if head.startswith(signatures)), extension)
     # LAS and LAZ have the same signature and reader; 3MF files are ZIP archives.
     if kind == extension or {kind, extension} in ({".las", ".laz"}, {"ZIP archive", ".3mf"}, {"ZIP archive", ".npz"}):
         return
@@ -172,3 +167,89 @@ def _check_file(path: Path, extension: str) -> None:
 def extension_of(path: Path) -> str:
     """Return the extension that says how a file is read, in lower case; ``.gz`` is skipped."""
     return Path(path.stem if path.suffix.lower() == ".gz" else path.name).suffix.lower()
+
+
+@contextmanager
+def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
+    """Yield a plain file with the data to read: the file itself, or a temporary copy of compressed data or a stream.
+
+    The extension, with its dot, says how it is to be read; a copy with a name has it. Damaged data, and more than a
+    scan can hold or the disk takes, ends in an `InputError`, and a terminal as standard input in a `UsageError`.
+    """
+    if not is_standard_input(path) and not _is_compressed(path):
+        yield path
+        return
+    with _temporary(f"stream{extension}", extension) as stream, _temporary(f"unpacked{extension}", extension) as target:
+        source = path
+        if is_standard_input(path):
+            if sys.stdin.isatty():
+                example = "gnrecon - --format xyz < scan.xyz"
+                raise UsageError(f"Standard input is a terminal; send it a file, as in: {example}")
+            _copy(sys.stdin.buffer, stream, None)
+            source = stream
+        if not _is_compressed(source):
+            yield source
+            return
+        try:
+            with gzip.open(source) as unpacking:
+                _copy(unpacking, target, source.stat().st_size)
+        except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+            raise InputError(f"the compressed data is damaged ({error}).") from None
+        yield target
+
+
+@contextmanager
+def _temporary(name: str, extension: str) -> Iterator[Path]:
+    """Yield the path of an empty temporary file, without a name where that is possible."""
+    with ExitStack() as stack:
+        if extension not in READERS or not OPEN_FILES.is_dir():
+            named = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gnrecon-"))) / name
+        if not OPEN_FILES.is_dir():
+            yield named
+            return
+        file = stack.enter_context(tempfile.TemporaryFile(prefix="gnrecon-"))
+        if extension in READERS:
+            yield OPEN_FILES / str(file.fileno())
+            return
+        # A reader may give the name to another process.
+        named.symlink_to(f"/proc/{os.getpid()}/fd/{file.fileno()}")
+        yield named
+
+
+def _is_compressed(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"  # the magic number of gzip
+
+
+def _copy(
+    source: BinaryIO | gzip.GzipFile,
+    target: Path,
+    packed_bytes: int | None,
+    *,
+    most_disk_share: float = 0.9,
+    most_ratio: float = 200.0,
+    least_suspect_bytes: int = 100_000_000,
+    chunk_bytes: int = 1 << 20,
+) -> None:
+    """Copy a stream into a file, by chunks.
+
+    Parameters
+    ----------
+    packed_bytes : size of the compressed data, None of other data
+    most_disk_share : of the free space that the copy may take, so that other programs have some left
+    most_ratio, least_suspect_bytes : larger copies of data that was compressed more than this are refused; gzip reaches
+        1,000 with bytes that are all the same, and scans 3 to 20
+    """
+    folder = tempfile.gettempdir()
+    most, copied = int(most_disk_share * shutil.disk_usage(folder).free), 0
+    too_much = f"it takes more than {most / 1e9:,.1f} GB, {100 * most_disk_share:.0f} % of what is free in {folder}, "
+    with target.open("wb") as file:
+        while chunk := source.read(chunk_bytes):
+            copied += len(chunk)
+            if copied > most:
+                raise InputError(f"unpacked, {too_much}where it is unpacked; TMPDIR names another folder.")
+            if packed_bytes is not None and copied > max(least_suspect_bytes, most_ratio * packed_bytes):
+                raise InputError(f"it unpacks to more than {most_ratio:.0f} times its size, as no scan does.")
+            file.write(chunk)

@@ -19,7 +19,7 @@ from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.geometry.units import parse_plane
 from gnrecon.io import cropped, read_scans
 from gnrecon.io.contents import Contents
-from gnrecon.io.streaming import VoxelThinning
+from gnrecon.io.merge import VoxelThinning
 from gnrecon.options import Options
 from gnrecon.runtime.errors import UsageError
 

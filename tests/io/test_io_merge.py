@@ -10,8 +10,8 @@ from made_shapes import sphere
 from scan_files import torus, write_scan
 from scipy.spatial.transform import Rotation
 
+from gnrecon.geometry.moments import Moments
 from gnrecon.io import read_scans
-from gnrecon.io.merge import Moments
 
 
 def moments(*chunks: np.ndarray) -> Moments:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gnrecon.io.named_files import input_files
+from gnrecon.io.named_files import all_input_files
 
 GLTF = {"buffers": [{"uri": "../a b.bin"}, {}, {"uri": "a%20b.bin"}], "images": [{"bufferView": 0}, {"uri": "t.png"}]}
 
@@ -33,12 +33,12 @@ def test_files_are_found_by_their_names(tmp_path: Path, name: str, text: str, na
     (tmp_path / "a b.mtl").write_text("newmtl a\n map_Kd -s 1 1 1 t.png\n")
     (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\nbump s.png\n")
     (tmp_path / name).write_text(text)
-    assert input_files(tmp_path / name) == [tmp_path / name, *(tmp_path / one for one in named)]
+    assert all_input_files([tmp_path / name]) == [tmp_path / name, *(tmp_path / one for one in named)]
     copy = tmp_path / "copy"
     (tmp_path / name).rename(copy)
-    assert input_files(copy, name.rpartition(".")[2]) == [copy, *(tmp_path / one for one in named)]
+    assert all_input_files([copy], name.rpartition(".")[2]) == [copy, *(tmp_path / one for one in named)]
 
 
 def test_a_pipe_is_left_to_its_reader(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "u.obj")
-    assert input_files(tmp_path / "u.obj") == [tmp_path / "u.obj"]
+    assert all_input_files([tmp_path / "u.obj"]) == [tmp_path / "u.obj"]

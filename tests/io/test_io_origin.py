@@ -10,7 +10,7 @@ import pytest
 from gnrecon.export import require_sound, verify_file
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_mesh, write_mesh, written_origin
-from gnrecon.io.origin import format_origin, parse_origin, stl_header
+from gnrecon.io.formats.stl import format_origin, parse_origin, stl_header
 
 UTM = np.array([512_345.678, 4_123_456.789, 123.4])
 

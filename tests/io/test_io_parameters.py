@@ -12,7 +12,7 @@ from scan_writers import file_of, random_cloud
 
 import gnrecon.io
 from gnrecon.io import IOParameters, read_scans
-from gnrecon.io.streaming import read_chunks
+from gnrecon.io.merge import read_chunks
 from gnrecon.options import Options
 
 
@@ -36,12 +36,11 @@ def test_scans_are_thinned_to_the_most_points(tmp_path: Path) -> None:
     np.testing.assert_array_equal(whole.points, read_scans([path], parameters=IOParameters())[0].points)
 
 
-def test_only_large_files_are_read_by_chunks(tmp_path: Path) -> None:
+def test_files_are_read_by_chunks(tmp_path: Path) -> None:
     path = file_of("ply", random_cloud(np.random.default_rng(3), 100), tmp_path)
 
     def sizes(parameters: IOParameters) -> list[int]:
         return [len(chunk.points) for chunk in read_chunks(path, ".ply", parameters=parameters)]
 
-    assert sizes(IOParameters(chunked_file_bytes=0, chunk_points=40)) == [40, 40, 20]
-    assert sizes(IOParameters(chunked_file_bytes=path.stat().st_size + 1, chunk_points=40)) == [100]
+    assert sizes(IOParameters(chunk_points=40)) == [40, 40, 20]
     assert [len(chunk.points) for chunk in read_chunks(path, ".ply")] == sizes(IOParameters()) == [100]

@@ -14,7 +14,7 @@ from gnrecon.io import IOParameters, read_cloud, read_scans
 from gnrecon.io.contents import Contents
 from gnrecon.io.format_registry import CHUNK_READERS
 from gnrecon.io.formats.stanford_conf import parse_conf
-from gnrecon.io.streaming import VoxelThinning
+from gnrecon.io.merge import VoxelThinning
 from gnrecon.runtime.errors import InputError
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -104,7 +104,7 @@ def test_chunks_make_no_difference(name: str, tmp_path: Path) -> None:
     path = file_of(name, random_cloud(np.random.default_rng(5), 100), tmp_path)
     whole, _ = read_scans([path])
     for rows in (7, 50, 1000):
-        cloud, reading = read_scans([path], parameters=IOParameters(chunked_file_bytes=0, chunk_points=rows))
+        cloud, reading = read_scans([path], parameters=IOParameters(chunk_points=rows))
         np.testing.assert_array_equal(cloud.points, whole.points)
         assert (cloud.normals is None) == (whole.normals is None)
         assert cloud.normals is None or np.array_equal(cloud.normals, whole.normals)
@@ -166,7 +166,7 @@ def test_more_points_than_are_to_be_kept(rng: np.random.Generator, tmp_path: Pat
 
 
 def test_large_files_that_are_damaged(tmp_path: Path) -> None:
-    parameters = IOParameters(chunked_file_bytes=0, chunk_points=8)
+    parameters = IOParameters(chunk_points=8)
     for name in ("ply", "xyz", "las", "laz", "ptx"):
         path = file_of(name, random_cloud(np.random.default_rng(1), 50), tmp_path)
         path.write_bytes(path.read_bytes()[:-300] + b"\n0 0 a\n")

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gnrecon.io import read_cloud, unpacking
+from gnrecon.io import read, read_cloud
 from gnrecon.io.parse import OPEN_FILES
 from gnrecon.runtime.errors import InputError
 
@@ -36,14 +36,14 @@ def test_what_no_scan_is_like_is_refused(tmp_path: Path) -> None:
     bomb = tmp_path / "bomb.gz"
     bomb.write_bytes(gzip.compress(bytes(1_000_000)))
     with gzip.open(bomb) as source, pytest.raises(InputError, match="more than 200 times its size"):
-        unpacking._copy(source, tmp_path / "copy", bomb.stat().st_size, least_suspect_bytes=100_000)
+        read._copy(source, tmp_path / "copy", bomb.stat().st_size, least_suspect_bytes=100_000)
 
 
 def test_a_full_disk_is_named(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(unpacking, "_copy", full)
+    monkeypatch.setattr(read, "_copy", full)
     with pytest.raises(InputError, match=r"scan.xyz.gz: the file cannot be read: No space left on device"):
         read_cloud(packed)
 
@@ -57,7 +57,7 @@ def test_nothing_of_the_data_is_left_after_a_kill(packed: Path, tmp_path: Path, 
     child = os.fork()
     if child == 0:
         tempfile.tempdir = str(temporary)
-        with unpacking.uncompressed_file(packed, extension) as file:
+        with read.uncompressed_file(packed, extension) as file:
             os.write(writer, f"{len(file.read_text().splitlines())} {file.suffix}".encode())
             os.kill(os.getpid(), signal.SIGKILL)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
@@ -73,12 +73,12 @@ def test_compressed_files_name_no_files_next_to_them(tmp_path: Path, name: str, 
     (tmp_path / "0").write_text("x")
     path = tmp_path / f"{name}.gz"
     path.write_bytes(gzip.compress(content.replace("%s", '{"uri": "0", "byteLength": 1}').encode()))
-    with pytest.raises(InputError, match=r"'0' lies next to it, which is not searched for compressed files"):
+    with pytest.raises(InputError, match=r"'0' lies next to it, where compressed files have none"):
         read_cloud(path)
 
 
 def test_a_copy_has_a_name_where_open_files_have_no_number(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unpacking, "OPEN_FILES", Path("/nowhere"))
-    with unpacking.uncompressed_file(packed, ".xyz") as file:
+    monkeypatch.setattr(read, "OPEN_FILES", Path("/nowhere"))
+    with read.uncompressed_file(packed, ".xyz") as file:
         assert (file.name, len(file.read_text().splitlines())) == ("unpacked.xyz", 200)
     assert not file.parent.exists()

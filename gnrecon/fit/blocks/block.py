@@ -26,6 +26,7 @@ from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.octree import Codes, DipoleTree, morton_codes, ranges
+from gnrecon.geometry.open_scenes import WindingLevel
 from gnrecon.geometry.signed_distance import Box
 
 
@@ -91,7 +92,7 @@ class BlockSolver:
             first=array("first"),
             keys=array("keys"),
             ends=array("ends"),
-            dipoles=DipoleTree.of_arrays(array, facts["levels"]),
+            dipoles=DipoleTree.of_arrays(array, facts["levels"], WindingLevel(facts["principal"])),
             network=Siren(tuple(facts["widths"])),
             theta=theta,
             box=Box(*array("box")),

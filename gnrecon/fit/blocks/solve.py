@@ -34,6 +34,7 @@ from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.octree import DipoleTree, morton_codes, octree_blocks
 from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import scene_dipoles
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import worker_count
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
@@ -122,7 +123,7 @@ def _task_data(
     keys, ends = _divided(
         _occupied_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points
     )
-    dipoles = DipoleTree.of(residuals.points, residuals.normals, density.disks)
+    dipoles = DipoleTree.of(residuals.points, *scene_dipoles(residuals.points, residuals.normals, density.disks))
     arrays = {
         "points": residuals.points[order],
         "normals": residuals.normals[order],
@@ -143,6 +144,7 @@ def _task_data(
     facts = {
         "widths": list(sdf.field.widths),
         "levels": len(dipoles.levels),
+        "principal": dipoles.sides.principal,
         "cell": partition.cell,
         "overlap": partition.overlap,
         "radius": density.radius,

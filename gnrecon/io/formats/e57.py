@@ -56,20 +56,17 @@ def _scan(file: Any, header: Any) -> Contents:
     types = dict.fromkeys(position, "f8") | {name: kind for name, (_, kind) in others.items()}
     values = _read(file, header, types | {name: "i1" for name in states if name in fields})
     valid = np.ones(header.point_count, bool)
-    for name in states:
-        # In state 1, only the direction is known.
-        valid &= values.pop(name, np.zeros(len(valid), np.int8)) == 0
+    for name in fields.intersection(states):
+        valid &= values.pop(name) == 0  # in state 1, only the direction is known
     values = {name: column[valid] for name, column in values.items()}
     points = np.column_stack([values[name] for name in position])
-    rotation, translation = np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)
-    points = (points if position is cartesian else convert_spherical_to_cartesian(points)) @ rotation.T + translation
+    points = points if position is cartesian else convert_spherical_to_cartesian(points)
     found = from_columns({label: values[name] for name, (label, _) in others.items()}, None, points)
-    attributes = dict(found.attributes)
-    if "colors" in attributes:
-        attributes["colors"] = _colors(attributes["colors"], colors, header)
-    normals = None if found.normals is None else found.normals @ rotation.T
-    origins = np.broadcast_to(translation, points.shape) if header.has_pose() else None
-    return replace(found, normals=normals, attributes=attributes, origins=origins)
+    if "colors" in found.attributes:
+        shades = {"colors": _colors(found.attributes["colors"], colors, header)}
+        found = replace(found, attributes={**found.attributes, **shades})
+    rotation, translation = np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)
+    return found.moved(rotation, translation, translation if header.has_pose() else None)
 
 
 def _read(file: Any, header: Any, types: dict[str, str]) -> dict[str, npt.NDArray[Any]]:

@@ -64,16 +64,18 @@ def read_gltf(path: Path) -> Contents:
         for buffer in tree.get("buffers", []):
             uri = buffer.setdefault("uri", "")
             if not uri.startswith("data:"):
-                buffers[uri] = _sibling(uri, path.parent) if uri else chunk
+                buffers[uri] = _buffer(uri, path.parent) if uri else chunk
                 if len(buffers[uri]) < int(buffer["byteLength"]):
                     raise InputError(f"a buffer ends after {len(buffers[uri])} of {buffer['byteLength']} bytes.")
         _prepare(tree, len(data) + sum(map(len, buffers.values())))
         file = trimesh.util.wrap_as_stream(json.dumps(tree))
         scene = trimesh.load_scene(file, file_type="gltf", resolver=buffers, process=False, skip_materials=True)
-        return _collected(scene, _unread(text))
+        names = {"TEXCOORD_0": "texture coordinates"} | {name: name for name in ("textures", "animations", "skins")}
+        unread = tuple(name for word, name in names.items() if f'"{word}"'.encode() in text)
+        return _collected(scene, unread)
 
 
-def _sibling(uri: str, folder: Path) -> bytes:
+def _buffer(uri: str, folder: Path) -> bytes:
     """The bytes of a file in or below the scene's folder."""
     target = sibling_path(folder, unquote(uri), "buffer")
     if not target.is_file():
@@ -84,8 +86,7 @@ def _sibling(uri: str, folder: Path) -> bytes:
 def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
     """All meshes and clouds of a scene, in one."""
     pieces = []
-    for node in scene.graph.nodes_geometry:
-        matrix, name = scene.graph[node]
+    for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry):
         part = scene.geometry[name]
         faces = np.asarray(part.faces, np.int64)
         faces = faces[:0] if np.array_equal(faces, [[0, 0, 0]]) else faces
@@ -101,31 +102,18 @@ def _collected(scene: Any, unread: tuple[str, ...]) -> Contents:
     if not len(found.points):
         raise InputError("the file holds no vertices.")
     given = found.normals if found.normals is not None and found.normals.any() else None
-    return replace(
-        found, normals=given, attributes=without_opaque_alpha(found.attributes), unread=unread + found.unread
-    )
-
-
-def _unread(text: bytes) -> tuple[str, ...]:
-    """Describe what else the file's JSON declares."""
-    names = {
-        b"TEXCOORD_0": "texture coordinates",
-        b"textures": "textures",
-        b"animations": "animations",
-        b"skins": "skins",
-    }
-    return tuple(name for word, name in names.items() if b'"' + word + b'"' in text)
+    held = without_opaque_alpha(found.attributes)
+    return replace(found, normals=given, attributes=held, unread=unread + found.unread)
 
 
 def _prepare(tree: dict[str, Any], size: int) -> None:
     """Make colours a custom attribute, and points triangles, so that trimesh reads both in full."""
     _require_bounded(tree, size)
-    for mesh in tree.get("meshes", []):
-        for primitive in mesh["primitives"]:
-            _rename(primitive["attributes"], "COLOR_0", "_COLOR_0")
-            if primitive.get("mode") == 0:  # points; mode 4 is triangles, component type 5121 is unsigned bytes
-                tree["accessors"].append({"componentType": 5121, "type": "SCALAR", "count": 3})
-                primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
+    for primitive in (primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]):
+        _rename(primitive["attributes"], "COLOR_0", "_COLOR_0")
+        if primitive.get("mode") == 0:  # points; mode 4 is triangles, component type 5121 is unsigned bytes
+            tree["accessors"].append({"componentType": 5121, "type": "SCALAR", "count": 3})
+            primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
 
 
 def _require_bounded(tree: dict[str, Any], size: int, *, most_parts: int = 10_000) -> None:
@@ -141,9 +129,9 @@ def _require_bounded(tree: dict[str, Any], size: int, *, most_parts: int = 10_00
         held = size if view is None else min(size, int(views[view]["byteLength"]))
         if not 0 <= count <= held or zeros > size:
             raise InputError(f"an accessor declares {count} values, more than the file holds.")
-    used = _nodes_with_meshes(tree)
-    numbers = [_numbers(tree, mesh) for mesh in range(len(tree.get("meshes", [])))]
-    parts = sum(len(tree["meshes"][mesh]["primitives"]) for mesh in used)
+    meshes, used = tree.get("meshes", []), _nodes_with_meshes(tree)
+    numbers = [sum(_numbers(tree, primitive) for primitive in mesh["primitives"]) for mesh in meshes]
+    parts = sum(len(meshes[mesh]["primitives"]) for mesh in used)
     require_buildable(parts, sum(numbers[mesh] for mesh in used), size, most_parts)
 
 
@@ -165,15 +153,11 @@ def _nodes_with_meshes(tree: dict[str, Any], *, most_steps: int = 500_000) -> li
     return [nodes[place]["mesh"] for place in found]
 
 
-def _numbers(tree: dict[str, Any], mesh: int) -> int:
-    """Coordinates, indices and attributes' values of a mesh."""
-    places = [
-        place
-        for primitive in tree["meshes"][mesh]["primitives"]
-        for place in [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
-    ]
-    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
-    return sum(columns.get(tree["accessors"][place]["type"], 4) * tree["accessors"][place]["count"] for place in places)
+def _numbers(tree: dict[str, Any], primitive: dict[str, Any]) -> int:
+    """Coordinates, indices and attributes' values of a part of a mesh."""
+    places = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+    columns, accessors = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}, [tree["accessors"][place] for place in places]
+    return sum(columns.get(accessor["type"], 4) * int(accessor["count"]) for accessor in accessors)
 
 
 def _rename(names: dict[str, Any], old: str, new: str) -> None:
@@ -201,9 +185,8 @@ def write_glb(mesh: Mesh, path: Path) -> None:
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     matrix = np.eye(4)
     matrix[:3, 3] = middle
-    attributes: dict[str, Any] = {
-        f"_{name.upper()}": values.astype(np.float32) for name, values in mesh.attributes.items() if name != "colors"
-    }
+    others = {name: values for name, values in mesh.attributes.items() if name != "colors"}
+    attributes: dict[str, Any] = {f"_{name.upper()}": values.astype(np.float32) for name, values in others.items()}
     if "colors" in mesh.attributes:
         light = to_linear(with_alpha(as_bytes(mesh.attributes["colors"])))
         attributes["_COLOR_0"] = np.rint(light * np.iinfo(np.uint16).max).astype(np.uint16)
@@ -225,7 +208,6 @@ def _set_colors_and_material(tree: dict[str, Any]) -> None:
     primitive = tree["meshes"][0]["primitives"][0]
     _rename(primitive["attributes"], "_COLOR_0", "COLOR_0")
     if "COLOR_0" in primitive["attributes"]:
-        accessor = tree["accessors"][primitive["attributes"]["COLOR_0"]]
-        accessor["normalized"] = True
+        tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
     tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
     primitive["material"] = 0

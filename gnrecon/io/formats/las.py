@@ -13,7 +13,6 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,27 +40,21 @@ def las_chunks(path: Path, rows: int, *, most_chunk_bytes: int = 1 << 28) -> Ite
     _require_consistent_header(path)
     # The parallel decompressor trusts the sizes in a damaged file and aborts the process.
     backend = laspy.LazBackend.Lazrs
-    with (
-        path.open("rb") as file,
-        guard_parser("LAS or LAZ"),
-        _memory_error_as_damage(),
-        laspy.open(file, closefd=False, laz_backend=backend) as reader,
-    ):
-        left = reader.header.point_count
-        rows = max(1, min(rows, most_chunk_bytes // max(reader.header.point_format.size, 1)))
-        for chunk in reader.chunk_iterator(rows):
-            left -= len(chunk)
-            yield _contents(chunk)
-        if left:
-            raise InputError(f"the header declares {reader.header.point_count} points, but {left} of them are missing.")
-
-
-@contextmanager
-def _memory_error_as_damage() -> Iterator[None]:
-    """Report a lack of memory as damage: chunks are small, so only damaged sizes can require so much."""
     try:
-        yield
-    except MemoryError:
+        with (
+            path.open("rb") as file,
+            guard_parser("LAS or LAZ"),
+            laspy.open(file, closefd=False, laz_backend=backend) as reader,
+        ):
+            count = left = reader.header.point_count
+            rows = max(1, min(rows, most_chunk_bytes // max(reader.header.point_format.size, 1)))
+            for chunk in reader.chunk_iterator(rows):
+                left -= len(chunk)
+                found = _contents(chunk)
+                yield drop_unused_attributes(found) if len(chunk) == count else found
+            if left:
+                raise InputError(f"the header declares {count} points, but {left} of them are missing.")
+    except MemoryError:  # chunks are small, so only damaged sizes can require so much
         raise InputError("the header declares records that are larger than this machine's memory.") from None
 
 

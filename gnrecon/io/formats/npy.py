@@ -26,9 +26,9 @@ def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
     with guard_parser("NPY or NPZ"):
         arrays = _arrays(path)
     found = {name.lower(): name for name in arrays}
-    usual = ("points", "xyz", "positions", "coords", "vertices", "pc", "pos", "data")
-    chosen = next((found[name] for name in usual if name in found), next(iter(arrays)) if len(arrays) == 1 else None)
-    if chosen is None:
+    usual = ["points", "xyz", "positions", "coords", "vertices", "pc", "pos", "data"]
+    usual += found if len(found) == 1 else []
+    if (chosen := next((found[name] for name in usual if name in found), None)) is None:
         if {"x", "y", "z"} <= found.keys():
             return from_columns({name: values for name, values in arrays.items() if values.ndim == 1})
         raise InputError(f"the archive holds the arrays {', '.join(arrays)[:200]}, but none named points.")
@@ -67,16 +67,12 @@ def _cloud(values: Values, columns: Sequence[str]) -> Contents:
         records: Any = values
         return from_columns({name: records[name].ravel() for name in values.dtype.names})
     if values.dtype.kind not in "iuf" or values.ndim < 2:
-        raise InputError(
-            f"expected numbers of shape (N, 3) or more columns, but found {values.dtype} of {values.shape}."
-        )
+        what = f"{values.dtype} of {values.shape}"
+        raise InputError(f"expected numbers of shape (N, 3) or more columns, but found {what}.")
     table = values.reshape(-1, values.shape[-1])
     if table.shape[1] > 64 or (values.ndim == 2 and values.shape[0] == 3 < values.shape[1]):
         raise InputError(f"expected rows of points, but found an array of shape {values.shape}; transpose it.")
-    numbers, remarks = table.astype(np.float64), tuple[str, ...]()
-    if columns:
-        names = named_by_user(columns, table.shape[1])
-    else:
-        names, remarks = guessed(numbers, range(table.shape[1]))
+    numbers, width = table.astype(np.float64), table.shape[1]
+    names, remarks = (named_by_user(columns, width), ()) if columns else guessed(numbers, range(width))
     named = {name: numbers[:, place] for place, name in enumerate(names) if name not in ("", "index")}
     return replace(from_columns(named), remarks=remarks)

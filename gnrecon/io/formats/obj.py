@@ -23,12 +23,15 @@ def read_obj(path: Path) -> Contents:
     """Read vertices (with colours, where they follow the position), vertex normals and faces."""
     # A backslash at the end of a line continues it.
     text = re.sub(r"\\\r?\n", " ", read_text(path))
-    lines = [line.partition("#")[0].strip() for line in text.splitlines()]
-    points, colors, lost = _vertices([line[2:] for line in lines if line.startswith(("v ", "v\t"))])
-    normals = parse_rows([line[3:] for line in lines if line.startswith(("vn ", "vn\t"))], "the 'vn' lines")
+    # The keyword of each line, and the words that follow it.
+    lines = [[*line.partition("#")[0].split(None, 1), "", ""][:2] for line in text.splitlines()]
+    points, colors, lost = _vertices([rest for word, rest in lines if word == "v"])
+    normals = parse_rows([rest for word, rest in lines if word == "vn"], "the 'vn' lines")
     if not len(points):
         raise InputError("the file holds no vertex line ('v x y z').")
-    counts, corners = _corners(lines)
+    faces = [rest.split() for word, rest in lines if word == "f"]
+    # Corners are v, v/t, v//n or v/t/n.
+    counts, corners = np.array(list(map(len, faces)), np.int64), [corner for face in faces for corner in face]
     if not len(counts):
         # Without faces nothing links normals to vertices; as many normals as vertices belong to them in order.
         given = normals[:, :3] if len(normals) == len(points) else None
@@ -53,29 +56,16 @@ def _vertices(lines: list[str]) -> tuple[Float, dict[str, Float], tuple[str, ...
     return np.ascontiguousarray(vertices[:, :3]), colors, ()
 
 
-def _unread(lines: list[str]) -> tuple[str, ...]:
+def _unread(lines: list[list[str]]) -> tuple[str, ...]:
     """Describe the lines that are not read."""
-    names = {
-        "vt": "texture coordinates",
-        "usemtl": "materials",
-        "l": "lines",
-        "p": "points",
-        "curv": "free-form curves and surfaces",
-        "surf": "free-form curves and surfaces",
-        "o": "names of objects and groups",
-        "g": "names of objects and groups",
-    }
-    kinds = {word for word in (line.partition(" ")[0] for line in lines) if word in names}
+    names = {"vt": "texture coordinates", "usemtl": "materials", "l": "lines", "p": "points"}
+    names |= dict.fromkeys(("curv", "surf"), "free-form curves and surfaces")
+    names |= dict.fromkeys(("o", "g"), "names of objects and groups")
+    kinds = {word for word, _ in lines}
     return tuple(dict.fromkeys(name for word, name in names.items() if word in kinds))
 
 
-def _corners(lines: list[str]) -> tuple[Int, list[str]]:
-    """Return the number of corners of every face, and all corner words (``v``, ``v/t``, ``v//n``, ``v/t/n``)."""
-    faces = [line[2:].split() for line in lines if line.startswith(("f ", "f\t"))]
-    return np.array([len(face) for face in faces], np.int64), [word for face in faces for word in face]
-
-
-def _indices(words: list[str], lines: list[str], counts: Int, kind: str) -> Int:
+def _indices(words: list[str], lines: list[list[str]], counts: Int, kind: str) -> Int:
     """Return zero-based indices; a negative one counts back from the lines of its `kind` that precede its face."""
     try:
         stated = np.array(list(map(int, words)), np.int64)
@@ -83,9 +73,8 @@ def _indices(words: list[str], lines: list[str], counts: Int, kind: str) -> Int:
         raise InputError("a face holds a corner that is not a vertex index.") from None
     before = np.zeros(len(words), np.int64)
     if (stated < 0).any():
-        seen = np.cumsum([line.startswith((f"{kind} ", f"{kind}\t")) for line in lines])
-        is_face = np.array([line.startswith(("f ", "f\t")) for line in lines])
-        before = np.repeat(seen[is_face], counts)
+        seen = np.cumsum([word == kind for word, _ in lines])
+        before = np.repeat(seen[[word == "f" for word, _ in lines]], counts)
     indices: Int = np.where(stated < 0, before + stated, stated - 1)
     if (indices < 0).any():
         raise InputError(f"a face names {kind} {stated[indices < 0][0]}, but indices begin at 1.")
@@ -93,7 +82,7 @@ def _indices(words: list[str], lines: list[str], counts: Int, kind: str) -> Int:
 
 
 def _normals(
-    corners: list[str], corner_vertices: Int, normals: Float, lines: list[str], counts: Int, size: int
+    corners: list[str], corner_vertices: Int, normals: Float, lines: list[list[str]], counts: Int, size: int
 ) -> Float | None:
     """Return a normal for every vertex, or None where not all corners name one."""
     words = [word.split("/")[2] if word.count("/") == 2 else "" for word in corners]
@@ -116,11 +105,8 @@ def write_obj(mesh: Mesh, path: Path) -> None:
     Colours follow the positions as shares of full brightness, which is not part of the format but widely supported.
     """
     colors = mesh.attributes.get("colors")
-    if colors is None:
-        blocks = format_rows("v %r %r %r\n", mesh.vertices)
-    else:
-        rows = np.hstack([mesh.vertices, as_bytes(colors)[:, :3] / 255])
-        blocks = format_rows("v %r %r %r %.4f %.4f %.4f\n", rows)
+    shades = np.empty((len(mesh.vertices), 0)) if colors is None else as_bytes(colors)[:, :3] / 255
+    blocks = format_rows(f"v %r %r %r{' %.4f' * shades.shape[1]}\n", np.hstack([mesh.vertices, shades]))
     corners = mesh.faces + 1
     if mesh.normals is None:
         blocks += format_rows("f %d %d %d\n", corners)

@@ -11,26 +11,25 @@ from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, fan_triangles, no_faces, polygon_remarks
-from gnrecon.io.parse import content_lines, format_rows, parse_numbers, parse_rows, read_text
+from gnrecon.io.parse import format_rows, parse_numbers, parse_rows, read_text
 from gnrecon.runtime.errors import InputError
 
 
 def read_off(path: Path) -> Contents:
     """Read vertices, the normals and colours that NOFF and COFF add, and faces."""
-    lines = content_lines(read_text(path))
+    lines = [line for row in read_text(path).splitlines() if (line := row.partition("#")[0].strip())]
     keyword = re.match(r"(ST)?(C)?(N)?OFF\b", lines[0], re.IGNORECASE) if lines else None
     if keyword is None or "BINARY" in lines[0].upper():
         raise InputError("expected a text file that begins with the word OFF.")
     rest = lines[0][keyword.end() :].split()
     # Some files have the counts on the line of the keyword.
-    words, lines = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
+    words, lines = (rest, lines[1:]) if rest else (" ".join(lines[1:2]).split(), lines[2:])
     if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
         raise InputError(f"expected the numbers of vertices and faces, but found {' '.join(words)[:60]!r}.")
     vertex_count, face_count = int(words[0]), int(words[1])
     if len(lines) < vertex_count + face_count:
-        raise InputError(
-            f"the header declares {vertex_count} vertices and {face_count} faces, but {len(lines)} rows follow."
-        )
+        stated = f"{vertex_count} vertices and {face_count} faces"
+        raise InputError(f"the header declares {stated}, but {len(lines)} rows follow.")
     if not vertex_count:
         raise InputError("the header declares no vertices.")
     table = parse_rows(lines[:vertex_count], "the vertex rows")
@@ -66,10 +65,8 @@ def write_off(mesh: Mesh, path: Path) -> None:
     """Write positions with all digits of float64 and triangles; as COFF where there are colours, without normals."""
     colors = mesh.attributes.get("colors")
     blocks = [f"{'OFF' if colors is None else 'COFF'}\n{len(mesh.vertices)} {len(mesh.faces)} 0\n"]
-    if colors is None:
-        blocks += format_rows("%r %r %r\n", mesh.vertices)
-    else:
-        blocks += format_rows("%r %r %r %d %d %d %d\n", np.hstack([mesh.vertices, with_alpha(as_bytes(colors))]))
+    shades = np.empty((len(mesh.vertices), 0)) if colors is None else with_alpha(as_bytes(colors))
+    blocks += format_rows(f"%r %r %r{' %d' * shades.shape[1]}\n", np.hstack([mesh.vertices, shades]))
     blocks += format_rows("3 %d %d %d\n", mesh.faces)
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(blocks)

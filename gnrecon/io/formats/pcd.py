@@ -39,14 +39,12 @@ def read_pcd(path: Path) -> Contents:
         copy.write("\n".join([*lines, ""]).encode("utf-8") + body)
         copy.flush()
         cloud = open3d.t.io.read_point_cloud(Path(copy.name), format="pcd")
-    arrays = {name: cloud.point[name].numpy() for name in cloud.point}
+    arrays = {name: cloud.point[name].numpy() for name in cloud.point if not name.startswith("_")}
     points = arrays.pop("positions", np.empty((0, 3)))
     if len(points) != declared:
         raise InputError(f"the header declares {declared} points, but {len(points)} could be read.")
-    columns = {name: values for name, values in arrays.items() if not name.startswith("_")}
-    return from_columns(
-        {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in columns.items()}, None, points
-    )
+    single = {name: values[:, 0] for name, values in arrays.items() if values.shape[1:] == (1,)}
+    return from_columns({**arrays, **single}, None, points)
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:
@@ -65,15 +63,13 @@ def _split(data: bytes) -> tuple[Header, bytes]:
     if "POINTS" not in header and all(header.get(key, ["?"])[0].isdecimal() for key in ("WIDTH", "HEIGHT")):
         header["POINTS"] = [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
     required = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
-    missing = [key for key in required if not header.get(key)]
-    if missing:
+    if missing := [key for key in required if not header.get(key)]:
         raise InputError(f"the PCD header lacks {' and '.join(missing)}.")
     if not {"x", "y", "z"} <= {name.lower() for name in header["FIELDS"]}:
         raise InputError(f"expected fields named x, y and z, but the header lists {' '.join(header['FIELDS'])}.")
-    for key in ("SIZE", "COUNT", "POINTS", "WIDTH", "HEIGHT"):
-        for word in header.get(key, []):
-            if not word.isdecimal():
-                raise InputError(f"the header's {key} holds {word!r}, but a count was expected.")
+    counts = ((key, word) for key in ("SIZE", "COUNT", "POINTS", "WIDTH", "HEIGHT") for word in header.get(key, []))
+    if wrong := next(((key, word) for key, word in counts if not word.isdecimal()), None):
+        raise InputError(f"the header's {wrong[0]} holds {wrong[1]!r}, but a count was expected.")
     return header, data[start:]
 
 

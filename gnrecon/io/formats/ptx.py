@@ -16,7 +16,7 @@ from typing import IO
 import numpy as np
 
 from gnrecon.geometry.arrays import Float, Int, Values
-from gnrecon.io.contents import Contents, no_faces
+from gnrecon.io.contents import Contents
 from gnrecon.io.parse import parse_numbers
 from gnrecon.runtime.errors import InputError
 
@@ -44,11 +44,9 @@ def _next_line(file: IO[str]) -> str:
 
 
 def _size(line: str, number: int) -> int:
-    if not line.strip().isdecimal():
-        raise InputError(
-            f"scan {number} begins with {line.strip()[:40]!r}, but a number of columns or rows was expected."
-        )
-    return int(line)
+    if not (word := line.strip()).isdecimal():
+        raise InputError(f"scan {number} begins with {word[:40]!r}, but a number of columns or rows was expected.")
+    return int(word)
 
 
 def _pose(lines: list[str], number: int, *, tolerance: float = 1e-3) -> Float:
@@ -87,6 +85,5 @@ def _contents(table: Float, cells: Int, height: int, matrix: Float) -> Contents:
         attributes["colors"] = np.clip(np.nan_to_num(table[:, 4:7]), 0, 255).astype(np.uint8)
     # Cells are stored column by column, as the scanner turns.
     attributes |= {"row": (cells % height).astype(np.int32), "column": (cells // height).astype(np.int32)}
-    points = table[:, :3] @ matrix[:3, :3] + matrix[3, :3]
-    origins = np.broadcast_to(matrix[3, :3], points.shape)
-    return Contents(points, None, no_faces(), attributes, (), origins)
+    found = Contents(table[:, :3], attributes=attributes)
+    return found.moved(matrix[:3, :3].T, matrix[3, :3], matrix[3, :3])

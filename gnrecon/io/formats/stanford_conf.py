@@ -48,13 +48,7 @@ def read_conf(path: Path) -> Contents:
 
 
 def parse_conf(text: str) -> list[Pose]:
-    """Return the scans and their poses.
-
-    Raises
-    ------
-    InputError
-        When a line is malformed.
-    """
+    """Return the scans and their poses."""
     from scipy.spatial.transform import Rotation
 
     poses = []
@@ -81,12 +75,7 @@ def _posed(pose: Pose, folder: Path) -> Contents:
     if not len(scan.points):
         raise InputError(f"the scan {pose.file} holds no points.")
     origin = _scanner_position(scan.points) @ pose.rotation.T + pose.translation
-    return replace(
-        scan,
-        points=scan.points @ pose.rotation.T + pose.translation,
-        normals=None if scan.normals is None else scan.normals @ pose.rotation.T,
-        origins=np.broadcast_to(origin, scan.points.shape),
-    )
+    return scan.moved(pose.rotation, pose.translation, origin)
 
 
 def _scanner_position(points: Float, *, distance_extents: float = 100.0) -> Float:

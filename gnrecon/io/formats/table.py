@@ -56,7 +56,8 @@ def table_chunks(
                 remarks += more
             found += len(table)
             contents = from_columns({name: table[:, place].copy() for place, name in kept})
-            yield replace(contents, unread=contents.unread + _unread(dialect, bool(columns)), remarks=remarks)
+            unread = () if columns else _columns_of_text(dialect)
+            yield replace(contents, unread=contents.unread + unread, remarks=remarks)
     if declared is not None and found != declared:
         raise InputError(f"the file declares {declared} points, but {found} follow.")
 
@@ -85,10 +86,7 @@ def _kept(
     return [(place, name) for name, place in kept.items()], remarks
 
 
-def _unread(dialect: Dialect, named: bool) -> tuple[str, ...]:
-    """Describe the columns of text."""
-    if named or all(dialect.numeric):
-        return ()
+def _columns_of_text(dialect: Dialect) -> tuple[str, ...]:
     names = dialect.names or [f"number {place + 1}" for place in range(dialect.width)]
     texts = [name for name, numeric in zip(names, dialect.numeric, strict=True) if name and not numeric]
     return (f"the columns without numbers ({', '.join(texts)})",) if texts else ()
@@ -154,14 +152,9 @@ def _parsed(text: str, dialect: Dialect, before: int) -> Float:
 def _require_rows(text: str, dialect: Dialect, before: int) -> None:
     """Refuse the first row that has not as many cells as the others, or a cell that is no number."""
     plain = replace(dialect, replaced=())
-    row = before
-    for line in text.split("\n"):
-        if not line.strip():
-            continue
-        row, cells = row + 1, plain.cells(line)
-        if len(cells) < dialect.width or (
-            len(cells) > dialect.width and not dialect.ragged and any(cells[dialect.width :])
-        ):
+    rows = (plain.cells(line) for line in text.split("\n") if line.strip())
+    for row, cells in enumerate(rows, before + 1):
+        if len(cells) < dialect.width or (not dialect.ragged and any(cells[dialect.width :])):
             raise InputError(f"row {row} holds {len(cells)} numbers, but the rows before it hold {dialect.width}.")
         for cell, numeric in zip(cells, dialect.numeric, strict=False):
             if numeric and not dialect.is_value(cell):

@@ -1,4 +1,7 @@
-"""Which columns of a table hold what: by the user's names, by its header, or by what the numbers look like."""
+"""Which columns of a table hold what: by the user's names, or by what the numbers look like.
+
+Too few columns, and names that do not fit, end in an `InputError`.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,7 @@ from gnrecon.runtime.errors import InputError
 
 
 def named_by_user(columns: Sequence[str], width: int) -> list[str]:
-    """Return the names of `width` columns after those that the user gave; ``-`` and missing ones are not read.
-
-    Raises
-    ------
-    InputError
-        When there are more names than columns, or x, y or z is missing.
-    """
+    """Return the names of `width` columns after those that the user gave; ``-`` and missing ones are not read."""
     if len(columns) > width:
         raise InputError(f"--columns names {len(columns)} columns, but the rows hold {width}.")
     names = ["" if name.strip() == "-" else name.strip() for name in columns]
@@ -34,11 +31,6 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
     rows : array of shape (N, C), the columns that hold numbers
     places : of these columns among all of the file's, from 0
     suffix : extension of the file; points of ``.pts`` have their intensity before their colour
-
-    Raises
-    ------
-    InputError
-        When there are fewer than 3 columns.
     """
     names: list[str] = ["index"] if _is_index(rows) else []
     reasons: dict[str, str] = {}
@@ -64,20 +56,16 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
 
 def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int]) -> tuple[str, ...]:
     """One sentence on what was guessed; none where the first three columns are all that there is."""
-    spoken = {"index": "a running number", "time": "time", "x": "x, y, z", "nx": "normals", "red": "colours"}
-    spoken["intensity"] = "intensity"
-    lengths = {"x": 3, "nx": 3, "red": 3}
+    spoken = {"index": "a running number", "time": "time", "intensity": "intensity"}
+    of_three = {"x": "x, y, z", "nx": "normals", "red": "colours"}
     found = []
     for at, name in enumerate(names):
-        if name in spoken and (name != "x" or places[at] or reasons.get("x")):
-            first, last = places[at] + 1, places[min(at + lengths.get(name, 1), len(names)) - 1] + 1
-            which = f"column {first} is" if first == last else f"columns {first} to {last} are"
+        if name in spoken or (name in of_three and (name != "x" or places[at] or reasons.get("x"))):
+            first = places[at] + 1
+            which = f"column {first} is" if name in spoken else f"columns {first} to {places[at + 2] + 1} are"
             reason = f" ({reasons[name]})" if reasons.get(name) else ""
-            found.append(f"{which} taken for {spoken[name]}{reason}")
-    if not found:
-        return ()
-    text = ", ".join(found)
-    return (f"The table has no header: {text}; --columns says otherwise.",)
+            found.append(f"{which} taken for {(spoken | of_three)[name]}{reason}")
+    return (f"The table has no header: {', '.join(found)}; --columns says otherwise.",) if found else ()
 
 
 def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
@@ -89,11 +77,10 @@ def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
     four = rest.shape[1] >= 4 and _are_colors(rest[:, 1:4])
     # Four columns that all may be bytes: scanners write the intensity first in PTS, and after the colour elsewhere. One
     # that never changes, or alone exceeds 255, is no colour channel.
-    odd = [False, False]
     if four:
         odd = [bool(np.ptp(rest[:, end]) == 0 or rest[:, end].max() > 255 >= rest[:, 1:3].max()) for end in (0, 3)]
-    if four and (odd[0] > odd[1] or (odd[0] == odd[1] and suffix == ".pts")):
-        return [""], ""
+        if odd[0] > odd[1] or (odd[0] == odd[1] and suffix == ".pts"):
+            return [""], ""
     return list(COLOR), "0 to 255" if rest[:, :3].max(initial=0) > 1 else "0 to 1"
 
 

@@ -2,7 +2,8 @@
 
 Each pair of separator and decimal mark is tried on the first lines. The right one is that in which most lines hold at
 least three numbers, and in which no cell holds several: in ``1,5 2,5 3,5``, commas cannot separate, because ``5 2`` is
-no number. What precedes the first row is searched for the names of the columns; all else there is metadata.
+no number. What precedes the first row is searched for the names of the columns; all else there is metadata. What is no
+such table ends in an `InputError` that says why.
 """
 
 from __future__ import annotations
@@ -85,27 +86,17 @@ class Dialect:
 
 
 def encoding_of(path: Path) -> str:
-    """Return the encoding of a text, by its byte-order mark, its zero bytes, or what decodes.
-
-    Raises
-    ------
-    InputError
-        When it is no text.
-    """
+    """Return the encoding of a text, by its byte-order mark, its zero bytes, or what decodes."""
     with path.open("rb") as file:
         head = file.read(1 << 16)
     marks = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe\0\0": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
     if found := next((name for mark, name in marks.items() if head.startswith(mark)), None):
         return found
-    for start, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        # ASCII in UTF-16 has a zero in every other byte, and nowhere else.
-        if (
-            len(head) > 1
-            and not head[start : len(head) // 2 * 2 : 2].strip(b"\0")
-            and head[1 - start :: 2].count(0) == 0
-        ):
-            return name
     if b"\0" in head:
+        even, odd = head[: len(head) // 2 * 2 : 2], head[1::2]
+        # ASCII in UTF-16 has a zero in every other byte, and nowhere else.
+        if not (even.strip(b"\0") and odd.strip(b"\0")) and 0 in (even.count(0), odd.count(0)):
+            return "utf-16-be" if even[:1] == b"\0" else "utf-16-le"
         raise InputError("expected text, but the file holds binary data.")
     try:
         head[:-4].decode("utf-8")
@@ -115,13 +106,7 @@ def encoding_of(path: Path) -> str:
 
 
 def find_dialect(lines: list[str]) -> Dialect:
-    """Return the dialect of a table whose first lines these are.
-
-    Raises
-    ------
-    InputError
-        When there are no rows, no columns x, y, z, or ambiguous columns, or it is a grid of heights.
-    """
+    """Return the dialect of a table whose first lines these are."""
     if re.match(r"\s*ncols\s+\d+\s+nrows\s+\d", "".join(lines[:2]), re.IGNORECASE):
         raise InputError("it is a grid of heights by Esri, not a table of points; gdal2xyz or QGIS make one of it.")
     texts = [COMMENT.sub("", line.replace("\ufeff", "")) for line in lines]
@@ -134,7 +119,8 @@ def find_dialect(lines: list[str]) -> Dialect:
     rows = [(number, cells) for number, cells in rows if number > title]
     first = rows[0][0]
     _require_unambiguous(dialect, [cells for _, cells in rows])
-    dialect = replace(dialect, skipped=first, count=_count(lines[:first]))
+    counts = [int(line) for line in map(str.strip, lines[:first]) if re.fullmatch("[0-9]{1,18}", line)]
+    dialect = replace(dialect, skipped=first, count=counts[-1] if counts else None)
     if names is not None:
         dialect = _fitted(dialect, names)
     else:
@@ -199,22 +185,12 @@ def _require_unambiguous(dialect: Dialect, rows: list[list[str]]) -> None:
     """Refuse commas that both separate columns and mark decimals, as in ``10,8158,-30,6569,-9,6008``."""
     if dialect.separator != "," or dialect.decimal == ",":
         return
-    whole = [list(column) for column in zip(*rows, strict=False)]
-    digits = [all(map(str.isdecimal, column)) for column in whole]
+    columns = [column for column in zip(*rows, strict=False) if all(map(str.isdecimal, column))]
     # Digits after a decimal mark begin with zeros in places; numbers of their own do not.
-    padded = [
-        all_digits and any(cell[0] == "0" < cell[1:] for cell in column)
-        for all_digits, column in zip(digits, whole, strict=True)
-    ]
-    if sum(padded) >= 2:
+    if sum(any(cell[0] == "0" < cell[1:] for cell in column) for column in columns) >= 2:
         raise InputError(
             "commas seem to separate the columns and to mark decimals as well; save the table with semicolons or tabs."
         )
-
-
-def _count(head: list[str]) -> int | None:
-    counts = [int(line) for line in map(str.strip, head) if re.fullmatch("[0-9]{1,18}", line)]
-    return counts[-1] if counts else None
 
 
 def _header(dialect: Dialect, head: list[str]) -> tuple[int, list[str] | None]:

@@ -22,9 +22,8 @@ from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
-import numpy.typing as npt
 
-from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.colors import as_bytes, with_alpha
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, concatenated, without_opaque_alpha
@@ -52,12 +51,9 @@ def write_3mf(mesh: Mesh, path: Path) -> None:
         '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">\n'
         f'<Relationship Target="/3D/3dmodel.model" Id="rel0" Type="{_NAMESPACES["model"]}"/>\n</Relationships>\n'
     )
+    parts = {"[Content_Types].xml": [types], "_rels/.rels": [relations], "3D/3dmodel.model": _model(mesh)}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        for name, blocks in (
-            ("[Content_Types].xml", iter([types])),
-            ("_rels/.rels", iter([relations])),
-            ("3D/3dmodel.model", _model(mesh)),
-        ):
+        for name, blocks in parts.items():
             entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # the first date that a ZIP archive can store
             entry.compress_type = zipfile.ZIP_DEFLATED
             # The size is not known before, and may exceed the 4 GiB of the older format.
@@ -69,42 +65,33 @@ def write_3mf(mesh: Mesh, path: Path) -> None:
 
 def _model(mesh: Mesh) -> Iterator[str]:
     """The model's XML, in blocks: the resources are a group of colours, with the number 1, and the object, 2."""
-    colors = mesh.attributes.get("colors")
-    shift = _shift(mesh)
+    colors, shift, corners = mesh.attributes.get("colors"), _shift(mesh), mesh.faces
     core, materials = _NAMESPACES["core"], _NAMESPACES["materials"]
     yield f'<model unit="millimeter" xml:lang="en-US" xmlns="{core}" xmlns:m="{materials}">\n<resources>\n'
-    which = None
+    default = paint = ""
     if colors is not None:
-        palette, which = _palette(with_alpha(as_bytes(colors)))
+        # The distinct colours as RGBA numbers, and the index of each vertex' among them.
+        codes = np.ascontiguousarray(with_alpha(as_bytes(colors))).view(">u4")[:, 0].astype(np.uint32)
+        palette, which = np.unique(codes, return_inverse=True)
+        default, paint = ' pid="1" pindex="0"', ' pid="1" p1="%d" p2="%d" p3="%d"'
+        corners = np.hstack([mesh.faces, which[mesh.faces]])
         yield '<m:colorgroup id="1">\n'
         yield from format_rows('<m:color color="#%08X"/>\n', palette)
         yield "</m:colorgroup>\n"
     kind = "model" if _is_closed(mesh) else "surface"
-    default = "" if colors is None else ' pid="1" pindex="0"'
     yield f'<object id="2" type="{kind}"{default}>\n<mesh>\n<vertices>\n'
     yield from format_rows('<vertex x="%r" y="%r" z="%r"/>\n', mesh.vertices - shift)
     yield "</vertices>\n<triangles>\n"
-    if which is None:
-        yield from format_rows('<triangle v1="%d" v2="%d" v3="%d"/>\n', mesh.faces)
-    else:
-        corners = np.hstack([mesh.faces, which[mesh.faces]])
-        template = '<triangle v1="%d" v2="%d" v3="%d" pid="1" p1="%d" p2="%d" p3="%d"/>\n'
-        yield from format_rows(template, corners)
+    yield from format_rows(f'<triangle v1="%d" v2="%d" v3="%d"{paint}/>\n', corners)
     matrix = "1 0 0 0 1 0 0 0 1 {!r} {!r} {!r}".format(*shift.tolist())
     item = f' transform="{matrix}"' if shift.any() else ""
     yield "</triangles>\n</mesh>\n</object>\n</resources>\n"
     yield f'<build>\n<item objectid="2"{item}/>\n</build>\n</model>\n'
 
 
-def _palette(colors: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint32], Int]:
-    """The distinct colours as RGBA numbers, and the index of each row of `colors`, of shape (V, 4), among them."""
-    return np.unique(np.ascontiguousarray(colors).view(">u4")[:, 0].astype(np.uint32), return_inverse=True)
-
-
 def _shift(mesh: Mesh) -> Float:
     """What is subtracted from the coordinates, of shape (3,): zero, unless float32 rounding would be visible."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    # Readers may convert coordinates to float32.
     rounding = float(np.abs(mesh.vertices).max()) * float(np.finfo(np.float32).eps)
     visible = IOParameters.visible_rounding_diagonals * float(np.linalg.norm(high - low))
     return (low + high) / 2 if rounding > visible else np.zeros(3)
@@ -190,11 +177,8 @@ class _Model:
         current.corners.extend((int(values["v1"]), int(values["v2"]), int(values["v3"])))
         known = self._colors.get((self._part, values.get("pid", current.group)))
         first = values.get("p1", current.place)
-        if known is None or not first:
-            current.colors.extend((-1,) * 3)
-        else:
-            places = (first, values.get("p2", first), values.get("p3", first))
-            current.colors.extend(known[int(place)] for place in places)
+        places = (first, values.get("p2", first), values.get("p3", first))
+        current.colors.extend(-1 if known is None or not first else known[int(place)] for place in places)
 
     def _reference(self, values: dict[str, str]) -> tuple[Key, Float]:
         """The object that a component or an item refers to, and the 4 x 3 matrix that moves rows (x, y, z, 1)."""
@@ -226,13 +210,11 @@ def _require_bounded(model: _Model, *, most_depth: int = 32, most_instances: int
         """Instances, numbers and levels of an object with all that it contains."""
         if key not in known:
             if key not in model.objects or depth > most_depth:
-                raise InputError(
-                    f"the 3MF model builds the object {key[1]!r}, which does not exist or contains itself."
-                )
-            current = model.objects[key]
-            inner = [counted(part, depth + 1) for part, _ in current.parts]
+                why = "which does not exist or contains itself"
+                raise InputError(f"the 3MF model builds the object {key[1]!r}, {why}.")
+            inner = [counted(part, depth + 1) for part, _ in model.objects[key].parts]
             instances, numbers, levels = zip(*inner, strict=True) if inner else ((), (), (0,))
-            known[key] = (1 + sum(instances), _numbers(current) + sum(numbers), 1 + max(levels))
+            known[key] = (1 + sum(instances), _numbers(model.objects[key]) + sum(numbers), 1 + max(levels))
         if known[key][2] > most_depth:
             raise InputError(f"the 3MF model nests objects more than {most_depth} levels deep.")
         return known[key]
@@ -259,15 +241,14 @@ def _transformed(model: _Model, key: Key, matrix: Float) -> Iterator[Contents]:
 def _mesh(current: _Object, matrix: Float) -> Contents:
     """The object's own mesh in place, with RGBA colours, zero where there are none."""
     vertices = np.array(current.vertices, dtype=np.float64).reshape(-1, 3)
-    faces = np.array(current.corners, dtype=np.int64).reshape(-1, 3)
+    corners, codes = np.array(current.corners, dtype=np.int64), np.array(current.colors, dtype=np.int64)
     colors = np.zeros((len(vertices), 4), dtype=np.uint8)
     if not (matrix[:3] == np.eye(3)).all():
         vertices = vertices @ matrix[:3]
     # A mirroring matrix would turn faces inside out, so their corners are reversed.
-    turned = faces if np.linalg.det(matrix[:3]) > 0 else faces[:, ::-1]
+    turned = corners.reshape(-1, 3)[:, :: 1 if np.linalg.det(matrix[:3]) > 0 else -1]
     mesh = Mesh(vertices + matrix[3], turned)  # which refuses indices of other objects' vertices
-    codes = np.array(current.colors, dtype=np.int64)
     # Where the corners at a vertex differ, the first one's colour is written last.
     painted = np.flatnonzero(codes != -1)[::-1]
-    colors[faces.reshape(-1)[painted]] = codes[painted].astype(">u4").view(np.uint8).reshape(-1, 4)
+    colors[corners[painted]] = codes[painted].astype(">u4").view(np.uint8).reshape(-1, 4)
     return Contents(mesh.vertices, None, mesh.faces, {"colors": colors})

@@ -73,10 +73,8 @@ class _VtkLegacy:
     def words_of(self, name: str) -> list[str]:
         """The words of the next line if it begins with a name; else none, and the line is still to be read."""
         place, words = self.place, self.words()
-        if words[:1] == [name]:
-            return words
-        self.place = place
-        return []
+        self.place = self.place if words[:1] == [name] else place
+        return words if words[:1] == [name] else []
 
     def numbers(self, count: int, kind: str) -> Values:
         """The next `count` numbers of a VTK type."""
@@ -104,9 +102,9 @@ class _VtkLegacy:
         match name:
             case "DATASET":
                 self.kind = "".join(words[1:2]).upper()
-                known = ("POLYDATA", "UNSTRUCTURED_GRID", "STRUCTURED_GRID", "STRUCTURED_POINTS", "RECTILINEAR_GRID")
-                if self.kind not in known:
-                    raise InputError(f"the data set is {self.kind or 'unnamed'}, but {', '.join(known)} are read.")
+                known = "POLYDATA, UNSTRUCTURED_GRID, STRUCTURED_GRID, STRUCTURED_POINTS, RECTILINEAR_GRID"
+                if self.kind not in known.split(", "):
+                    raise InputError(f"the data set is {self.kind or 'unnamed'}, but {known} are read.")
             case "DIMENSIONS" | "ORIGIN" | "SPACING" | "ASPECT_RATIO":
                 self.held[name] = parse_numbers(words[1:4])
             case "X_COORDINATES" | "Y_COORDINATES" | "Z_COORDINATES":
@@ -129,10 +127,9 @@ class _VtkLegacy:
                 self.words_of("LOOKUP_TABLE")  # which is optional
                 self._keep(title, self.numbers(columns * self.rows, _word(words, 2)), columns)
             case "COLOR_SCALARS":
-                columns = _count(words, 2)
-                values = self.numbers(columns * self.rows, shade)
+                values = self.numbers(_count(words, 2) * self.rows, shade)
                 values = values if self.binary else np.rint(255 * np.clip(values.astype(np.float64), 0, 1))
-                self._keep(title, values.astype(np.uint8), columns)
+                self._keep(title, values.astype(np.uint8), _count(words, 2))
             case "LOOKUP_TABLE":
                 self.numbers(4 * _count(words, 2), shade)
             case "VECTORS" | "NORMALS" | "TENSORS":
@@ -147,8 +144,8 @@ class _VtkLegacy:
 
     def _read_cells(self, name: str, rows: int, size: int) -> None:
         """Read polygons with interleaved counts or, since version 5, with separate offsets."""
-        if offset_words := self.words_of("OFFSETS"):
-            offsets = self.numbers(rows, _word(offset_words, 1)).astype(np.int64)
+        if words := self.words_of("OFFSETS"):
+            offsets = self.numbers(rows, _word(words, 1)).astype(np.int64)
             if not (words := self.words_of("CONNECTIVITY")):
                 raise InputError("expected the line CONNECTIVITY after the offsets.")
             corners: Int = self.numbers(size, _word(words, 1)).astype(np.int64)
@@ -156,7 +153,7 @@ class _VtkLegacy:
         else:
             counts, corners = _counted(self.numbers(size, "int").astype(np.int64), rows)
         if name in ("POLYGONS", "TRIANGLE_STRIPS"):
-            self.faces.append(triangulate_cells(counts, corners, strips=name == "TRIANGLE_STRIPS"))
+            self.faces.append(fan_triangles(counts, corners, strips=name == "TRIANGLE_STRIPS"))
         elif name == "CELLS":
             self.cells = counts, corners
         elif name == "LINES":
@@ -169,20 +166,19 @@ class _VtkLegacy:
             raise InputError("the types of cells do not match the cells.")
         for kinds, strips in (((5, 7, 9), False), ((6,), True)):
             chosen = np.isin(types, kinds)
-            self.faces.append(triangulate_cells(counts[chosen], corners[np.repeat(chosen, counts)], strips=strips))
+            self.faces.append(fan_triangles(counts[chosen], corners[np.repeat(chosen, counts)], strips=strips))
         if (others := ~np.isin(types, (1, 2, 5, 6, 7, 9))).any():
             self.unread.append(f"{int(others.sum())} cells that are no polygons")
 
     def _keep(self, name: str, values: Values, columns: int) -> None:
         if self.of_points:
             self.arrays[unquote(name)] = values if columns == 1 else values.reshape(-1, max(columns, 1))
-        elif "values of polygons or of the whole" not in self.unread:
+        else:
             self.unread.append("values of polygons or of the whole")
 
 
 def _count(words: list[str], place: int) -> int:
-    text = _word(words, place)
-    if not text.isdecimal():
+    if not (text := _word(words, place)).isdecimal():
         raise InputError(f"the line {' '.join(words)[:60]!r} holds {text[:20]!r} where a count was expected.")
     return int(text)
 
@@ -197,7 +193,7 @@ def _lattice(file: _VtkLegacy) -> Float:
     """The points of a regular or rectilinear grid, of shape (N, 3); x varies fastest."""
     held, regular = file.held, file.kind == "STRUCTURED_POINTS"
     axes = [held.get(axis, np.zeros(0)) for axis in "XYZ"]
-    shape = held.get("DIMENSIONS", np.zeros(0)) if regular else np.array([float(len(axis)) for axis in axes])
+    shape = held.get("DIMENSIONS", np.zeros(0)) if regular else np.array(list(map(len, axes)), np.float64)
     size = float(np.prod(shape))
     # A few bytes may declare any number of points.
     if len(shape) != 3 or not (shape >= 1).all() or size != file.rows or not file.arrays:
@@ -227,32 +223,19 @@ def _counted(values: Int, rows: int) -> tuple[Int, Int]:
 def assemble_contents(
     points: Float, faces: Int, arrays: Mapping[str, Values], normals: str | None, unread: list[str]
 ) -> Contents:
-    """Return the contents of a data set.
+    """Return the contents of a data set, with the arrays of its points by name, and what else the file holds.
 
-    Parameters
-    ----------
-    points : array of shape (N, 3)
-    faces : integer array of shape (F, 3)
-    arrays : the points' arrays by name, of shape (N,) or (N, C)
-    normals : name of the array that holds the normals; by default ``Normals``, if there is one
-    unread : what else the file holds
-
-    Raises
-    ------
-    InputError
-        When an array has another number of rows.
+    `normals` names the array that holds the normals; by default it is ``Normals``, if there is one.
     """
     columns = dict(arrays)
     if normals in columns and columns[normals].shape[1:] == (3,):
         columns["normals"] = columns.pop(normals)
     # VTK displays an array of bytes as colours.
-    shown = (
-        name for name, one in columns.items() if one.dtype == np.uint8 and one.ndim == 2 and one.shape[1] in (3, 4)
-    )
-    if (name := next(shown, None)) is not None:
-        columns = {"colors": columns.pop(name), **columns}
+    shown = [name for name, one in columns.items() if one.dtype == np.uint8 and one.shape[1:] in ((3,), (4,))]
+    if shown:
+        columns = {"colors": columns.pop(shown[0]), **columns}
     found = from_columns(columns, faces, points)
-    return replace(found, unread=(*unread, *found.unread))
+    return replace(found, unread=(*dict.fromkeys(unread), *found.unread))
 
 
 def text_numbers(words: list[str], dtype: np.dtype[Any]) -> Values:
@@ -260,35 +243,8 @@ def text_numbers(words: list[str], dtype: np.dtype[Any]) -> Values:
     return np.array([int(word) for word in words], dtype) if dtype.kind in "iu" else parse_numbers(words)
 
 
-def triangulate_cells(counts: Int, corners: Int, strips: bool) -> Int:
-    """Return the triangles, of shape (F, 3), of polygons or of triangle strips.
-
-    Parameters
-    ----------
-    counts : integer array of shape (P,), corners of each
-    corners : integer array of shape (counts.sum(),)
-    strips : whether each is a strip, in which the orientation of triangles alternates
-    """
-    if not strips or not len(counts):
-        return fan_triangles(counts, corners) if len(counts) else no_faces()
-    starts = np.cumsum(counts) - counts
-    found = []
-    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
-        strip = np.stack([corners[start + k : start + count - 2 + k] for k in range(3)], axis=1)
-        # Every other triangle of a strip has the opposite orientation.
-        strip[1::2] = strip[1::2, [1, 0, 2]]
-        found.append(strip)
-    return np.concatenate(found)
-
-
 def counts_from_offsets(offsets: Int, corners: Int) -> Int:
-    """Return how many corners each polygon has, of shape (P,), from offsets of shape (P + 1,) that begin with 0.
-
-    Raises
-    ------
-    InputError
-        When the offsets do not grow from 0 to the number of corners.
-    """
+    """Return how many corners each polygon has, of shape (P,), from offsets of shape (P + 1,) that begin with 0."""
     counts = np.diff(offsets)
     if len(offsets) and (offsets[0] != 0 or offsets[-1] != len(corners) or (counts < 0).any()):
         raise InputError("the offsets of the polygons do not grow from 0 to the number of their corners.")

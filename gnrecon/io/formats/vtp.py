@@ -15,13 +15,14 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from gnrecon.geometry.arrays import Int, Values
-from gnrecon.io.contents import Contents, concatenated, no_faces
-from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, text_numbers, triangulate_cells
+from gnrecon.io.contents import Contents, concatenated, fan_triangles, no_faces
+from gnrecon.io.formats.vtk import assemble_contents, counts_from_offsets, text_numbers
 from gnrecon.runtime.errors import InputError
 
 
@@ -50,10 +51,7 @@ def read_vtp(path: Path) -> Contents:
 
 def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     """Return the XML without the appended block, and how arrays are read."""
-    decompressors: dict[str, Callable[[bytes], bytes]] = {
-        "vtkZLibDataCompressor": zlib.decompress,
-        "vtkLZMADataCompressor": lzma.decompress,
-    }
+    libraries: dict[str, Any] = {"vtkZLibDataCompressor": zlib, "vtkLZMADataCompressor": lzma}
     xml, _, rest = data.partition(b"<AppendedData")
     tag, _, block = rest.partition(b">")
     # Raw bytes are not XML, so the tree ends before them.
@@ -61,11 +59,13 @@ def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise InputError(f"expected a VTKFile of the type PolyData, but found {root.get('type', root.tag)!r}.")
     compressor = root.get("compressor", "")
-    if compressor and compressor not in decompressors:
-        raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(decompressors)}, or none.")
+    if compressor and compressor not in libraries:
+        raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(libraries)}, or none.")
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
-    return root, _VtkXml(order, header, decompressors.get(compressor), block.partition(b"_")[2], b"raw" in tag)
+    return root, _VtkXml(
+        order, header, libraries[compressor].decompress if compressor else None, block.partition(b"_")[2], b"raw" in tag
+    )
 
 
 def _piece(piece: ElementTree.Element, file: _VtkXml) -> Contents:
@@ -96,7 +96,7 @@ def _faces(piece: ElementTree.Element, name: str, file: _VtkXml) -> Int:
     corners = arrays["connectivity"].astype(np.int64).ravel()
     ends = arrays["offsets"].astype(np.int64).ravel()
     counts = counts_from_offsets(np.concatenate([[0], ends]), corners)
-    return triangulate_cells(counts, corners, strips=name == "Strips")
+    return fan_triangles(counts, corners, strips=name == "Strips")
 
 
 def _values(array: ElementTree.Element, file: _VtkXml) -> Values:
@@ -126,36 +126,29 @@ def _bytes(array: ElementTree.Element, form: str, file: _VtkXml) -> bytes:
     block = block if raw else block.lstrip()
 
     def first(size: int, after: int = 0) -> bytes:
-        return block[after : after + size] if raw else _decoded(block[_encoded_size(after) :], size)
+        if raw:
+            return block[after : after + size]
+        # Three bytes take four characters.
+        start, end = (-(-count // 3) * 4 for count in (after, size))
+        return binascii.a2b_base64(block[start : start + end])[:size]
 
-    count = _require_plausible(_header(first(width), file, 1)[0], block)
+    def header(size: int) -> list[int]:
+        data = first(size * width)
+        if len(data) < size * width:
+            raise InputError("the file ends within the header of an array.")
+        found: list[int] = np.frombuffer(data, file.header, size).tolist()
+        return found
+
+    count = _require_plausible(header(1)[0], block)
     if file.decompress is None:
         data = first(width + count)[width:]
         if len(data) < count:
             raise InputError(f"an array declares {count} bytes, but {len(data)} follow.")
         return data
     # The number of blocks, the size of one, that of the last one, and what each takes when it is compressed.
-    length = (3 + count) * width
-    ends = np.cumsum([0, *_header(first(length), file, 3 + count)[3:]], dtype=np.int64).tolist()
-    packed = first(_require_plausible(ends[-1], block), length)
+    ends = np.cumsum([0, *header(3 + count)[3:]], dtype=np.int64).tolist()
+    packed = first(_require_plausible(ends[-1], block), (3 + count) * width)
     return b"".join(file.decompress(packed[start:end]) for start, end in itertools.pairwise(ends))
-
-
-def _header(data: bytes, file: _VtkXml, count: int) -> list[int]:
-    if len(data) < count * file.header.itemsize:
-        raise InputError("the file ends within the header of an array.")
-    found: list[int] = np.frombuffer(data, file.header, count).tolist()
-    return found
-
-
-def _encoded_size(size: int) -> int:
-    """Number of base64 characters for so many bytes."""
-    return -(-size // 3) * 4
-
-
-def _decoded(text: bytes, size: int) -> bytes:
-    """The first `size` bytes of base64 text."""
-    return binascii.a2b_base64(text[: _encoded_size(size)])[:size]
 
 
 def _require_plausible(count: int, data: bytes) -> int:
