@@ -92,7 +92,7 @@ def sibling_path(folder: Path, name: str, what: str) -> Path:
     """
     if folder == OPEN_FILES:
         raise InputError(
-            f"the {what} {name[:80]!r} lies next to it, which is not searched for compressed files and streams; unpack it."
+            f"the {what} {name[:80]!r} lies next to it, where nothing is read for compressed files and streams."
         )
     target = folder / name
     if not target.resolve().is_relative_to(folder.resolve()):

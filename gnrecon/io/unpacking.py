@@ -24,6 +24,7 @@ from gnrecon.io.parse import OPEN_FILES
 from gnrecon.runtime.errors import InputError, UsageError
 from gnrecon.runtime.files import is_standard_input
 
+
 @contextmanager
 def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
     """Yield a plain file with the data to read: the file itself, or a temporary copy of compressed data or a stream.

@@ -73,7 +73,7 @@ def test_compressed_files_name_no_files_next_to_them(tmp_path: Path, name: str, 
     (tmp_path / "0").write_text("x")
     path = tmp_path / f"{name}.gz"
     path.write_bytes(gzip.compress(content.replace("%s", '{"uri": "0", "byteLength": 1}').encode()))
-    with pytest.raises(InputError, match=r"'0' lies next to it, which is not searched for compressed files"):
+    with pytest.raises(InputError, match=r"'0' lies next to it, where nothing is read for compressed files"):
         read_cloud(path)
 
 
