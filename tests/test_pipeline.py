@@ -355,5 +355,7 @@ def test_parts_that_no_cells_resolve_are_named_before_the_fit() -> None:
     points, normals = sphere(100, np.random.default_rng(0))
     progress = UntilFit()
     with pytest.raises(KeyError):
-        reconstruct(np.vstack([points, points + [500, 0, 0]]), np.vstack([normals] * 2), progress=progress, **TINY)
+        reconstruct(
+            np.vstack([points, points + np.array([500, 0, 0])]), np.vstack([normals] * 2), progress=progress, **TINY
+        )
     assert [remark for remark in progress.remarks if remark.startswith("2 parts of the scan are far smaller")]

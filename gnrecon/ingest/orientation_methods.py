@@ -284,14 +284,14 @@ class _Winding:
     def at_points(self, mu: Single) -> Single:
         """Return w, of shape (N,)."""
         p = self._points
-        sums = self._by_rows(lambda rows: self._kernel[rows] @ _beside((p * mu).sum(axis=1), mu))
+        sums = self._by_rows(lambda rows: self._kernel[rows] @ _in_columns((p * mu).sum(axis=1), mu))
         found: Single = sums[:, 0] - (p * sums[:, 1:]).sum(axis=1)
         return found
 
     def transposed(self, values: Single) -> Single:
         """Return the transpose of `at_points` times values of shape (N,): of shape (N, 3)."""
         p = self._points
-        sums = self._by_rows(lambda columns: self._kernel[:, columns].T @ _beside(values, p * values[:, None]))
+        sums = self._by_rows(lambda columns: self._kernel[:, columns].T @ _in_columns(values, p * values[:, None]))
         found: Single = p * sums[:, :1] - sums[:, 1:]
         return found
 
@@ -304,7 +304,7 @@ class _Winding:
             along: Single = p[rows] @ mu.T
             np.subtract(height, along, out=along)
             along *= self._slope[rows]
-            sums: Single = along @ _beside(ones, p)
+            sums: Single = along @ _in_columns(ones, p)
             found: Single = self._kernel[rows] @ mu - (sums[:, 1:] - p[rows] * sums[:, :1])
             return found
 
@@ -315,7 +315,7 @@ class _Winding:
         return np.concatenate(map_in_threads(work, slices(len(self._points), chunk_rows)))
 
 
-def _beside(first: Single, others: Single) -> Single:
+def _in_columns(first: Single, others: Single) -> Single:
     """Return a column and others as one array, so that one product passes over a matrix once."""
     return np.column_stack([first, others])
 

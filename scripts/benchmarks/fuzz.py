@@ -95,7 +95,6 @@ def prepare() -> None:
     The refusal fills what Python keeps of modules, commands and options. It starts no threads, which a fork would lose.
     """
     import laspy  # noqa: F401
-    import lazrs  # noqa: F401
 
     from gnrecon.cli.app import main
     from gnrecon.runtime.preload import preload
@@ -113,7 +112,7 @@ def work(argument: dict[str, Any]) -> int:
     from gnrecon.fit import fit
 
     if argument["few_features"]:
-        gnrecon.pipeline.fit = partial(fit, parameters=FitParameters(global_field=few_features()))
+        vars(gnrecon.pipeline)["fit"] = partial(fit, parameters=FitParameters(global_field=few_features()))
     # The command line hides them from its users; those of the library would see them.
     sys.warnoptions.append("default::RuntimeWarning")
     warnings.simplefilter("ignore")

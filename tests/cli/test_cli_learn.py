@@ -87,7 +87,7 @@ def test_a_scan_of_ones_own_comes_back_in_its_own_coordinates(
 ) -> None:
     mesh, report = tmp_path / "mesh.ply", tmp_path / "r.json"
     scan = repository / "sample_data" / "bracket_sparse.ply"
-    words = ("-o", mesh, "--report", report, "--steps", 1, "--share", 0.5, "--resolution", 24, "--wider", 1)
+    words = ("-o", mesh, "--report", report, "--steps", 1, "--share", 0.1, "--resolution", 24, "--wider", 1)
     done = gnrecon("learn", scan, *words)
     assert done.returncode == 0, done.stderr
     written = json.loads(report.read_text())
