@@ -170,7 +170,7 @@ def map_in_threads(
 
 
 class _Runs:
-    """What runs that share the time of a caller have in common: its wish to end them, and calls that it makes."""
+    """What runs that share the time of a caller have in common: its request that they end, and calls that it makes."""
 
     def __init__(self) -> None:
         self.calls: SimpleQueue[Callable[[], object]] = SimpleQueue()
