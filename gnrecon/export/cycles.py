@@ -185,7 +185,9 @@ def _shortest_through(graph: _Graph, tree: cKDTree, sources: Int, longest: Float
     copy, other, edge = copy[kept], other[kept], edge[kept]
     links = csr_array((graph.lengths[edge], (copy, other)), shape=(len(names), len(names)))
     starts = np.searchsorted(names, np.arange(len(sources)) * len(graph.vertices) + sources)
-    far, before, _ = dijkstra(links, indices=starts, min_only=True, return_predecessors=True)
+    # Along the surface either, so that the search ends there; rounding is allowed for.
+    most = float(longest[sources].max(initial=0.0)) / 2 * (1 + 1e-9)
+    far, before, _ = dijkstra(links, indices=starts, min_only=True, limit=most, return_predecessors=True)
     reached = np.isfinite(far)
     signatures = _path_signatures(copy, other, graph.signatures[edge], before)
     length = far[copy] + far[other] + graph.lengths[edge]
