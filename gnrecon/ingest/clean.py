@@ -112,7 +112,8 @@ def usable_positions(
     if not least_spread < spread < most_spread:
         extent = f"less than {least_spread:g}" if spread <= least_spread else f"more than {most_spread:g}"
         raise InputError(f"The points extend over {extent} file units, which cannot be computed with; scale the scan.")
-    usable[usable] = away / spread <= most_spreads / 4
+    with np.errstate(over="ignore"):  # what overflows is out of all proportion
+        usable[usable] = away / spread <= most_spreads / 4
     return usable
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -35,3 +37,10 @@ def test_scans_that_cannot_be_computed_with_are_refused(scale: float) -> None:
 def test_pulses_without_an_echo_leave_the_scan_usable() -> None:
     points = np.concatenate([np.zeros((400, 3)), ball() + 4e6])
     assert usable_positions(points).all()
+
+
+def test_the_greatest_double_next_to_a_tiny_scan_raises_no_warning() -> None:
+    points = np.vstack([1e-12 * np.random.default_rng(0).standard_normal((20, 3)), [[1.7e308, 0.0, 0.0]]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert usable_positions(points).tolist() == [True] * 20 + [False]
