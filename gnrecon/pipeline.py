@@ -25,6 +25,7 @@ from gnrecon.export import (
     require_bordered,
     require_sound,
     same_side_distances,
+    spacing_ratio,
     trim,
     unsupported_area,
     verify_file,
@@ -329,7 +330,8 @@ def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedS
     may_be_open = run.options.trim is None and run.options.open is not False
     one_sided = may_be_open and is_single_sheet(samples.points, samples.normals)
     sheet = one_sided and run.options.open is None and ingested.layers is None
-    reach = run.options.trim_at(surface.spacing, sheet)
+    spacing = surface.spacing * (spacing_ratio(samples.points, samples.normals) if one_sided else 1.0)
+    reach = run.options.trim_at(spacing, sheet)
     if reach is not None:
         with run.stages("trim"):
             distances, points = surface.neighbourhood.distances(mesh.vertices), samples.frame.to_world(samples.points)
@@ -337,7 +339,7 @@ def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedS
             if one_sided:
                 distances = distances_between_points(mesh, distances, points, samples.normals, reach)
             # A reach that the user gave is where the surface ends.
-            mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else surface.spacing)
+            mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else spacing)
         why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]
         actions = [*surface.actions, *(why if sheet else []), *trimming.describe()]
         surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)

@@ -12,7 +12,7 @@ from gnrecon.export.remeshing.refine import RefineOptions, refine
 from gnrecon.export.remeshing.remesh import remesh
 from gnrecon.export.remeshing.sharpen import sharpen
 from gnrecon.export.repair import drop_stray_components, remove_stray, repair
-from gnrecon.export.sheet_support import distances_between_points
+from gnrecon.export.sheet_support import distances_between_points, spacing_ratio
 from gnrecon.export.trim import Trimming, UnsupportedArea, same_side_distances, trim, unsupported_area
 from gnrecon.export.verify import Findings, MeshFacts, examine, require_bordered, require_sound, verify, verify_file
 
@@ -49,6 +49,7 @@ __all__ = [
     "same_side_distances",
     "sharpen",
     "simplify",
+    "spacing_ratio",
     "transfer_attributes",
     "trim",
     "unsupported_area",
