@@ -20,12 +20,10 @@ from gnrecon.export import (
     Attribute,
     Metrics,
     Neighbourhood,
-    distances_between_points,
     measure,
     require_bordered,
     require_sound,
     same_side_distances,
-    spacing_ratio,
     trim,
     unsupported_area,
     verify_file,
@@ -35,6 +33,7 @@ from gnrecon.export.mesh_field import cells_for_faces, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.open_scenes import spacing_ratio
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey
 from gnrecon.io import (
@@ -253,8 +252,7 @@ class _PipelineRun:
     @property
     def refines_resolution(self) -> bool:
         """Whether the field may raise the resolution, because no size of the faces was given."""
-        chosen = self.chosen
-        return chosen.resolution is None and chosen.edge_length is None and chosen.max_error is None
+        return self.chosen.resolution is None and self.chosen.edge_length is None and self.chosen.max_error is None
 
 
 def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
@@ -335,13 +333,10 @@ def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedS
     if reach is not None:
         with run.stages("trim"):
             distances, points = surface.neighbourhood.distances(mesh.vertices), samples.frame.to_world(samples.points)
-            distances = same_side_distances(mesh, distances, points, samples.normals, reach)
-            if one_sided:
-                distances = distances_between_points(mesh, distances, points, samples.normals, reach)
+            distances = same_side_distances(mesh, distances, points, samples.normals, reach, one_sided=one_sided)
             # A reach that the user gave is where the surface ends.
             mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else spacing)
-        why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]
-        actions = [*surface.actions, *(why if sheet else []), *trimming.describe()]
+        actions = [*surface.actions, *trimming.describe(sheet)]
         surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)
     run.remark(surface.actions)
     return surface
@@ -363,9 +358,7 @@ def _finish(
         mesh, attributes, remarks = compute_attributes(sources, run.progress.advance)
     run.remark([*(unsupported.describe() if trimming is None else []), *remarks])
     finished = FinishedMesh(mesh, facts, unsupported, attributes, None)
-    if scan.reference is not None:
-        finished = _measure(run, finished, scan.reference)
-    return finished, sources.uncertainty
+    return finished if scan.reference is None else _measure(run, finished, scan.reference), sources.uncertainty
 
 
 def _measure(run: _PipelineRun, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.export import distances_between_points, spacing_ratio
+from gnrecon.export import distances_between_points
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.open_scenes import spacing_ratio
 
 SPACING = 0.1
 
