@@ -20,7 +20,6 @@ from gnrecon.export import (
     Attribute,
     Metrics,
     Neighbourhood,
-    distances_between_points,
     measure,
     require_bordered,
     require_sound,
@@ -34,6 +33,7 @@ from gnrecon.export.mesh_field import cells_for_faces, mesh_field
 from gnrecon.fit import Misfit, NeuralSDF, Uncertainty, bounds_of, fit
 from gnrecon.fit.blocks.store import require_work_folder
 from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.open_scenes import spacing_ratio
 from gnrecon.geometry.point_cloud import PointCloud, Region
 from gnrecon.ingest import is_single_sheet, layers_of, prepare, sheet_thickness, survey, without_garbage
 from gnrecon.io import (
@@ -252,8 +252,7 @@ class _PipelineRun:
     @property
     def refines_resolution(self) -> bool:
         """Whether the field may raise the resolution, because no size of the faces was given."""
-        chosen = self.chosen
-        return chosen.resolution is None and chosen.edge_length is None and chosen.max_error is None
+        return self.chosen.resolution is None and self.chosen.edge_length is None and self.chosen.max_error is None
 
 
 def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, reference: Any) -> ScanRead:
@@ -329,17 +328,15 @@ def _trim(run: _PipelineRun, ingested: Ingested, surface: MeshedScan) -> MeshedS
     may_be_open = run.options.trim is None and run.options.open is not False
     one_sided = may_be_open and is_single_sheet(samples.points, samples.normals)
     sheet = one_sided and run.options.open is None and ingested.layers is None
-    reach = run.options.trim_at(surface.spacing, sheet)
+    spacing = surface.spacing * (spacing_ratio(samples.points, samples.normals) if one_sided else 1.0)
+    reach = run.options.trim_at(spacing, sheet)
     if reach is not None:
         with run.stages("trim"):
             distances, points = surface.neighbourhood.distances(mesh.vertices), samples.frame.to_world(samples.points)
-            distances = same_side_distances(mesh, distances, points, samples.normals, reach)
-            if one_sided:
-                distances = distances_between_points(mesh, distances, points, samples.normals, reach)
+            distances = same_side_distances(mesh, distances, points, samples.normals, reach, one_sided=one_sided)
             # A reach that the user gave is where the surface ends.
-            mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else surface.spacing)
-        why = ["The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."]
-        actions = [*surface.actions, *(why if sheet else []), *trimming.describe()]
+            mesh, trimming = trim(mesh, distances, reach, overhang=None if run.options.trim else spacing)
+        actions = [*surface.actions, *trimming.describe(sheet)]
         surface = replace(surface, mesh=mesh, actions=actions, trimming=trimming)
     run.remark(surface.actions)
     return surface
@@ -361,9 +358,7 @@ def _finish(
         mesh, attributes, remarks = compute_attributes(sources, run.progress.advance)
     run.remark([*(unsupported.describe() if trimming is None else []), *remarks])
     finished = FinishedMesh(mesh, facts, unsupported, attributes, None)
-    if scan.reference is not None:
-        finished = _measure(run, finished, scan.reference)
-    return finished, sources.uncertainty
+    return finished if scan.reference is None else _measure(run, finished, scan.reference), sources.uncertainty
 
 
 def _measure(run: _PipelineRun, finished: FinishedMesh, reference: Mesh | PointCloud) -> FinishedMesh:

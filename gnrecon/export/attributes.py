@@ -15,8 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gnrecon.export.export_parameters import ExportParameters
+from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.geometry.arrays import Float, Int, Values
 from gnrecon.geometry.colors import as_bytes, to_linear, to_srgb
+from gnrecon.geometry.mesh import Mesh
+from gnrecon.geometry.open_scenes import sheet_triangles
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.runtime.chunks import slices
 
@@ -219,3 +222,50 @@ def _weights(distances: Float, count: int) -> Float:
         weights = weights[:, :count] * (beyond[:, count:] - beyond[:, :count])
         weights = np.where(weights.sum(axis=1, keepdims=True) > 0, weights, 1.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def distances_between_points(
+    mesh: Mesh,
+    distances: Float,
+    points: Float,
+    normals: Float,
+    reach: float,
+    *,
+    most_gap_reaches: float = 2.0,
+    least_cosine: float = 0.25,
+) -> Float:
+    """Return distances to the data of a sheet, of shape (V,), to which triangles between its points belong.
+
+    A sheet was seen from one side. From there, two points next to each other show that the surface joins them, however
+    far one lies behind the other, as on the sides of raised letters.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With V vertices.
+    distances : array of shape (V,)
+        From each vertex to the nearest scanned point that supports it, in file units.
+    points, normals : arrays of shape (N, 3)
+        Scanned points, in file units, and their outward unit normals, nearly all on one side.
+    reach : float
+        Distance at which support ends, in file units.
+    most_gap_reaches : float
+        Longest edge of such a triangle, as it is seen; with two, no point between them is farther than the reach.
+    least_cosine : float
+        Of the angle between the surface and a triangle that supports it.
+    """
+    far = np.flatnonzero(distances > reach)
+    triangles, flat = sheet_triangles(points, normals.mean(axis=0))
+    edges = np.linalg.norm(flat[triangles] - flat[np.roll(triangles, 1, axis=1)], axis=2)
+    triangles = triangles[edges.max(axis=1) <= most_gap_reaches * reach]
+    if not len(far) or not len(triangles):
+        return distances
+    sheet = Mesh(points, triangles)
+    gaps, faces = nearest_on_surface(sheet, mesh.vertices[far])
+    facing = sheet.face_vectors[faces]
+    cosines = np.einsum("gi,gi->g", facing, mesh.vertex_normals()[far]) / np.maximum(
+        np.linalg.norm(facing, axis=1), np.finfo(np.float64).tiny
+    )
+    result = distances.copy()
+    result[far] = np.where(cosines > least_cosine, np.minimum(result[far], gaps), result[far])
+    return result

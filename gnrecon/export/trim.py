@@ -25,6 +25,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gnrecon.export.attributes import distances_between_points
 from gnrecon.export.curvature import diffuse, vertex_areas
 from gnrecon.export.export_parameters import ExportParameters, TrimParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -56,8 +57,12 @@ class Trimming:
         """All of it by name, ready for JSON."""
         return asdict(self)
 
-    def describe(self) -> list[str]:
-        """Sentences for the user."""
+    def describe(self, sheet: bool = False) -> list[str]:
+        """Sentences for the user; `sheet` says whether it was done because the scan is a single sheet."""
+        why = "The scan is a single sheet, so the mesh is left open at its border; --no-open closes it."
+        return [why] * sheet + self._what()
+
+    def _what(self) -> list[str]:
         if not self.area_share:
             return [f"Nothing was cut off: all of the surface lies within {self.distance:.6g} of a point."]
         crumbs = f", with {self.crumbs} small leftover pieces" if self.crumbs else ""
@@ -152,6 +157,7 @@ def same_side_distances(
     normals: Float,
     reach: float,
     *,
+    one_sided: bool = False,
     neighbours: int = 16,
     least_cosine: float = 0.25,
     far_reaches: float = 2.0,
@@ -172,6 +178,8 @@ def same_side_distances(
         Scanned points, in file units, and their outward unit normals.
     reach : float
         Distance at which support ends, in file units.
+    one_sided : bool
+        Whether the data is a sheet, see `distances_between_points`.
     neighbours : int
         Nearest points among which one has to face the same way; enough to find the face beyond an edge.
     least_cosine : float
@@ -193,7 +201,7 @@ def same_side_distances(
         cosines = np.einsum("gki,gi->gk", normals[found], directions[rows])
         alone = rows[(cosines < least_cosine).all(axis=1)]
         result[alone] = np.maximum(result[alone], far_reaches * reach)
-    return result
+    return distances_between_points(mesh, result, points, normals, reach) if one_sided else result
 
 
 def _absorb_small_patches(mesh: Mesh, near: Mask, areas: Float, least: float, of: bool) -> tuple[Mask, int]:

@@ -115,3 +115,37 @@ def sheet_triangles(points: Float, towards: Float) -> tuple[Int, Float]:
     away = np.cross(b - a, c - a) @ towards < 0
     triangles[away] = triangles[away][:, ::-1]
     return triangles, flat
+
+
+def spacing_ratio(
+    points: Float, normals: Float, *, neighbours: int = 8, most_points: int = 100_000, least_ratio: float = 1.25
+) -> float:
+    """Return the typical spacing of a sheet's points, in the median over its area, over that in the median of points.
+
+    It is 1 where the points are even, and more where most of them lie in strips, far denser along them than across.
+
+    Parameters
+    ----------
+    points, normals : arrays of shape (N, 3)
+        Scanned points, and their outward unit normals, nearly all on one side.
+    neighbours : int
+        Up to which a point's spacing is measured.
+    most_points : int
+        Points that are looked at, chosen at random.
+    least_ratio : float
+        Smaller ratios are 1: random points have up to 1.1.
+    """
+    from scipy.spatial import cKDTree
+
+    points = points[np.random.default_rng(0).permutation(len(points))[:most_points]]
+    triangles, flat = sheet_triangles(points, normals.mean(axis=0))
+    if not len(triangles):
+        return 1.0
+    radii = cKDTree(points).query(points, min(neighbours + 1, len(points)))[0][:, -1]
+    sides = flat[triangles[:, 1:]] - flat[triangles[:, :1]]
+    areas = np.abs(np.linalg.det(sides))
+    order = np.argsort(radii)
+    shares = np.cumsum(np.bincount(triangles.ravel(), np.repeat(areas, 3), len(points))[order])
+    middle = radii[order[np.searchsorted(shares, shares[-1] / 2)]]
+    ratio = float(middle / max(float(np.median(radii)), np.finfo(np.float64).tiny))
+    return ratio if ratio > least_ratio else 1.0

@@ -132,7 +132,7 @@ class CoarseDistance:
     points, normals : arrays of shape (N, 3), unit coordinates, outward unit normals
     rng : draws the points that the winding number sums over
     density : of the points, if it is known already
-    may_be_open : whether the sides of an open scene are distinguished as in `gnrecon.geometry.open_scenes`
+    may_be_open : whether the sides of an open scene are found as in `gnrecon.geometry.open_scenes`
     max_sources : number of these points at most, which bounds the cost of a sum
     """
 
