@@ -202,17 +202,15 @@ def uncompressed_file(path: Path, extension: str) -> Iterator[Path]:
 def _temporary(name: str, extension: str) -> Iterator[Path]:
     """Yield the path of an empty temporary file, without a name where that is possible."""
     with ExitStack() as stack:
-        if extension not in READERS or not OPEN_FILES.is_dir():
-            named = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gnrecon-"))) / name
-        if not OPEN_FILES.is_dir():
-            yield named
-            return
-        file = stack.enter_context(tempfile.TemporaryFile(prefix="gnrecon-"))
-        if extension in READERS:
-            yield OPEN_FILES / str(file.fileno())
-            return
-        # A reader may give the name to another process.
-        named.symlink_to(f"/proc/{os.getpid()}/fd/{file.fileno()}")
+        if OPEN_FILES.is_dir():
+            file = stack.enter_context(tempfile.TemporaryFile(prefix="gnrecon-"))
+            if extension in READERS:
+                yield OPEN_FILES / str(file.fileno())
+                return
+        named = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gnrecon-"))) / name
+        if OPEN_FILES.is_dir():
+            # A reader may give the name to another process.
+            named.symlink_to(f"/proc/{os.getpid()}/fd/{file.fileno()}")
         yield named
 
 
