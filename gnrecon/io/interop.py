@@ -333,10 +333,7 @@ def to_pymeshlab(shape: Mesh | PointCloud) -> Any:
 def to_pyvista(shape: Mesh | PointCloud) -> Any:
     """Return a ``pyvista.PolyData`` with normals and attributes; colours are its point data ``RGB`` or ``RGBA``.
 
-    Raises
-    ------
-    ImportError
-        When pyvista is not installed; gnrecon itself does not need it.
+    It raises `ImportError` when pyvista is not installed; gnrecon itself does not need it.
     """
     import pyvista
 
@@ -356,10 +353,7 @@ def to_pyvista(shape: Mesh | PointCloud) -> Any:
 def to_meshio(shape: Mesh | PointCloud) -> Any:
     """Return a ``meshio.Mesh`` of triangles, or of a cloud one of vertices, with normals and attributes.
 
-    Raises
-    ------
-    ImportError
-        When meshio is not installed; gnrecon itself does not need it.
+    It raises `ImportError` when meshio is not installed; gnrecon itself does not need it.
     """
     import meshio
 

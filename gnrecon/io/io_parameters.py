@@ -11,12 +11,9 @@ class IOParameters:
 
     most_points: int = 2_000_000
     # Points to keep of a scan: far fewer describe a surface well, and all later stages fit into memory.
-
     chunk_points: int = 1 << 20
     # Points in a chunk: their arrays take some ten megabytes, and libraries read so many at full speed.
-
     visible_rounding_diagonals: float = 1e-6
     # Rounding to float32, in diagonals of the mesh, that is reported or avoided: about eight times the float32 epsilon.
-
     most_built_numbers: int = 100_000_000
     # Coordinates and indices that a file may build by using what it stores many times: they take some 3 GB while read.

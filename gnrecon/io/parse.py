@@ -53,11 +53,8 @@ def format_rows(template: str, rows: Values, *, block_rows: int = 100_000) -> li
     ``%r`` writes the shortest digits that read back as the same float64. One format operation covers `block_rows` rows,
     which is several times faster than a loop over rows, and blocks keep the memory bounded.
     """
-    blocks = []
-    for start in range(0, len(rows), block_rows):
-        block = rows[start : start + block_rows]
-        blocks.append((template * len(block)) % tuple(block.ravel().tolist()))
-    return blocks
+    blocks = (rows[start : start + block_rows] for start in range(0, len(rows), block_rows))
+    return [(template * len(block)) % tuple(block.ravel().tolist()) for block in blocks]
 
 
 def sibling_path(folder: Path, name: str, what: str) -> Path:

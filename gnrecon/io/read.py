@@ -209,8 +209,7 @@ def _temporary(name: str, extension: str) -> Iterator[Path]:
                 return
         named = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gnrecon-"))) / name
         if OPEN_FILES.is_dir():
-            # A reader may give the name to another process.
-            named.symlink_to(f"/proc/{os.getpid()}/fd/{file.fileno()}")
+            named.symlink_to(f"/proc/{os.getpid()}/fd/{file.fileno()}")  # not /proc/self, for other processes
         yield named
 
 
