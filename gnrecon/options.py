@@ -201,7 +201,7 @@ class Options(OptionTable):
         ----------
         bounds : box in which the points will be meshed, of shape (2, 3), file units
         most_faces : with `remesh`, of a surface as large as that of the box; a hundred bytes and more for each
-        least_error : of `max_error`, in longest sides of the box: half of what 1024 cells, the most, leave on a ball
+        least_error : of `max_error` and `simplify`, in longest sides of the box: half of what 1024 cells leave on balls
 
         Raises
         ------
@@ -218,10 +218,12 @@ class Options(OptionTable):
                     f"Faces with edges of {self.remesh:g} would be more than {most_faces:,.0f} on this scan; "
                     f"give --remesh at least {least:.2g}."
                 )
-        if self.max_error is not None and self.max_error < (least := least_error * max(x, y, z)):
-            raise UsageError(
-                f"An error of {self.max_error:g} cannot be reached; give --max-error at least {least:.2g}."
-            )
+        least = least_error * max(x, y, z)
+        for option, length in (("max-error", self.max_error), ("simplify", self.simplify)):
+            if length is not None and length < least:
+                raise UsageError(
+                    f"No mesh is as near to the surface as {length:g}; give --{option} at least {least:.2g}."
+                )
 
     def fit(self) -> FitOptions:
         """Return the options of the fit."""

@@ -83,10 +83,10 @@ def test_long_and_short_reaches_are_not_squared_beyond_the_doubles() -> None:
     assert np.isfinite(moved).all()
 
 
-@pytest.mark.parametrize("values", [{"remesh": 1e-9}, {"max_error": 1e-12}])
+@pytest.mark.parametrize("values", [{"remesh": 1e-9}, {"max_error": 1e-12}, {"simplify": 1e-30}])
 def test_lengths_too_short_for_the_scan(values: dict[str, Any]) -> None:
     options = Options(**values)
-    options.require_reachable(np.array([[0.0] * 3, [1e-6] * 3]))
+    options.require_reachable(np.array([[0.0] * 3, [1e-30 if "simplify" in values else 1e-6] * 3]))
     with pytest.raises(UsageError, match="give --"):
         options.require_reachable(np.array([[0.0] * 3, [100.0] * 3]))
 
