@@ -11,7 +11,6 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.ingest.point_spacing import mean_distances
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
-from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.runtime.quiet_imports import import_open3d
 
 
@@ -312,6 +311,8 @@ class _Winding:
 
     def _by_rows(self, work: Callable[[slice], Single], *, chunk_rows: int = 256) -> Single:
         """Return what a function makes of some rows at a time, which stay in the processor's cache, in threads."""
+        from gnrecon.runtime.parallel import map_in_threads  # it loads torch
+
         return np.concatenate(map_in_threads(work, slices(len(self._points), chunk_rows)))
 
 

@@ -15,7 +15,7 @@ from gnrecon.runtime.errors import GnreconError
 
 @pytest.fixture
 def measured_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `run_isolated` call its function in this process; `test_bench.py` and others keep the real one."""
+    """Let `run_isolated` call its function in this process; those of its limits keep the real one."""
 
     def run(function: str, arguments: Mapping[str, Any], folder: Path, **_: Any) -> dict[str, Any]:
         module, _, name = function.partition(":")

@@ -170,6 +170,7 @@ def test_a_trial_that_fails_gives_the_sentence(tmp_path: Path) -> None:
     assert result["error"].startswith("There is no option 'width'")
 
 
+@pytest.mark.usefixtures("measured_here")
 def test_a_comparison_from_files_to_figures(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures, picture = tmp_path / "figures.json", tmp_path / "sheet.png"
     arguments = ["--data", str(data), "--cases", "rockerarm-20", "--json", str(figures), "--picture", str(picture)]

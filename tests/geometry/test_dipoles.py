@@ -52,7 +52,7 @@ def test_every_point_counts_once_and_few_terms_are_left() -> None:
 def test_arrays_bring_it_back() -> None:
     tree = DipoleTree.of(*two_balls())
     arrays = tree.arrays()
-    again = DipoleTree.of_arrays(arrays.__getitem__, len(tree.levels))
+    again = DipoleTree.of_arrays(arrays.__getitem__, len(tree.levels), tree.sides)
     x = np.array([[0.1, 0.2, 0.0], [3.0, 0.0, 0.0]])
     assert (
         winding_number(x, *again.dipoles_for(x[0], 0.0)).tolist()
