@@ -72,15 +72,14 @@ class MarginalLikelihood:
         features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
         return cls(patches, features, radius, device, parameters)
 
-    def likeliest(self, length: float, near: Place | None = None) -> Place:
-        """Return where the noises of the largest marginal likelihood are in both tables of candidates.
+    def likeliest(self, length: float) -> tuple[float, float]:
+        """Return the noise of positions, unit coordinates, and of normals, radians, of the largest marginal likelihood.
 
-        It is a local maximum.
+        It is a local maximum over both tables of candidates.
 
         Parameters
         ----------
         length : over which the functions vary, unit coordinates
-        near : place of those of a similar length, where the search begins
         """
         kernels = map_in_threads(
             lambda patch: data_kernel(patch, self.features, length, patch.size), self.patches, self.device
@@ -89,17 +88,16 @@ class MarginalLikelihood:
 
         @cache
         def found(place: Place) -> float:
-            position, angle = self.noise_at(place)
+            position, angle = self._noise_at(place)
             return sum(map_in_threads(lambda one: log_density(*one, position, angle), both, self.device))
 
-        best = near or self.parameters.first_index
-        for stride in self.parameters.strides if near is None else self.parameters.strides[-1:]:
+        best = self.parameters.first_index
+        for stride in self.parameters.strides:
             while (better := max(self._around(best, stride), key=found)) != best:
                 best = better
-        return best
+        return self._noise_at(best)
 
-    def noise_at(self, place: Place) -> tuple[float, float]:
-        """Return the noise of positions, unit coordinates, and of normals, radians, at a place in both tables."""
+    def _noise_at(self, place: Place) -> tuple[float, float]:
         positions, angles = self.parameters.position_noises_disk_radii, self.parameters.angle_noises_radians
         return positions[place[0]] * self.radius, angles[place[1]]
 

@@ -25,7 +25,7 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import Volume
 from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
-from gnrecon.fit.marginal_likelihood import MarginalLikelihood, Place, SurfaceLikelihood, clean_noise
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, SurfaceLikelihood, clean_noise
 from gnrecon.fit.parameters import (
     MarginalLikelihoodParameters,
     ModelSelectionParameters,
@@ -195,8 +195,8 @@ class CrossValidation:
     held_out : mask of shape (N,), of the validation points
     device : a torch device
     known : noise of positions and normals, if it is known; then no other is tried
-    likelihood : which decides the noise for each length; None where several are tried, as for estimated normals, whose
-        errors are correlated
+    likelihood : which gives one more candidate of the noise for each length, and decides it in the end; None of
+        estimated normals, whose errors are correlated
     """
 
     residuals: FieldResiduals
@@ -209,7 +209,6 @@ class CrossValidation:
     known: tuple[float, float] | None = None
     likelihood: MarginalLikelihood | None = None
     parameters: ModelSelectionParameters = ModelSelectionParameters()
-    _places: list[Place] = field(default_factory=list, init=False, repr=False)
     _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
     _scored: dict[float, Float] = field(default_factory=dict, init=False, repr=False)
 
@@ -273,10 +272,15 @@ class CrossValidation:
         step = 1 if least(at + 1) < least(at) else -1
         while least(at + step) < least(at):
             at += step
+        if self.likelihood is not None:
+            # The share of ties is for noise that is correlated, which no likelihood decides.
+            alone = {number: of_length[:, -1:] for number, of_length in scores.items()}
+            number, _ = _smoothest(alone, parameters=replace(self.parameters, tie_share=0.0))
+            # Errors of dense scans are alike among neighbours, as those of estimated normals are.
+            by_place = len(self.residuals) <= self.parameters.sparse_points
+            return Hyperparameters(self._length(number), *self.noises(self._length(number))[-1], by_place)
         number, noise = _smoothest(scores, parameters=self.parameters)
-        # Errors of dense scans are alike among neighbours, as those of estimated normals are.
-        by_place = self.likelihood is not None and len(self.residuals) <= self.parameters.sparse_points
-        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise], by_place)
+        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise])
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
@@ -291,7 +295,7 @@ class CrossValidation:
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
-        """Return the noises of positions and normals to try with a length."""
+        """Return the noises of positions and normals to try with a length, the most likely one last."""
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
@@ -299,15 +303,10 @@ class CrossValidation:
             least, most = 0.0, max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
             if self.residuals.estimated and (shown := self.residuals.noise):
                 least, most = shown / self.parameters.most_noise_factor, shown * self.parameters.most_noise_factor
-            self._noises[length] = [(min(max(position, least), most), angle) for position, angle in self._tried(length)]
+            tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
+            tried += [] if self.likelihood is None else [self.likelihood.likeliest(length)]
+            self._noises[length] = [(min(max(position, least), most), angle) for position, angle in tried]
         return self._noises[length]
-
-    def _tried(self, length: float) -> list[tuple[float, float]]:
-        """Return the likeliest noise of a length, or all candidates where likelihood does not decide."""
-        if self.likelihood is None:
-            return [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
-        self._places.append(self.likelihood.likeliest(length, self._places[-1] if self._places else None))
-        return [self.likelihood.noise_at(self._places[-1])]
 
     def scores(self, length: float) -> Float:
         """Return the scores of a length, of shape (patches, noises), in radii; each length is tried once."""

@@ -33,7 +33,7 @@ def test_outliers_leave_the_choice_to_validation_points(monkeypatch: pytest.Monk
     value, held_out = np.linalg.norm(points, axis=1) - 0.8, np.arange(400) % 6 == 0
     residuals = FieldResiduals(points, normals, value, points / np.linalg.norm(points, axis=1, keepdims=True))
     likely = 0.123 * residuals.density.radius
-    monkeypatch.setattr(MarginalLikelihood, "noise_at", lambda *_: (likely, 0.2))
+    monkeypatch.setattr(MarginalLikelihood, "likeliest", lambda *_: (likely, 0.2))
     chosen = select_hyperparameters(residuals, held_out, residuals.density.radius, rng, outliers=outliers)
     assert chosen.by_place is not outliers
     assert (chosen.position == likely) is not outliers
