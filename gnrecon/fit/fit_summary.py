@@ -60,15 +60,11 @@ def _solved(summary: FitSummary, *, least_unused_degrees: float = 45.0) -> Itera
     by_steps = f" by {_counted(summary.steps, 'Gauss-Newton step')}," if summary.steps else ""
     yield f"Fitted a global field{by_steps} and {_counted(summary.cubes, 'local field')} by linear least squares."
     if summary.edge_samples is None:
-        unused = summary.angle_noise > least_unused_degrees
-        yield (
-            f"Chosen from the data: length scale {summary.length:.3g}, noise {summary.position_noise:.2g} in position"
-            + (
-                "; estimated normals say which side is outside."
-                if unused
-                else f" and {summary.angle_noise:.2g} degrees in normals."
-            )
-        )
+        normals = f" and {summary.angle_noise:.2g} degrees in normals"
+        if summary.angle_noise > least_unused_degrees:
+            normals = "; estimated normals say which side is outside"
+        noise = f"noise {summary.position_noise:.2g} in position{normals}"
+        yield f"Chosen from the data: length scale {summary.length:.3g}, {noise}."
         yield from _disagreement(summary)
     else:
         yield f"The length scale is {summary.length:.3g}, the shortest that the samples of sharp faces allow."

@@ -283,27 +283,30 @@ class _Winding:
     def at_points(self, mu: Single) -> Single:
         """Return w, of shape (N,)."""
         p = self._points
-        sums = self._by_rows(lambda rows: self._kernel[rows] @ _in_columns((p * mu).sum(axis=1), mu))
+        # In one array, so that one product passes over the matrix once.
+        both: Single = np.column_stack([(p * mu).sum(axis=1), mu])
+        sums = self._by_rows(lambda rows: self._kernel[rows] @ both)
         found: Single = sums[:, 0] - (p * sums[:, 1:]).sum(axis=1)
         return found
 
     def transposed(self, values: Single) -> Single:
         """Return the transpose of `at_points` times values of shape (N,): of shape (N, 3)."""
         p = self._points
-        sums = self._by_rows(lambda columns: self._kernel[:, columns].T @ _in_columns(values, p * values[:, None]))
+        both: Single = np.column_stack([values, p * values[:, None]])
+        sums = self._by_rows(lambda columns: self._kernel[:, columns].T @ both)
         found: Single = p * sums[:, :1] - sums[:, 1:]
         return found
 
     def descent(self, mu: Single) -> Single:
         """Return -grad w at the points, of shape (N, 3)."""
         p = self._points
-        height, ones = (p * mu).sum(axis=1), np.ones(len(p), np.float32)
+        height, both = (p * mu).sum(axis=1), np.column_stack([np.ones(len(p), np.float32), p])
 
         def of_rows(rows: slice) -> Single:
             along: Single = p[rows] @ mu.T
             np.subtract(height, along, out=along)
             along *= self._slope[rows]
-            sums: Single = along @ _in_columns(ones, p)
+            sums: Single = along @ both
             found: Single = self._kernel[rows] @ mu - (sums[:, 1:] - p[rows] * sums[:, :1])
             return found
 
@@ -314,11 +317,6 @@ class _Winding:
         from gnrecon.runtime.parallel import map_in_threads  # it loads torch
 
         return np.concatenate(map_in_threads(work, slices(len(self._points), chunk_rows)))
-
-
-def _in_columns(first: Single, others: Single) -> Single:
-    """Return a column and others as one array, so that one product passes over a matrix once."""
-    return np.column_stack([first, others])
 
 
 def _unit(vectors: Single) -> Single:

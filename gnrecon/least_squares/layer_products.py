@@ -223,12 +223,6 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
     return product
 
 
-def add_gram(product: Tensor, rows: Tensor, *, block_columns: int = 192) -> None:
-    """Add J^T J of a chunk of rows, of shape (m, p), to the lower triangle of a product, as `gram` does."""
-    for block in slices(len(product), block_columns):
-        _add_block(product, rows, block)
-
-
 def _add_block(product: Tensor, rows: Tensor, block: slice) -> None:
     place = product[block, : block.stop]
     if rows.dtype == product.dtype:

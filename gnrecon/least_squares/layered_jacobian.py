@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.least_squares.jacobian import Block, column_slices
-from gnrecon.least_squares.layer_products import add_gram, gram
+from gnrecon.least_squares.layer_products import gram
 from gnrecon.runtime.parallel import map_in_threads
 
 
@@ -113,22 +113,17 @@ class LayeredJacobian:
         """Return J^T J, its lower triangle valid."""
         small = self.pieces * self.columns**2 * self.dtype.itemsize <= self.chunk_bytes
         if not (small and self.kept and self.device.type == "cpu"):
-            return gram(self._dense(map(_without_zero_rows, self.blocks())), self.columns, self._zeros(0))
+            return self._gram(self.blocks())
         # Threads share the blocks and no sum; which blocks a sum has does not depend on the number of threads.
-        products = [self._zeros(self.columns, self.columns) for _ in range(self.pieces)]
-
-        def add(blocks: Sequence[Block], product: Tensor) -> None:
-            for rows in self._dense(map(_without_zero_rows, blocks)):
-                add_gram(product, rows)
-
         blocks = list(self.blocks())
-        map_in_threads(
-            lambda number: add(blocks[number :: self.pieces], products[number]), range(self.pieces), self.device
-        )
-        total, *others = products
+        shares = [blocks[number :: self.pieces] for number in range(self.pieces)]
+        total, *others = map_in_threads(self._gram, shares, self.device)
         for product in others:
             total += product
         return total
+
+    def _gram(self, blocks: Iterable[Block]) -> Tensor:
+        return gram(self._dense(map(_without_zero_rows, blocks)), self.columns, self._zeros(0))
 
     def group_grams(self) -> list[Tensor]:
         """Return the layers' blocks of J^T J, each with a valid lower triangle."""

@@ -76,11 +76,14 @@ class SharpShape:
         if edges.roughness > p.max_raw_roughness_radii and not samples.estimated:
             averaging = BilateralFilter(p.averaging_width_radii, p.averaging_normal_scale)
             averaged = averaging.apply(points, normals)
-            if not _is_even_and_sharp(EdgeCompletion(*averaged, parameters.edges), p):
+            edges = EdgeCompletion(*averaged, parameters.edges)
+            if not _is_even_and_sharp(edges, p):
                 return None
             snapped = snap_to_primitives(points, normals, averaged, parameters.snapping)
-            points, normals = averaged if snapped is None else (snapped.points, snapped.normals)
-            edges = EdgeCompletion(points, normals, parameters.edges)
+            points, normals = averaged
+            if snapped is not None:
+                points, normals = snapped.points, snapped.normals
+                edges = EdgeCompletion(points, normals, parameters.edges)
         if not _is_even_and_sharp(edges, p):
             return None
         holes = complete_holes(points, normals, True, parameters.holes)
