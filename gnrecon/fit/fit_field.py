@@ -79,7 +79,8 @@ def fit(
             f"{len(convex) - len(given)} samples."
         )
         fitted = replace(fitted, status=status)
-    return replace(sdf, support=_support(given)), fitted
+    support = _support(given) if sdf.support is None else np.concatenate([_support(given), sdf.support])
+    return replace(sdf, support=support), fitted
 
 
 def _completed(samples: Samples, parameters: FitParameters) -> Samples | None:

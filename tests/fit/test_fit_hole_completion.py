@@ -8,7 +8,8 @@ import pytest
 from made_shapes import bored_plate
 
 from gnrecon.fit import FitOptions, fit
-from gnrecon.fit.shape_priors.hole_completion import complete_holes, encloses, in_bore_opening
+from gnrecon.fit.shape_priors.bores import in_bore_opening
+from gnrecon.fit.shape_priors.hole_completion import complete_holes, encloses
 from gnrecon.fit.shape_priors.min_cut import minimal_inside
 from gnrecon.fit.shape_priors.primitive_detection import detect_primitives, planar_share
 from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, is_inlier

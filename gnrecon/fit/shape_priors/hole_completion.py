@@ -3,7 +3,7 @@
 A smooth field closes a hole like a membrane. Where an edge, a corner, or most of a bore is missing, that is far from
 the part. A minimal cut (`min_cut`) of a lattice around the hole, between the cells that nearby points show to be inside
 and outside, decides which parts of the extended primitives are surface. Where the cut follows none of them, no samples
-are added, and the hole is closed smoothly.
+are added, and the hole is closed smoothly. Walls of round bores are completed first (`bores`).
 
 A hole is where the winding number is near one half although no point is near. Entry: `complete_holes`.
 """
@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from gnrecon.fit.shape_priors.bores import in_bore_opening, samples_on_bores
 from gnrecon.fit.shape_priors.edge_completion import EdgeCompletion
 from gnrecon.fit.shape_priors.min_cut import minimal_inside, shifted
 from gnrecon.fit.shape_priors.primitive_detection import DetectedPrimitive, detect_primitives, planar_share
@@ -24,7 +25,6 @@ from gnrecon.fit.shape_priors.primitives import Primitive, is_inlier, project
 from gnrecon.fit.shape_priors.prior_parameters import HoleCompletionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Box, CoarseDistance, Density
-from gnrecon.geometry.statistics import widest_gap
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,15 @@ class HoleCompletion:
     def none(cls) -> HoleCompletion:
         """Return no samples."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), 0)
+
+    @classmethod
+    def joined(cls, found: list[tuple[Float, Float]]) -> HoleCompletion:
+        """Return the samples and normals of holes, each of shape (M, 3), as one; holes without any do not count."""
+        some = [one for one in found if len(one[0])]
+        if not some:
+            return cls.none()
+        points, normals = (np.concatenate(arrays) for arrays in zip(*some, strict=True))
+        return cls(points, normals, len(some))
 
     def appended_to(self, points: Float, normals: Float) -> tuple[Float, Float]:
         """Return points and normals, of shape (N, 3), followed by the samples, of shape (N + M, 3)."""
@@ -64,14 +73,16 @@ def complete_holes(
     """
     # A generator of its own, so that later draws are the same whether there are holes or not.
     rng = np.random.default_rng(0)
-    total = HoleCompletion.none()
+    # First, as the walls of bores show what is around other holes.
+    bores, total = _bore_walls(points, normals, exact, parameters), HoleCompletion.none()
+    known = bores.appended_to(points, normals)
     for _ in range(parameters.passes):
-        more = _one_pass(*total.appended_to(points, normals), exact, rng, parameters)
+        more = _one_pass(*total.appended_to(*known), exact, rng, parameters)
         finished = len(more) <= parameters.min_gain_share * len(total)
         total = HoleCompletion(*total.appended_to(more.points, more.normals), max(total.holes, more.holes))
         if finished:
             break
-    return total
+    return HoleCompletion(*total.appended_to(bores.points, bores.normals), total.holes + bores.holes)
 
 
 def _one_pass(
@@ -80,21 +91,25 @@ def _one_pass(
     """Return the samples of one pass; the parameters are those of `complete_holes`."""
     if len(points) < parameters.min_points:
         return HoleCompletion.none()
-    drawn = rng.permutation(len(points))
-    rows, dense = np.sort(drawn[: parameters.hole_points]), np.sort(drawn[: parameters.surface_points])
-    density = Density(points[rows])
-    coarse = CoarseDistance(points[rows], normals[rows], rng, density)
-    scan = _HoleScan(points[rows], normals[rows], points[dense], normals[dense], density, coarse, exact, parameters)
-    spacing = parameters.sample_spacing_radii * density.radius * np.sqrt(len(rows) / len(points))
+    scan = _HoleScan.of(points, normals, exact, rng, parameters)
+    spacing = parameters.sample_spacing_radii * scan.density.radius * np.sqrt(len(scan.points) / len(points))
     holes = scan.holes()
     if not holes or not scan.is_machine_part(rng):
         return HoleCompletion.none()
-    found = [some for cells in holes if len((some := scan.samples_across(cells, spacing, rng))[0])]
-    if not found:
+    found = HoleCompletion.joined([scan.samples_across(cells, spacing, rng) for cells in holes])
+    kept = ~in_bore_opening(found.points, found.normals, points, normals)
+    return HoleCompletion(found.points[kept], found.normals[kept], found.holes)
+
+
+def _bore_walls(points: Float, normals: Float, exact: bool, parameters: HoleCompletionParameters) -> HoleCompletion:
+    """Return samples in the gaps of bores' walls; the parameters are those of `complete_holes`."""
+    if len(points) < parameters.min_points:
         return HoleCompletion.none()
-    samples, sample_normals = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    kept = ~in_bore_opening(samples, sample_normals, points, normals)
-    return HoleCompletion(samples[kept], sample_normals[kept], len(found))
+    # Draws of their own: what is found in holes does not depend on bores.
+    rng = np.random.default_rng(0)
+    scan = _HoleScan.of(points, normals, exact, rng, parameters)
+    found = HoleCompletion.joined(scan.samples_in_bores())
+    return found if len(found) and scan.is_machine_part(rng) else HoleCompletion.none()
 
 
 @dataclass(frozen=True)
@@ -117,6 +132,22 @@ class _HoleScan:
     coarse: CoarseDistance
     exact: bool
     parameters: HoleCompletionParameters
+
+    @classmethod
+    def of(
+        cls,
+        points: Float,
+        normals: Float,
+        exact: bool,
+        rng: np.random.Generator,
+        parameters: HoleCompletionParameters,
+    ) -> _HoleScan:
+        """Draw the points in which holes and primitives are looked for; as in `complete_holes`."""
+        drawn = rng.permutation(len(points))
+        rows, dense = np.sort(drawn[: parameters.hole_points]), np.sort(drawn[: parameters.surface_points])
+        density = Density(points[rows])
+        coarse = CoarseDistance(points[rows], normals[rows], rng, density)
+        return cls(points[rows], normals[rows], points[dense], normals[dense], density, coarse, exact, parameters)
 
     @cached_property
     def roughness(self) -> float:
@@ -148,6 +179,17 @@ class _HoleScan:
         found = [lattice[number == one] for one in range(1, count + 1)]
         found = [h for h in found if len(h) >= p.min_hole_cells and np.ptp(h, axis=0).max() <= p.max_hole_units]
         return sorted(found, key=len, reverse=True)[: p.max_holes]
+
+    @property
+    def _dense_radius(self) -> float:
+        """Radius of the disks for which the dense points stand."""
+        return self.density.radius * float(np.sqrt(len(self.points) / len(self.dense_points)))
+
+    def samples_in_bores(self) -> list[tuple[Float, Float]]:
+        """Return samples and normals, both of shape (M, 3), of the unseen walls of bores."""
+        radius = self._dense_radius
+        dense = self.dense_points, self.dense_normals, radius, self._max_height(radius)
+        return samples_on_bores(*dense, self.coarse, self.parameters.bores)
 
     def samples_across(self, hole_cells: Float, spacing: float, rng: np.random.Generator) -> tuple[Float, Float]:
         """Return samples and normals, both of shape (M, 3), of the primitives that extend across a hole."""
@@ -182,7 +224,7 @@ class _HoleScan:
         radius, p = self.density.radius, self.parameters
         distance = hole.query(self.dense_points)[0] / radius
         around = distance < p.search_radii
-        disk = radius * float(np.sqrt(len(self.points) / len(self.dense_points)))
+        disk = self._dense_radius
         proposing = distance[around] < p.touch_radii
         points, normals, height = self.dense_points[around], self.dense_normals[around], self._max_height(disk)
         faces = detect_primitives(points, normals, proposing, disk, height, rng, p.detection)
@@ -311,57 +353,3 @@ def _lattice(lower: Float, upper: Float, size: float) -> Float:
     """Return the points of a lattice of cells of a size that covers a box, of shape (a, b, c, 3)."""
     axes = [np.arange(low, high + size, size) for low, high in zip(lower, upper, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-
-
-# Bore openings. A face that ends at a bore has a hole there, which looks like an unscanned part of the face. Points of
-# the bore's wall, just behind the face, have normals that point to the middle of the hole from all around it: if the
-# face were closed there, they would be inside the part.
-
-
-def in_bore_opening(
-    samples: Float,
-    normals: Float,
-    points: Float,
-    point_normals: Float,
-    *,
-    search_distances: float = 1.5,
-    group_distances: float = 1.6,
-    min_group_cosine: float = 0.95,
-) -> Mask:
-    """Return which samples lie in the openings of bores, of shape (M,).
-
-    Parameters
-    ----------
-    samples, normals : arrays of shape (M, 3), of extended faces
-    points, point_normals : arrays of shape (N, 3), of the scan
-    search_distances : how far around a sample wall points are looked for, in distances of its nearest point
-    group_distances : how far from such a sample others of its face are in the opening too, in the same distances
-    min_group_cosine : of the angle between the normals of one face
-    """
-    found = np.zeros(len(samples), dtype=bool)
-    if not len(samples):
-        return found
-    tree, others = cKDTree(points), cKDTree(samples)
-    away = tree.query(samples)[0]
-    for row, near in enumerate(tree.query_ball_point(samples, search_distances * away)):
-        if not found[row] and _is_walled(points[near] - samples[row], point_normals[near], normals[row]):
-            same = np.array(others.query_ball_point(samples[row], group_distances * away[row]))
-            found[same[normals[same] @ normals[row] > min_group_cosine]] = True
-    return found
-
-
-def _is_walled(
-    offsets: Float, normals: Float, axis: Float, *, max_wall_cosine: float = 0.5, max_gap_degrees: float = 150.0
-) -> bool:
-    """Return whether walls behind the origin, along an axis, face it from all around.
-
-    Parameters
-    ----------
-    offsets, normals : arrays of shape (N, 3), of points near the origin
-    axis : array of shape (3,), the face's normal
-    max_wall_cosine : of the angle between a wall's normal and the axis: walls may slope by 30 degrees
-    max_gap_degrees : widest angle around the axis without a wall
-    """
-    wall = np.abs(normals @ axis) < max_wall_cosine
-    wall &= (offsets @ axis < 0) & (np.einsum("nd,nd->n", normals, offsets) < 0)
-    return bool(widest_gap(offsets[wall], axis) < np.radians(max_gap_degrees))

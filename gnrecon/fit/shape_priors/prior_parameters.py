@@ -81,10 +81,27 @@ class EdgeParameters:
 
 
 @dataclass(frozen=True)
+class BoreParameters:
+    """Walls of round bores, completed where they have no points, see `bores`."""
+
+    # Heights and normals of 8 points are 24 equations for a cylinder's five unknowns.
+    detection: DetectionParameters = DetectionParameters(min_points=8, proposals=1000)
+    max_bore_radii: float = 10.0  # radius of a bore
+    max_pairs: int = 10_000_000  # of points that may face each other, each twice, for memory
+    max_open_degrees: float = 150.0  # widest angle around the axis without a point
+    max_spacing_share: float = 0.5  # of the radius, between samples: 12 around a narrow bore
+    max_gap_diameters: float = 3.0  # length of a gap, in diameters of the bore
+    backing_radii: float = 2.0  # behind the wall, where the winding number shows solid
+    free_share: float = 0.5  # of the radius, from the axis to all points: else the bore ends there
+    unseen_radii: float = 2.0  # from every point to a sample
+
+
+@dataclass(frozen=True)
 class HoleCompletionParameters:
     """Planes and cylinders extended across holes, see `hole_completion`."""
 
     detection: DetectionParameters = DetectionParameters()
+    bores: BoreParameters = BoreParameters()
     hole_points: int = 6000  # in which holes are looked for; what so few do not show is small
     surface_points: int = 15_000  # in which primitives are looked for
     passes: int = 3  # as an extended face shows where others end
