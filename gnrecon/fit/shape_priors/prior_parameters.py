@@ -90,7 +90,7 @@ class BoreParameters:
     max_pairs: int = 10_000_000  # of points that may face each other, each twice, for memory
     max_open_degrees: float = 150.0  # widest angle around the axis without a point
     max_spacing_share: float = 0.5  # of the radius, between samples: 12 around a narrow bore
-    max_gap_diameters: float = 3.0  # length of a gap, in diameters of the bore
+    max_gap_diameters: float = 10.0  # length of a gap, in diameters of the bore: as deep as drills reach
     backing_radii: float = 2.0  # behind the wall, where the winding number shows solid
     free_share: float = 0.5  # of the radius, from the axis to all points: else the bore ends there
     unseen_radii: float = 2.0  # from every point to a sample
