@@ -134,7 +134,7 @@ class _Data:
     sharp: SharpShape | None
     across: HoleCompletion
 
-    def across_holes(self, parameters: HoleCompletionParameters) -> _Data:
+    def across_holes(self, rng: np.random.Generator, parameters: HoleCompletionParameters) -> _Data:
         """Return the data with samples across the holes; a shape with sharp edges has them already."""
         if self.sharp is not None:
             return self
@@ -144,8 +144,9 @@ class _Data:
             return self
         points, normals = across.appended_to(self.samples.points, self.samples.normals)
         held_out = np.concatenate([self.held_out, np.zeros(len(across), dtype=bool)])
-        # The global field sees all of them: where it closes a hole by a film, the local fields have far to go.
-        added = len(self.samples) + np.arange(len(across))
+        # The global field sees the same share of them as of the points that are not held out.
+        share = len(self.seen) / max(len(self.samples) - int(self.held_out.sum()), 1)
+        added = len(self.samples) + np.flatnonzero(rng.random(len(across)) < share)
         samples = replace(self.samples, points=points, normals=normals)
         return _Data(self.scan, samples, held_out, np.concatenate([self.seen, added]), None, across)
 
@@ -271,7 +272,7 @@ class _Steps:
         """Return the data with samples across holes; a fit with curvature penalties closes holes by them."""
         if self.options.regularisers:
             return data
-        return data.across_holes(self.parameters.shape_priors.holes)
+        return data.across_holes(self.rng, self.parameters.shape_priors.holes)
 
     def _draw(self, scan: Samples, sharp: SharpShape | None) -> _Data:
         """Draw the validation points and those that the global field sees."""
