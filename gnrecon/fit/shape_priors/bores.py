@@ -15,10 +15,10 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from gnrecon.fit.shape_priors.primitive_detection import detect_primitives
-from gnrecon.fit.shape_priors.primitives import Cylinder
-from gnrecon.fit.shape_priors.prior_parameters import BoreParameters
-from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.fit.shape_priors.primitive_detection import detect_cylinders, meets_on_an_axis
+from gnrecon.fit.shape_priors.primitives import Cylinder, cosine_of
+from gnrecon.fit.shape_priors.prior_parameters import BoreParameters, DetectionParameters
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.geometry.statistics import widest_gap
 from gnrecon.runtime.chunks import slices
@@ -47,11 +47,13 @@ def samples_on_bores(
     # Where points crowd, each has too many others within reach.
     while tree.count_neighbors(tree, 2.0 * widest) > p.max_pairs:
         widest /= 2.0
-    walls = _facing_another(points, normals, tree, 2.0 * widest)
-    everywhere = np.ones(int(walls.sum()), dtype=bool)
+    pairs = _pairs_on_bores(points, normals, tree, 2.0 * widest, 2.0 * max_height, p.detection)
     # A generator of its own, so that later draws are the same whether there are bores or not.
     rng = np.random.default_rng(0)
-    found = detect_primitives(points[walls], normals[walls], everywhere, radius, max_height, rng, p.detection)
+    rows, pairs = np.unique(pairs, return_inverse=True)
+    cloud = points[rows], normals[rows], pairs.reshape(-1, 2), radius, max_height, rng, p.detection
+    # What is open to one side is a groove or a fillet.
+    found = detect_cylinders(*cloud, max_open_degrees=p.max_open_degrees)
     samples = []
     for one in found:
         wall = one.surface
@@ -63,19 +65,26 @@ def samples_on_bores(
     return samples
 
 
-def _facing_another(points: Float, normals: Float, tree: cKDTree, reach: float, *, max_cosine: float = -0.5) -> Mask:
-    """Return which points, of shape (N,), face another within reach that faces them, by the cosine of their normals."""
-    walls = np.zeros(len(points), dtype=bool)
+def _pairs_on_bores(
+    points: Float, normals: Float, tree: cKDTree, reach: float, tolerance: float, parameters: DetectionParameters
+) -> Int:
+    """Return pairs of rows, of shape (K, 2), within reach that may lie on one bore, among points that face another."""
+    facing, close = np.zeros(len(points), dtype=bool), []
     pairs = tree.query_pairs(reach, output_type="ndarray")
     for rows in slices(len(pairs), 200_000):
         one, other = pairs[rows].T
-        opposed = np.einsum("kd,kd->k", normals[one], normals[other]) < max_cosine
-        one, other = one[opposed], other[opposed]
-        across = points[other] - points[one]
-        facing = np.einsum("kd,kd->k", across, normals[one]) > 0
-        facing &= np.einsum("kd,kd->k", across, normals[other]) < 0
-        walls[one[facing]] = walls[other[facing]] = True
-    return walls
+        n, m, offset = normals[one], normals[other], points[other] - points[one]
+        cosine = np.einsum("kd,kd->k", n, m)
+        # Both are in front of the other.
+        concave = (np.einsum("kd,kd->k", offset, n) > 0) & (np.einsum("kd,kd->k", offset, m) < 0)
+        opposed = concave & (cosine < cosine_of(parameters.max_pair_degrees))
+        facing[one[opposed]] = facing[other[opposed]] = True
+        turned = concave & ~opposed & (cosine < cosine_of(parameters.min_pair_degrees))
+        turned[turned] = meets_on_an_axis(offset[turned], n[turned], m[turned], tolerance)
+        close.append(pairs[rows][turned])
+    found = np.concatenate(close) if close else np.zeros((0, 2), dtype=int)
+    chosen: Int = found[facing[found].all(axis=1)]
+    return chosen
 
 
 @dataclass(frozen=True)
@@ -120,9 +129,6 @@ class _Bore:
         """
         p, wall = parameters, self.wall
         offset = self.points - wall.center
-        # What is open to one side is a groove or a fillet.
-        if widest_gap(offset, wall.axis) > np.radians(p.max_open_degrees):
-            return np.zeros((0, 3))
         behind = self.rings - p.backing_radii * radius * wall.normal(self.rings.reshape(-1, 3)).reshape(
             self.rings.shape
         )
@@ -138,6 +144,8 @@ class _Bore:
             first, last = gap[0].start, gap[0].stop
             ends = first > 0 and last < len(kept) and (scanned[first - 1] or scanned[last])
             kept[gap] = ends and (last - first) * self.spacing < 2.0 * p.max_gap_diameters * wall.radius
+        # Mouths are often rounded or bevelled.
+        kept &= ndimage.binary_erosion(passes)
         away = tree.query(self.rings.reshape(-1, 3))[0].reshape(solid.shape)
         unseen: Float = self.rings[kept[:, None] & solid & (away > max(self.spacing, p.unseen_radii * radius))]
         return unseen

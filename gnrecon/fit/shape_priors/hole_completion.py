@@ -108,8 +108,7 @@ def _bore_walls(points: Float, normals: Float, exact: bool, parameters: HoleComp
     # Draws of their own: what is found in holes does not depend on bores.
     rng = np.random.default_rng(0)
     scan = _HoleScan.of(points, normals, exact, rng, parameters)
-    found = HoleCompletion.joined(scan.samples_in_bores())
-    return found if len(found) and scan.is_machine_part(rng) else HoleCompletion.none()
+    return HoleCompletion.joined(scan.samples_in_bores() if scan.is_machine_part(rng) else [])
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ Source: Schnabel, Wahl and Klein, Efficient RANSAC for Point-Cloud Shape Detecti
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +18,7 @@ from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, Primitive, Sphe
 from gnrecon.fit.shape_priors.prior_parameters import DetectionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Density
+from gnrecon.geometry.statistics import widest_gap
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,38 @@ def detect_primitives(
     if len(points) <= parameters.flat_neighbours:
         return []
     return _Detector(points, normals, radius, max_height, rng, parameters).detect(proposing)
+
+
+def detect_cylinders(
+    points: Float,
+    normals: Float,
+    pairs: Int,
+    radius: float,
+    max_height: float,
+    rng: np.random.Generator,
+    parameters: DetectionParameters = DetectionParameters(),
+    *,
+    max_open_degrees: float,
+) -> list[DetectedPrimitive]:
+    """Return the round cylinders that pairs of points propose, with points all around them.
+
+    Parameters
+    ----------
+    pairs : array of shape (K, 2), rows of the points
+    max_open_degrees : widest angle around the axis without a point
+    points, normals, radius, max_height, rng, parameters : as in `detect_primitives`
+    """
+    detector = _Detector(points, normals, radius, max_height, rng, parameters)
+    found: list[DetectedPrimitive] = []
+    left: Int = np.arange(len(points))
+    for _ in range(parameters.rounds):
+        pairs = pairs[np.isin(pairs, left).all(axis=1)]
+        some = pairs if len(pairs) <= parameters.proposals else rng.choice(pairs, parameters.proposals, replace=False)
+        proposed = detector.cylinders(some)
+        closed = [one for one in proposed if detector.open_degrees(one, left) <= max_open_degrees]
+        accepted, left = detector.accepted(left, closed)
+        found += accepted
+    return found
 
 
 def planar_share(
@@ -113,9 +147,21 @@ class _Detector:
         cosine = np.einsum("kd,kd->k", n, m)
         kept = (cosine < cosine_of(p.min_pair_degrees)) & (cosine > cosine_of(p.max_pair_degrees))
         pairs = points[first[kept]], n[kept], m[kept], offset[kept]
-        return self._cylinders(*pairs) + (self._spheres(*pairs) if p.spheres else [])
+        return [*self._cylinders(*pairs), *(self._spheres(*pairs) if p.spheres else [])]
 
-    def _cylinders(self, points: Float, n: Float, m: Float, offset: Float) -> list[Primitive]:
+    def open_degrees(self, cylinder: Cylinder, rows: Int) -> float:
+        """Return the widest angle around a cylinder without one of its inliers among some rows."""
+        points = self.points[rows][self._inliers(cylinder, self.points[rows], self.normals[rows])]
+        return float(np.degrees(widest_gap(points - cylinder.center, cylinder.axis))) if len(points) else 360.0
+
+    def cylinders(self, pairs: Int) -> list[Cylinder]:
+        """Return the cylinders of pairs of rows, of shape (K, 2)."""
+        one, other = pairs.T
+        return self._cylinders(
+            self.points[one], self.normals[one], self.normals[other], self.points[other] - self.points[one]
+        )
+
+    def _cylinders(self, points: Float, n: Float, m: Float, offset: Float) -> list[Cylinder]:
         """Return the cylinders of points, of shape (K, 3), with normals n, and those at an offset with normals m."""
         axis = np.cross(n, m)
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -135,7 +181,7 @@ class _Detector:
         proper = np.flatnonzero((size > p.min_round_radii * self.radius) & (missed < p.max_center_miss * size))
         return [Sphere(points[k] + reach[k] * n[k], float(size[k]), float(-np.sign(reach[k]))) for k in proper]
 
-    def accepted(self, rows: Int, proposed: list[Primitive]) -> tuple[list[DetectedPrimitive], Int]:
+    def accepted(self, rows: Int, proposed: Sequence[Primitive]) -> tuple[list[DetectedPrimitive], Int]:
         """Return the proposals that pass, those with most inliers first, and which of the rows are left."""
         p = self.parameters
         found: list[DetectedPrimitive] = []
@@ -202,6 +248,25 @@ class _Detector:
     @cached_property
     def _density(self) -> Density:
         return Density(self.points)
+
+
+def meets_on_an_axis(offset: Float, n: Float, m: Float, tolerance: float, *, tilt: float = 0.1) -> Mask:
+    """Return which pairs of points, of shape (K,), with normals n and m may lie on a round bore.
+
+    Along both normals an axis is equally far ahead.
+
+    Parameters
+    ----------
+    offset, n, m : arrays of shape (K, 3), from the first point of a pair to the second, and their normals
+    tolerance, tilt : how far apart both may come to the axis: a length, and a share of the distance to it
+    """
+    axis = np.cross(n, m)
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
+    across = offset - np.einsum("kd,kd->k", offset, axis)[:, None] * axis
+    reach = _meeting(n, m, across)
+    missed = np.linalg.norm(across - reach[:, None] * (n - m), axis=1)
+    meets: Mask = (reach > 0) & (missed < tolerance + tilt * reach)
+    return meets
 
 
 def _meeting(n: Float, m: Float, offset: Float) -> Float:

@@ -85,7 +85,7 @@ class BoreParameters:
     """Walls of round bores, completed where they have no points, see `bores`."""
 
     # Heights and normals of 8 points are 24 equations for a cylinder's five unknowns.
-    detection: DetectionParameters = DetectionParameters(min_points=8, proposals=1000)
+    detection: DetectionParameters = DetectionParameters(min_points=8, proposals=1000, max_primitives=40)
     max_bore_radii: float = 10.0  # radius of a bore
     max_pairs: int = 10_000_000  # of points that may face each other, each twice, for memory
     max_open_degrees: float = 150.0  # widest angle around the axis without a point
