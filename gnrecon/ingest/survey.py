@@ -122,23 +122,40 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
 
 
 def is_single_sheet(
-    points: Float, normals: Float, *, least_facing_share: float = 0.97, least_points: int = 100
+    points: Float,
+    normals: Float,
+    *,
+    least_facing_share: float = 0.97,
+    most_outward: float = 0.5,
+    least_points: int = 100,
+    neighbours: int = 8,
+    queries: int = 10_000,
 ) -> bool:
-    """Return whether a scan is a single sheet that was seen from one side, such as terrain, a relief or a wall.
+    """Return whether a scan is a single sheet that was seen from one side, such as terrain, a face or a wall.
 
-    Its winding number is that of an open surface, without an inside, and nearly all normals are within 90 degrees of
-    their mean. A bowl or half of a sphere has an inside; objects on a ground have sides that face away.
+    Its winding number is that of an open surface, without an inside, and nearly all of its area has normals within 90
+    degrees of their mean. A bowl or half of a sphere has an inside, and a ball on a ground an underside. Areas count,
+    because walls may have many points for their size.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), outward unit normals
-    least_facing_share : of the normals within 90 degrees of the mean
+    least_facing_share : of the area whose normals are within 90 degrees of the mean
+    most_outward : magnitude of the `outwardness`; half of a sphere has 0.6, a face as a depth camera sees it 0.46
     least_points : fewer may be those of anything, so that the closed surface is the simplest
+    neighbours : of a point, up to which it represents the area
+    queries : random points at which the area is measured
     """
     if len(points) < least_points:
         return False
-    facing = float((normals @ normals.mean(axis=0) > 0).mean())
-    return facing >= least_facing_share and is_open(outwardness(points - points.mean(axis=0), normals))
+    from scipy.spatial import cKDTree
+
+    some = np.random.default_rng(0).permutation(len(points))[:queries]
+    areas = cKDTree(points).query(points[some], neighbours + 1)[0][:, -1] ** 2
+    away = normals[some] @ (areas @ normals[some]) <= 0
+    if areas[away].sum() > (1 - least_facing_share) * areas.sum():
+        return False
+    return is_open(outwardness(points - points.mean(axis=0), normals), most=most_outward)
 
 
 def fill_a_volume(

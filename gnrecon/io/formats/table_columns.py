@@ -38,7 +38,10 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
         raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1] - len(names)}.")
     first = rows[:, len(names) :]
     grows = first.shape[1] > 3 and _grows(first[:, 0])
-    if _is_before_position(first):
+    if _are_normals_first(first):
+        names += NORMAL
+        reasons["nx"] = "unit length"
+    elif _is_before_position(first):
         names.append("time" if grows else "intensity")
     elif grows:
         reasons["x"] = f"column {places[len(names)] + 1} grows, as a time would"
@@ -58,13 +61,16 @@ def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int])
     """One sentence on what was guessed; none where the first three columns are all that there is."""
     spoken = {"index": "a running number", "time": "time", "intensity": "intensity"}
     of_three = {"x": "x, y, z", "nx": "normals", "red": "colours"}
-    found = []
+    found, values = [], []
     for at, name in enumerate(names):
+        if name.startswith("column_"):
+            values.append(f"{places[at] + 1}")
         if name in spoken or (name in of_three and (name != "x" or places[at] or reasons.get("x"))):
             first = places[at] + 1
             which = f"column {first} is" if name in spoken else f"columns {first} to {places[at + 2] + 1} are"
             reason = f" ({reasons[name]})" if reasons.get(name) else ""
             found.append(f"{which} taken for {(spoken | of_three)[name]}{reason}")
+    found += [f"values without a name are in column {', '.join(values)}"] if values else []
     return (f"The table has no header: {', '.join(found)}; --columns says otherwise.",) if found else ()
 
 
@@ -85,11 +91,19 @@ def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
 
 
 def _is_index(rows: Float, *, least_rows: int = 10) -> bool:
-    """Whether the first of at least four columns counts the rows, while others hold fractions."""
-    if rows.shape[1] < 4 or len(rows) < least_rows:
+    """Whether the first of at least four columns numbers the rows in even steps, while others hold fractions."""
+    if rows.shape[1] < 4 or len(rows) < least_rows or (rows[:, 0] % 1 != 0).any():
         return False
-    fractions = bool((rows[:, 1:4] % 1 != 0).any())
-    return fractions and bool((np.diff(rows[:, 0]) == 1).all()) and float(rows[0, 0]).is_integer()
+    steps = np.diff(rows[:, 0])
+    return bool((rows[:, 1:4] % 1 != 0).any() and steps[0] > 0 and np.ptp(steps) == 0)
+
+
+def _are_normals_first(rows: Float) -> bool:
+    """Whether the first three of at least six columns are normals, and the next three neither normals nor colours."""
+    next_three = rows[:, 3:6]
+    return (
+        rows.shape[1] >= 6 and _are_normals(rows[:, :3]) and not (_are_normals(next_three) or _are_colors(next_three))
+    )
 
 
 def _grows(values: Float) -> bool:
@@ -117,6 +131,8 @@ def _is_before_position(
     rows = rows[np.isfinite(rows).all(axis=1)]
     if rows.shape[1] < 4 or len(rows) < least_rows or _grows(rows[:, 3]) or _are_normals(rows[:, 3:6]):
         return False
+    if _grows(rows[:, 0]) and rows[:, 0].min() > max(1e8, 30 * np.abs(rows[:, 1:4]).max()):
+        return True
     chosen = np.random.default_rng(0).permutation(len(rows))[:most_rows]
     sample, next_three = rows[chosen, :4], rows[chosen, 1:4]
     different, digits = [len(np.unique(column)) for column in sample.T], [_digits(column) for column in sample.T]
@@ -130,8 +146,7 @@ def _is_before_position(
         return False
     steps = np.diff(rows[:, 0])
     even = bool(np.quantile(steps, 0.99) <= 2 * np.median(steps))
-    beyond = bool(sample[:, 0].min() > max(1e8, 30 * np.abs(next_three).max()))
-    return even or beyond or digits[0] != digits[1] == digits[2] == digits[3]
+    return even or digits[0] != digits[1] == digits[2] == digits[3]
 
 
 def _thickness(points: Float, *, neighbors: int = 12) -> float:
