@@ -15,13 +15,13 @@ POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", 
 
 _UNIT = r"mm|millimet(?:er|re)s?|cm|m|met(?:er|re)s?|km|ft|feet|us_?ft|in|inch(?:es)?"
 _PLACE = (
-    r"pos|positions?|points?|coords?|coordinates?|koord|koordinaten?|坐标|location|loc|vertex|p|world|global|local|utm|"
-    r"grid|field|cartesian|xyz"
+    r"pos|positions?|points?|points_m_xyz|[ck]o[oö]rd[^\W_]*|坐标|location|loc|vertex|p|world|global|local|utm|grid|"
+    r"field|cartesian|xyz"
 )
 _SURVEY = {
-    "x": r"(?:(?:utm|grid|local)_?)?(?:e|east|easting|ost|ostwert|este?|rechts|rechtswert)",
-    "y": r"(?:(?:utm|grid|local)_?)?(?:n|north|northing|nord|nordwert|norte|hoch|hochwert)",
-    "z": r"h|height|elevation|elev|altitude|alt|rl|hoehe|höhe|cota|quota|altura|kote",
+    "x": r"(?:(?:utm|grid|local|x)_?)?(?:e|east|easting|ost|ostwert|este?|rechts|rechtswert)",
+    "y": r"(?:(?:utm|grid|local|y)_?)?(?:n|north|northing|nord|nordwert|norte|hoch|hochwert)",
+    "z": r"(?:z_?)?(?:h|height|elevation|elev|altitude|alt|rl|hoehe|höhe|hoogte|cota|quota|altura|kote)",
 }
 _NAMES: dict[str, tuple[str, ...]] = {
     **{

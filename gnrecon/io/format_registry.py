@@ -93,7 +93,6 @@ CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
 }
 """Writers of points without faces."""
 
-
 ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
     **dict.fromkeys((".obj", ".off", ".3mf"), lambda name, _: name == "colors"),
     ".ply": lambda _, values: values.dtype.kind in "biuf",

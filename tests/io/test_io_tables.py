@@ -86,6 +86,12 @@ def test_columns_of_other_kinds_before_the_position(tmp_path: Path) -> None:
         said = f"taken for {what}" if what else "values without a name are in column 4, 5, 6"
         assert said in reading.remarks()[0]
     assert set(cloud.attributes) == {"column_4", "column_5", "column_6"}
+    np.savetxt(tmp_path / "a.xyzn", np.hstack([POINTS, 0 * POINTS]))
+    normals = read_cloud(tmp_path / "a.xyzn").normals
+    assert normals is not None
+    assert not normals.any()
+    (tmp_path / "a.xyzn").rename(tmp_path / "a.xyz")
+    assert "colors" not in read_cloud(tmp_path / "a.xyz").attributes  # black would be
 
 
 def test_arrays_of_numpy(tmp_path: Path) -> None:

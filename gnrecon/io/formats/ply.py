@@ -251,14 +251,12 @@ def truncation_error(element: Element, rows: int) -> InputError:
     return InputError(f"the header declares {element.count} {element.name} rows, but the file ends after {rows}.")
 
 
-Column = tuple[str, str, Values]
-"""Name, PLY type, and values of shape (V,)."""
-
-
-def vertex_columns(mesh: Mesh) -> list[Column]:
-    """Return all columns of a mesh; an attribute of several columns becomes NAME_0, NAME_1, and so on."""
+def vertex_columns(mesh: Mesh) -> list[tuple[str, str, Values]]:
+    """Return name, PLY type and values of all columns; an attribute of several becomes NAME_0, NAME_1, and so on."""
     # Doubles, because projected coordinates lose centimetres in single precision.
-    columns: list[Column] = [(name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")]
+    columns: list[tuple[str, str, Values]] = [
+        (name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")
+    ]
     if mesh.normals is not None:
         columns += [(f"n{name}", "float", mesh.normals[:, axis]) for axis, name in enumerate("xyz")]
     color_names = ("red", "green", "blue", "alpha")

@@ -33,14 +33,13 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
     suffix : extension of the file; points of ``.pts`` have their intensity before their colour
     """
     names: list[str] = ["index"] if _is_index(rows) else []
-    reasons: dict[str, str] = {}
+    reasons = {"nx": "unit length"}
     if rows.shape[1] - len(names) < 3:
         raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1] - len(names)}.")
     first = rows[:, len(names) :]
     grows = first.shape[1] > 3 and _grows(first[:, 0])
     if _are_normals_first(first):
         names += NORMAL
-        reasons["nx"] = "unit length"
     elif _is_before_position(first):
         names.append("time" if grows else "intensity")
     elif grows:
@@ -76,8 +75,9 @@ def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int])
 
 def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
     """Return the names of the next columns, and why: three of a normal or a colour, or one without a name."""
-    if "nx" not in names and rest.shape[1] >= 3 and _are_normals(rest[:, :3]):
-        return list(NORMAL), "unit length"
+    unit = rest.shape[1] >= 3 and _are_normals(rest[:, :3])
+    if "nx" not in names and (unit or (suffix == ".xyzn" and rest.shape[1] >= 3)):
+        return list(NORMAL), "unit length" if unit else ""
     if "red" in names or rest.shape[1] < 3 or not _are_colors(rest[:, :3]):
         return [""], ""
     four = rest.shape[1] >= 4 and _are_colors(rest[:, 1:4])
@@ -87,7 +87,8 @@ def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
         odd = [bool(np.ptp(rest[:, end]) == 0 or rest[:, end].max() > 255 >= rest[:, 1:3].max()) for end in (0, 3)]
         if odd[0] > odd[1] or (odd[0] == odd[1] and suffix == ".pts"):
             return [""], ""
-    return list(COLOR), "0 to 255" if rest[:, :3].max(initial=0) > 1 else "0 to 1"
+    top = rest[:, :3].max(initial=0)
+    return list(COLOR), f"0 to {1 if top <= 1 else 255 if top <= 255 else 65535}"
 
 
 def _is_index(rows: Float, *, least_rows: int = 10) -> bool:
@@ -182,8 +183,8 @@ def _are_normals(vectors: Float, *, least_share: float = 0.9, tolerance: float =
 
 
 def _are_colors(values: Values) -> bool:
-    """Whether all numbers, of shape (N, 3), are whole ones from 0 to 255 or 65535, or shares from 0 to 1."""
+    """Whether all numbers, of shape (N, 3), are whole ones from 0 to 255 or 65535, or shares from 0 to 1; not all 0."""
     finite = values[np.isfinite(values)]
-    if not len(finite) or finite.min() < 0:
+    if not finite.any() or finite.min() < 0:
         return False
     return bool(finite.max() <= 1) or bool(finite.max() <= 65535 and (finite == np.rint(finite)).all())

@@ -22,11 +22,12 @@ from gnrecon.runtime.errors import InputError
 BLANKS = r"\s+"
 MISSING = (
     *("", "nan", "+nan", "na", "n/a", "#n/a", "null", "none", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan"),
-    *("1.#ind", "-1.#ind", "-", "--", "nil", "<na>", "#value!", "missing"),
+    *("1.#ind", "-1.#ind", "-", "--", "nil", "<na>", "missing", "#value!", "#ref!", "#div/0!", "#num!", "#name?"),
 )
 """Cells without a number, in lower case."""
 
-COMMENT = re.compile(r"^\s*(?:#|//|%|!|;(?!\s*[-+\d])).*$|(?<=[\s\d])(?:#(?!N/A)|//).*$", re.MULTILINE)
+_HASH = r"#(?!N/A|DIV/0|[A-Z]+[!?])"  # but not an error of a spreadsheet
+COMMENT = re.compile(rf"^\s*(?:{_HASH}|//|%|!|;(?!\s*[-+\d])).*$|(?<=[\s\d])(?:{_HASH}|//).*$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def find_dialect(lines: list[str]) -> Dialect:
     title, names = _header(dialect, lines[:end])
     # A line of text before the rows may hold numbers, too, such as those of a box.
     rows = [(at, cells) for at, cells in rows if at > title and (at >= end or dialect.is_value(cells[0]))]
-    while dialect.width > max(3, len(names or ())) and not any(len(c) == dialect.width and c[-1] for _, c in rows):
+    if dialect.width > max(3, len(names or ())) and not any(len(c) == dialect.width and c[-1] for _, c in rows):
         dialect = replace(dialect, width=dialect.width - 1)  # rows end with a separator
     first = rows[0][0]
     _require_unambiguous(dialect, [cells for _, cells in rows])
@@ -209,8 +210,7 @@ def _header(dialect: Dialect, head: list[str]) -> tuple[int, list[str] | None]:
     """Return the place and the names of the last line of the head that names x, y and z; -1 and None without one."""
     for place, line in reversed(list(enumerate(head))):
         # A separator at the start stays: pandas leaves the name of its index empty.
-        text = line.strip(" \r\n").lstrip("#/%!").strip(" ")
-        text = re.sub(r"^(?:variables|columns|fields)\s*[:=]\s*", "", text, flags=re.IGNORECASE)
+        text = re.sub(r"(?i)^ *[#/%!]* *(?:(?:variables|columns|fields)\s*[:=]\s*)?", "", line.rstrip(" \r\n"))
         text = text.lstrip("; ") if dialect.separator != ";" else text
         if dialect.separator == BLANKS:
             text = re.sub(r"\s+(?=\[\w+\]|\(\w+\))", "", text)  # a unit belongs to its name
@@ -251,8 +251,9 @@ def _fitted(dialect: Dialect, names: list[str], first: list[str]) -> Dialect:
         names = names[:-1]
     if len(names) > width and dialect.separator == BLANKS:
         names = _joined(names, width)
-    elif len(names) == width - 1 and all(map(str.isdecimal, first)) and set(np.diff(list(map(int, first)))) <= {1}:
-        names = ["", *names]  # R names no column of row numbers
+    elif len(names) == width - 1 and all(cell.isdecimal() or not dialect.is_number(cell) for cell in first):
+        numbers = [int(cell) if cell.isdecimal() else place for place, cell in enumerate(first)]
+        names = ["", *names] if set(np.diff(numbers)) <= {1} else names  # R names no column of the rows' names
     if len(names) != width:
         what = f"the header names {len(names)} columns, but the rows hold {width}."
         raise InputError(f"{what} Name those to read with --columns.")

@@ -75,14 +75,12 @@ def _piece(piece: ElementTree.Element, file: _VtkXml) -> Contents:
     count = piece.get("NumberOfPoints", f"{len(found[0])}" if found else "0")
     if len(found) != 1 or found[0].shape != (_whole(count), 3):
         raise InputError(f"a piece declares {count} points, but does not hold them.")
-    data = piece.find("PointData")
-    arrays = {} if data is None else {array.get("Name", "unnamed"): _values(array, file) for array in data}
+    data = next(piece.iterfind("PointData"), ElementTree.Element("none"))
+    arrays = {array.get("Name", "unnamed"): _values(array, file) for array in data}
     faces = [no_faces(), *(_faces(piece, name, file) for name in ("Polys", "Strips", "Cells"))]
     unread = ["lines"] if _whole(piece.get("NumberOfLines")) else []
-    cells = piece.find("CellData")
-    unread += ["values of polygons"] if cells is not None and len(cells) else []
-    normals = None if data is None else data.get("Normals")
-    return assemble_contents(found[0].astype(np.float64), np.concatenate(faces), arrays, normals, unread)
+    unread += ["values of polygons"] if piece.findall("CellData/*") else []
+    return assemble_contents(found[0].astype(np.float64), np.concatenate(faces), arrays, data.get("Normals"), unread)
 
 
 def _whole(text: str | None) -> int:
