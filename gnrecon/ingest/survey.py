@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.local_pca import surface_variation, tangent_coordinates
@@ -183,18 +185,27 @@ def fill_a_volume(
 
 
 def outer_surface(
-    points: Float, *, neighbours: int = 32, least_offset: float = 0.25, chunk_points: int = 50_000
+    points: Float,
+    *,
+    neighbours: int = 32,
+    least_offset: float = 0.25,
+    link_reaches: float = 0.75,
+    least_part: float = 0.05,
+    chunk_points: int = 50_000,
 ) -> tuple[Mask, Float]:
     """Return which points of a filled volume are at its surface, and outward unit normals there.
 
     The neighbours of a point at the surface are all on one side: their mean is 3/8 of their reach away from a point on
-    a plane, and 0.14 in the root mean square from a point within random ones.
+    a plane, and 0.14 in the root mean square from a point within random ones. By chance some inner points have as much;
+    unlike those of a surface, they are not next to many others.
 
     Parameters
     ----------
     points : array of shape (N, 3), centred, distinct, N > neighbours
     neighbours : of a point
     least_offset : of the neighbours' mean from a point at the surface, over their reach
+    link_reaches : distance within which points belong to one surface, in median reaches of the neighbours
+    least_part : points of a surface, over those of the largest one
     chunk_points : handled at a time, which bounds memory
 
     Returns
@@ -209,6 +220,12 @@ def outer_surface(
         away[rows], reach[rows] = points[rows] - points[near[:, 1:]].mean(axis=1), distances[:, -1]
     lengths = np.linalg.norm(away, axis=1)
     outer = lengths > least_offset * reach
+    rows = np.flatnonzero(outer)
+    pairs = cKDTree(points[rows]).query_pairs(link_reaches * float(np.median(reach)), output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(rows), len(rows)))
+    parts = connected_components(links, directed=False)[1]
+    sizes = np.bincount(parts, minlength=1)
+    outer[rows] = sizes[parts] >= least_part * sizes.max()
     return outer, away[outer] / lengths[outer, None]
 
 
