@@ -128,6 +128,7 @@ def is_single_sheet(
     normals: Float,
     *,
     least_facing_share: float = 0.97,
+    least_facing_area: float = 0.98,
     most_outward: float = 0.5,
     least_points: int = 100,
     neighbours: int = 8,
@@ -135,14 +136,14 @@ def is_single_sheet(
 ) -> bool:
     """Return whether a scan is a single sheet that was seen from one side, such as terrain, a face or a wall.
 
-    Its winding number is that of an open surface, without an inside, and nearly all of its area has normals within 90
-    degrees of their mean. A bowl or half of a sphere has an inside, and a ball on a ground an underside. Areas count,
-    because walls may have many points for their size.
+    Its winding number is that of an open surface, without an inside, and nearly all of its points, or of its area, have
+    normals within 90 degrees of their mean. A bowl or half of a sphere has an inside; objects on a ground have sides
+    that face away. The walls of a house on terrain may have many points, but they have little area.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), outward unit normals
-    least_facing_share : of the area whose normals are within 90 degrees of the mean
+    least_facing_share, least_facing_area : shares of points and of area with normals within 90 degrees of the mean
     most_outward : magnitude of the `outwardness`; half of a sphere has 0.6, a face as a depth camera sees it 0.46
     least_points : fewer may be those of anything, so that the closed surface is the simplest
     neighbours : of a point, up to which it represents the area
@@ -154,8 +155,10 @@ def is_single_sheet(
 
     some = np.random.default_rng(0).permutation(len(points))[:queries]
     areas = cKDTree(points).query(points[some], neighbours + 1)[0][:, -1] ** 2
-    away = normals[some] @ (areas @ normals[some]) <= 0
-    if areas[away].sum() > (1 - least_facing_share) * areas.sum():
+    facing = normals[some] @ (areas @ normals[some]) > 0
+    if (normals @ normals.mean(axis=0) > 0).mean() < least_facing_share and (
+        areas[facing].sum() < least_facing_area * areas.sum()
+    ):
         return False
     return is_open(outwardness(points - points.mean(axis=0), normals), most=most_outward)
 

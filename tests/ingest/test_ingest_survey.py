@@ -89,6 +89,7 @@ def test_single_sheets_are_terrain_and_walls_not_bowls_or_solids(rng: np.random.
     scene = np.concatenate([terrain, walls]), np.concatenate([up, leaning])
     assert (scene[1] @ scene[1].mean(axis=0) > 0).mean() < 0.9
     assert is_single_sheet(*scene)
+    assert not is_single_sheet(*scene, least_facing_area=1.0)
     points, outward = sphere(rng)
     half = points[:, 2] > 0
     away = outward / [0.8, 1.1, 0.6]

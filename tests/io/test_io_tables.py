@@ -131,6 +131,7 @@ def test_a_time_before_the_position_is_no_coordinate(tmp_path: Path) -> None:
         ("intensity", [points, time], "%.4f", 0),
         ("x, y, z", [profiles, rng.uniform(0, 1, 400)], ["%.1f"] + 3 * ["%.4f"], 0),
         ("intensity", [rng.uniform(0, 1, (400, 3)), shade % 3], "%.4f", 0),
+        ("row", [np.arange(400) // 20, np.arange(400) % 20, points, shade], ["%d"] * 2 + ["%.4f"] * 4, 2),
     ):
         rows = np.column_stack(columns)
         np.savetxt(tmp_path / "a.txt", rows, formats)

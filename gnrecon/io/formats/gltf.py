@@ -9,9 +9,6 @@ and from ``COLOR_0`` in the file's JSON. All other attributes are float32, and t
 
 trimesh reads only the positions of point clouds. They are therefore passed to it as a mesh of one triangle that uses
 the first point three times: its indices are an accessor without a buffer, whose values are zero by the specification.
-
-A GLB has its JSON and one buffer in one file; text glTF has its buffers in the JSON or in other files. Both are given
-to trimesh as JSON and buffers by name.
 """
 
 from __future__ import annotations

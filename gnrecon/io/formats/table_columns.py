@@ -32,7 +32,7 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
     places : of these columns among all of the file's, from 0
     suffix : extension of the file; points of ``.pts`` have their intensity before their colour
     """
-    names: list[str] = ["index"] if _is_index(rows) else []
+    names: list[str] = ["index"] if _is_index(rows) else ["row", "column"] if _are_cells(rows) else []
     reasons = {"nx": "unit length"}
     if rows.shape[1] - len(names) < 3:
         raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1] - len(names)}.")
@@ -58,7 +58,7 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
 
 def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int]) -> tuple[str, ...]:
     """One sentence on what was guessed; none where the first three columns are all that there is."""
-    spoken = {"index": "a running number", "time": "time", "intensity": "intensity"}
+    spoken = {"index": "a running number"} | {name: name for name in ("time", "intensity", "row", "column")}
     of_three = {"x": "x, y, z", "nx": "normals", "red": "colours"}
     found, values = [], []
     for at, name in enumerate(names):
@@ -97,6 +97,14 @@ def _is_index(rows: Float, *, least_rows: int = 10) -> bool:
         return False
     steps = np.diff(rows[:, 0])
     return bool((rows[:, 1:4] % 1 != 0).any() and steps[0] > 0 and np.ptp(steps) == 0)
+
+
+def _are_cells(rows: Float) -> bool:
+    """Whether the first two of at least five columns are the cells of a grid, as FARO's scanners write them."""
+    cells, digits = rows[:, :2], [_digits(column) for column in rows[:2000, :5].T]
+    fit = len(digits) == 5 and max(digits[:2]) == 0 < min(digits[2:]) == max(digits[2:])
+    ordered = fit and cells.min() >= 0 and (_grows(cells[:, 0]) or _grows(cells[:, 1]))
+    return bool(ordered and not _are_normals(rows[:, 3:6]) and len(np.unique(cells, axis=0)) == len(cells))
 
 
 def _are_normals_first(rows: Float) -> bool:

@@ -77,11 +77,9 @@ class Dialect:
     def is_number(self, cell: str) -> bool:
         """Whether a cell holds a number in this dialect."""
         mark = re.escape(self.decimal)
-        if self.thousands and re.fullmatch(rf"[+-]?\d{{1,3}}({re.escape(self.thousands)}\d{{3}})+({mark}\d*)?", cell):
-            return True
-        if re.fullmatch(rf"[+-]?(\d+({mark}\d*)?|{mark}\d+)(e[+-]?\d+)?", cell, re.IGNORECASE | re.ASCII):
-            return True
-        return re.fullmatch("[+-]?(inf(inity)?|nan)", cell.lower()) is not None
+        known = rf"(\d+({mark}\d*)?|{mark}\d+)(e[+-]?\d+)?|inf(inity)?|nan"
+        known += rf"|\d{{1,3}}({re.escape(self.thousands)}\d{{3}})+({mark}\d*)?" if self.thousands else ""
+        return re.fullmatch(f"[+-]?({known})", cell, re.IGNORECASE | re.ASCII) is not None
 
     def is_value(self, cell: str) -> bool:
         """Whether a cell holds a number, or is one of those that stand for none."""

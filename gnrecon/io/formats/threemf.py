@@ -4,7 +4,6 @@ Implemented here because the format's own library and trimesh store coordinates 
 files have one object, in millimetres, the unit that readers assume; coordinates are text with all digits of float64.
 Most readers convert them to float32, so a mesh far from the origin is stored relative to its middle, and the build item
 has the translation. Archive members have a fixed date, so that equal meshes give equal bytes.
-
 Models may be large, so their XML is parsed as a stream, without a tree.
 
 Specifications: 3MF Core 1.3, Materials and Properties 1.2 (https://3mf.io/spec).
