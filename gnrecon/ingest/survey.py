@@ -223,12 +223,12 @@ def outer_surface(
         away[rows], reach[rows] = points[rows] - points[near[:, 1:]].mean(axis=1), distances[:, -1]
     lengths = np.linalg.norm(away, axis=1)
     outer = lengths > least_offset * reach
-    rows = np.flatnonzero(outer)
-    pairs = cKDTree(points[rows]).query_pairs(link_reaches * float(np.median(reach)), output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(rows), len(rows)))
+    found = np.flatnonzero(outer)
+    pairs = cKDTree(points[found]).query_pairs(link_reaches * float(np.median(reach)), output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(found), len(found)))
     parts = connected_components(links, directed=False)[1]
     sizes = np.bincount(parts, minlength=1)
-    outer[rows] = sizes[parts] >= least_part * sizes.max()
+    outer[found] = sizes[parts] >= least_part * sizes.max()
     return outer, away[outer] / lengths[outer, None]
 
 

@@ -36,11 +36,10 @@ def table_chunks(
     of some tables are.
     """
     with path.open("r", encoding=encoding_of(path), errors="replace") as file:
-        lines = list[str]()
-        while not COMMENT.sub("", "".join(lines[-sampled_lines:])).strip() and (
-            more := list(islice(file, sampled_lines))
-        ):
-            lines += map(plain_text, more)
+        lines, head = list[str](), [""]
+        while head and not COMMENT.sub("", "".join(head)).strip():
+            head = list(map(plain_text, islice(file, sampled_lines)))
+            lines += head
         if columns:
             # The user's names stand in place of any header, which may hold names of all kinds.
             lines = [line if re.search(r"\d", line) else "\n" for line in lines]
