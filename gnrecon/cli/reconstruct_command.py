@@ -27,8 +27,8 @@ ScansArgument = Annotated[
     list[Path],
     typer.Argument(
         help="One or more scans of an object, merged by the poses that they hold: PLY, PCD, XYZ, PTS, TXT, CSV, "
-        "LAS, LAZ, E57, PTX, VTK, VTP, OBJ, OFF, STL, glTF, GLB or 3MF, compressed by gzip or not; CONF names "
-        "scans with their poses; - is standard input."
+        "LAS, LAZ, E57, PTX, VTK, VTP, VTU, VTS, OBJ, OFF, STL, glTF, GLB or 3MF, compressed by gzip or not; CONF "
+        "names scans with their poses; - is standard input."
     ),
 ]
 ReferenceOption = Annotated[

@@ -48,7 +48,8 @@ def _plan(cloud: PointCloud, reading: Reading, options: Options) -> tuple[dict[s
     samples, counts = prepare(cloud, **options.ingest())
     fit, bounds = options.fit(), bounds_of(samples)
     points = samples.frame.to_world(samples.points)
-    options = options.for_scan(points, bounds, sheet_thickness(points, samples.normals))
+    noise = (samples.noise or 0.0) * samples.frame.scale
+    options = options.for_scan(points, bounds, sheet_thickness(points, samples.normals, noise))
     expected = estimate(reading.points, len(samples), bounds, options)
     plan = {
         "points": len(samples),

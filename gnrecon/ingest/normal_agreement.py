@@ -104,6 +104,7 @@ def sheet_thickness(
     noise: float = 0.0,
     *,
     neighbours: int = 16,
+    least_behind: int = 2,
     queries: int = 10_000,
     least_depth_deviations: float = 4.0,
     least_share: float = 0.02,
@@ -116,6 +117,7 @@ def sheet_thickness(
     points, normals : arrays of shape (N, 3); outward unit normals
     noise : standard deviation of the points along the normal, in their unit
     neighbours : of a point, among which the layer behind it is looked for; farther layers are far for the spacing
+    least_behind : of the neighbours, in a layer behind a point: one alone may have a wrong normal, as at an edge
     queries : random points at which it is measured
     least_depth_deviations : of the noise, of a layer behind a point: less may be the noise of the two points alone
     least_share : of these with a layer behind them, below which it may be noise
@@ -127,7 +129,7 @@ def sheet_thickness(
     near = cKDTree(points).query(points[some], min(neighbours + 1, len(points)))[1]
     depths = -np.einsum("gki,gi->gk", points[near] - points[some, None], normals[some])
     behind = (np.einsum("gki,gi->gk", normals[near], normals[some]) < -0.9) & (depths > least_depth_deviations * noise)
-    found = np.flatnonzero(behind.any(axis=1))
+    found = np.flatnonzero(behind.sum(axis=1) >= least_behind)
     if len(found) < least_share * len(some):
         return None
     depths = np.where(behind, depths, 0.0)[found].sum(axis=1) / behind[found].sum(axis=1)

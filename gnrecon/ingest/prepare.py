@@ -15,6 +15,7 @@ from gnrecon.ingest.counts import IngestCounts
 from gnrecon.ingest.ingest_parameters import IngestParameters
 from gnrecon.ingest.line_scans import lie_on_lines, normals_across_lines, rows_along_lines, thinned_along_lines
 from gnrecon.ingest.noise import estimate_noise
+from gnrecon.ingest.normal_agreement import sheet_thickness
 from gnrecon.ingest.normals import unoriented_normals
 from gnrecon.ingest.orientation import Orientation, are_inconsistent, require_orientation, with_outward_normals
 from gnrecon.ingest.point_spacing import mean_spacing
@@ -166,6 +167,10 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Sa
     _log.info("The unit ball has the centre %s and the radius %.6g.", frame.center.tolist(), frame.scale)
     if len(held_out) and held_out.normals is not None:
         held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
-    points = frame.to_unit(kept.points)
-    noise = estimate_noise(points, mean_spacing(points)).deviation if len(points) >= 16 else None
-    return Samples(points, kept.normals, frame, held, estimated, noise)
+    points, normals = frame.to_unit(kept.points), kept.normals
+    layer = points
+    if not estimated and sheet_thickness(points, normals) is not None:
+        # The two sides of a thin sheet would look like noise; one of them shows it.
+        layer = points[normals @ np.linalg.eigh(normals.T @ normals)[1][:, -1] > 0.5]
+    noise = estimate_noise(layer, mean_spacing(layer)).deviation if len(layer) >= 16 else None
+    return Samples(points, normals, frame, held, estimated, noise)

@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.local_pca import surface_variation, tangent_coordinates
@@ -122,23 +124,43 @@ def survey(cloud: PointCloud, *, parameters: IngestParameters = IngestParameters
 
 
 def is_single_sheet(
-    points: Float, normals: Float, *, least_facing_share: float = 0.97, least_points: int = 100
+    points: Float,
+    normals: Float,
+    *,
+    least_facing_share: float = 0.97,
+    least_facing_area: float = 0.98,
+    most_outward: float = 0.5,
+    least_points: int = 100,
+    neighbours: int = 8,
+    queries: int = 10_000,
 ) -> bool:
-    """Return whether a scan is a single sheet that was seen from one side, such as terrain, a relief or a wall.
+    """Return whether a scan is a single sheet that was seen from one side, such as terrain, a face or a wall.
 
-    Its winding number is that of an open surface, without an inside, and nearly all normals are within 90 degrees of
-    their mean. A bowl or half of a sphere has an inside; objects on a ground have sides that face away.
+    Its winding number is that of an open surface, without an inside, and nearly all of its points, or of its area, have
+    normals within 90 degrees of their mean. A bowl or half of a sphere has an inside; objects on a ground have sides
+    that face away. The walls of a house on terrain may have many points, but they have little area.
 
     Parameters
     ----------
     points, normals : arrays of shape (N, 3), outward unit normals
-    least_facing_share : of the normals within 90 degrees of the mean
+    least_facing_share, least_facing_area : shares of points and of area with normals within 90 degrees of the mean
+    most_outward : magnitude of the `outwardness`; half of a sphere has 0.6, a face as a depth camera sees it 0.46
     least_points : fewer may be those of anything, so that the closed surface is the simplest
+    neighbours : of a point, up to which it represents the area
+    queries : random points at which the area is measured
     """
     if len(points) < least_points:
         return False
-    facing = float((normals @ normals.mean(axis=0) > 0).mean())
-    return facing >= least_facing_share and is_open(outwardness(points - points.mean(axis=0), normals))
+    from scipy.spatial import cKDTree
+
+    some = np.random.default_rng(0).permutation(len(points))[:queries]
+    areas = cKDTree(points).query(points[some], neighbours + 1)[0][:, -1] ** 2
+    facing = normals[some] @ (areas @ normals[some]) > 0
+    if (normals @ normals.mean(axis=0) > 0).mean() < least_facing_share and (
+        areas[facing].sum() < least_facing_area * areas.sum()
+    ):
+        return False
+    return is_open(outwardness(points - points.mean(axis=0), normals), most=most_outward)
 
 
 def fill_a_volume(
@@ -166,18 +188,27 @@ def fill_a_volume(
 
 
 def outer_surface(
-    points: Float, *, neighbours: int = 32, least_offset: float = 0.25, chunk_points: int = 50_000
+    points: Float,
+    *,
+    neighbours: int = 32,
+    least_offset: float = 0.25,
+    link_reaches: float = 0.75,
+    least_part: float = 0.05,
+    chunk_points: int = 50_000,
 ) -> tuple[Mask, Float]:
     """Return which points of a filled volume are at its surface, and outward unit normals there.
 
     The neighbours of a point at the surface are all on one side: their mean is 3/8 of their reach away from a point on
-    a plane, and 0.14 in the root mean square from a point within random ones.
+    a plane, and 0.14 in the root mean square from a point within random ones. By chance some inner points have as much;
+    unlike those of a surface, they are not next to many others.
 
     Parameters
     ----------
     points : array of shape (N, 3), centred, distinct, N > neighbours
     neighbours : of a point
     least_offset : of the neighbours' mean from a point at the surface, over their reach
+    link_reaches : distance within which points belong to one surface, in median reaches of the neighbours
+    least_part : points of a surface, over those of the largest one
     chunk_points : handled at a time, which bounds memory
 
     Returns
@@ -192,6 +223,12 @@ def outer_surface(
         away[rows], reach[rows] = points[rows] - points[near[:, 1:]].mean(axis=1), distances[:, -1]
     lengths = np.linalg.norm(away, axis=1)
     outer = lengths > least_offset * reach
+    found = np.flatnonzero(outer)
+    pairs = cKDTree(points[found]).query_pairs(link_reaches * float(np.median(reach)), output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(found), len(found)))
+    parts = connected_components(links, directed=False)[1]
+    sizes = np.bincount(parts, minlength=1)
+    outer[found] = sizes[parts] >= least_part * sizes.max()
     return outer, away[outer] / lengths[outer, None]
 
 

@@ -2,16 +2,7 @@
 
 from gnrecon.io.column_names import parse_columns
 from gnrecon.io.format_registry import CLOUD_WRITERS, READERS, WRITERS, readable, writable
-from gnrecon.io.interop import (
-    as_cloud,
-    as_mesh,
-    as_shape,
-    to_meshio,
-    to_open3d,
-    to_pymeshlab,
-    to_pyvista,
-    to_trimesh,
-)
+from gnrecon.io.interop import as_cloud, as_mesh, as_shape, to_meshio, to_open3d, to_pymeshlab, to_pyvista, to_trimesh
 from gnrecon.io.io_parameters import IOParameters
 from gnrecon.io.merge import Reading, cropped, read_scans
 from gnrecon.io.named_files import all_input_files

@@ -14,11 +14,14 @@ from gnrecon.runtime.errors import InputError, UsageError
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 
 _UNIT = r"mm|millimet(?:er|re)s?|cm|m|met(?:er|re)s?|km|ft|feet|us_?ft|in|inch(?:es)?"
-_PLACE = r"pos|position|points?|coords?|coordinates?|location|loc|vertex|p|world|global|local|cartesian|xyz"
+_PLACE = (
+    r"pos|positions?|points?|points_m_xyz|[ck]o[oö]rd[^\W_]*|坐标|location|loc|vertex|p|world|global|local|utm|grid|"
+    r"field|cartesian|xyz"
+)
 _SURVEY = {
-    "x": r"e|east|easting|ost|ostwert|rechts|rechtswert|utm_?e(?:asting)?",
-    "y": r"n|north|northing|nord|nordwert|hoch|hochwert|utm_?n(?:orthing)?",
-    "z": r"h|height|elevation|elev|altitude|alt|rl|hoehe|höhe",
+    "x": r"(?:(?:utm|grid|local|x)_?)?(?:e|east|easting|ost|ostwert|este?|rechts|rechtswert)",
+    "y": r"(?:(?:utm|grid|local|y)_?)?(?:n|north|northing|nord|nordwert|norte|hoch|hochwert)",
+    "z": r"(?:z_?)?(?:h|height|elevation|elev|altitude|alt|rl|hoehe|höhe|hoogte|cota|quota|altura|kote)",
 }
 _NAMES: dict[str, tuple[str, ...]] = {
     **{
@@ -44,6 +47,11 @@ def simple_name(name: str) -> str:
     return re.sub(rf"(?<=.)_(?:{_UNIT})$", "", name)
 
 
+def is_angle(name: str) -> bool:
+    """Whether a column is named as a latitude or a longitude."""
+    return re.match("lat|lon|(?:geo)?breite|l(?:ä|ae)nge", simple_name(name)) is not None
+
+
 def unit_of(name: str) -> str:
     """Return the unit in a column's name, such as ``mm`` of ``x [mm]`` or ``x_mm``; empty where there is none."""
     found = re.search(rf"[\[(]\s*({_UNIT})\s*[\])]|_({_UNIT})\W*$", name.strip().lower())
@@ -58,18 +66,13 @@ def columns_of_role(names: Iterable[str], role: tuple[str, ...]) -> list[str] | 
     simple: dict[str, str] = {}
     for name in names:
         simple.setdefault(simple_name(name), name)
-    found = [[_first(simple, pattern) for pattern in _NAMES[part]] for part in role]
-    for style in zip(*found, strict=True):
-        if all(name is not None for name in style):
-            return [name for name in style if name is not None]
-    mixed = [next((name for name in choices if name is not None), None) for choices in found]
-    if role != POSITION or any(name is None for name in mixed):
-        return None
-    return [name for name in mixed if name is not None]
 
+    def named(pattern: str) -> str:
+        return next((name for key, name in simple.items() if re.fullmatch(pattern, key)), "")
 
-def _first(simple: dict[str, str], pattern: str) -> str | None:
-    return next((name for key, name in simple.items() if re.fullmatch(pattern, key)), None)
+    found = [[named(pattern) for pattern in _NAMES[part]] for part in role]
+    mixed = [next(filter(None, choices), "") for choices in found] if role == POSITION else [""]
+    return next((list(names) for names in (*zip(*found, strict=True), mixed) if all(names)), None)
 
 
 def parse_columns(text: str | None) -> tuple[str, ...]:
@@ -90,7 +93,7 @@ def require_position(names: Iterable[str], hint: str = "") -> list[str]:
     position = columns_of_role(names, POSITION)
     if position is None:
         shown = ", ".join(names)[:200] or "none"
-        if any(re.match("lat|lon", simple_name(name)) for name in names):
+        if any(map(is_angle, names)):
             hint = " Latitude and longitude are angles: project them to metres first."
         raise InputError(f"expected columns named x, y and z, but found {shown}.{hint}")
     units = [unit_of(name) for name in position]

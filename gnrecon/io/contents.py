@@ -87,7 +87,7 @@ def from_columns(columns: Columns, faces: Int | None = None, points: Values | No
     for name, values in rest.items():
         if len(values) != len(points):
             raise InputError(f"{name!r} has {len(values)} values, but there are {len(points)} points.")
-    normal = _taken(rest, ("normals", "normal"), NORMAL, (3,))
+    normal = _taken(rest, ("normals", "normal", "point_normals", "norm"), NORMAL, (3,))
     names = (*COLOR, "alpha") if columns_of_role(rest, (*COLOR, "alpha")) else COLOR
     color = _taken(rest, ("colors", "colours", "rgb", "rgba"), names, (3, 4))
     normals, unread = (None, ()) if normal is None else decoded_normals(normal)

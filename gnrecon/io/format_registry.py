@@ -9,6 +9,7 @@ Plugins cannot replace built-in formats.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,7 @@ READERS: dict[str, Callable[[Path], Contents]] = {
     ".e57": read_e57,
     ".ptx": partial(_read_whole, ".ptx"),
     ".vtk": read_vtk,
-    ".vtp": read_vtp,
+    **dict.fromkeys((".vtp", ".vtu", ".vts"), read_vtp),
     ".conf": read_conf,
 }
 """Readers of whole files. A file that is malformed, cut short or of another kind ends in an `InputError` of one
@@ -91,7 +92,6 @@ CLOUD_WRITERS: dict[str, Callable[[Mesh, Path], None]] = {
     ".csv": write_table,
 }
 """Writers of points without faces."""
-
 
 ATTRIBUTE_SUPPORT: dict[str, Callable[[str, Values], bool]] = {
     **dict.fromkeys((".obj", ".off", ".3mf"), lambda name, _: name == "colors"),
@@ -171,19 +171,6 @@ def _read_with_plugin(plugin: Plugin, read: Callable[[Path], Any], path: Path) -
 
 def _write_with_plugin(plugin: Plugin, write: Callable[[Mesh, Path], Any], mesh: Mesh, path: Path) -> None:
     with plugin.guarded(OutputError):
-        write(_read_only(mesh), path)
+        write(deepcopy(mesh), path)  # the caller still uses its own
     if not path.is_file() or not path.stat().st_size:
         raise OutputError(f"{plugin.subject} wrote nothing.")
-
-
-def _read_only(mesh: Mesh) -> Mesh:
-    """The same mesh in read-only arrays, because the caller still uses the mesh after it was written."""
-
-    def locked(values: Any) -> Any:
-        view = values.view()
-        view.flags.writeable = False
-        return view
-
-    attributes = {name: locked(values) for name, values in mesh.attributes.items()}
-    normals = None if mesh.normals is None else locked(mesh.normals)
-    return Mesh(locked(mesh.vertices), locked(mesh.faces), normals, attributes)

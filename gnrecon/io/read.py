@@ -145,7 +145,7 @@ def _check_file(path: Path, extension: str) -> None:
     if not path.is_file():
         raise InputError("expected a file, but this is a folder or a device.")
     with path.open("rb") as file:
-        head = file.read(16)
+        head = file.read(1 << 16)
     if not head.strip():
         raise InputError("the file is empty.")
     if not is_readable(extension):

@@ -150,6 +150,8 @@ def test_two_opposite_layers_show_the_thickness_of_a_sheet(rng: np.random.Genera
     assert sheet_thickness(flat, normals, noise=0.009) == pytest.approx(0.04)
     assert sheet_thickness(flat, normals, noise=0.011) is None  # two sides of one surface may be as far apart
     assert sheet_thickness(flat, np.abs(normals)) is None
+    few = np.where(np.arange(3000)[:, None] % 60 == 0, normals, np.abs(normals))
+    assert sheet_thickness(flat, few) is None  # single wrong normals, as at edges
     assert sheet_thickness(flat, -normals) is None  # the layers face each other: nothing is between them
     assert sheet_thickness(*sphere(3000)) is None
 

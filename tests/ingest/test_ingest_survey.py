@@ -82,8 +82,19 @@ def test_single_sheets_are_terrain_and_walls_not_bowls_or_solids(rng: np.random.
     terrain = np.column_stack([x, y, 0.5 * np.sin(2 * x) + np.cos(y)])
     assert is_single_sheet(terrain, up)
     assert is_single_sheet(terrain[:, [2, 0, 1]] + 1e6, up[:, [2, 0, 1]])
+    # The walls of a narrow house, with as many points as the ground.
+    height, side = rng.uniform(0, 0.5, 3000), rng.choice([-1.0, 1.0], 3000)
+    walls = np.column_stack([0.1 * side, rng.uniform(-0.3, 0.3, 3000), height + terrain[:, 2].max()])
+    leaning = np.column_stack([side, 0 * side, rng.normal(0, 0.05, 3000)])
+    scene = np.concatenate([terrain, walls]), np.concatenate([up, leaning])
+    assert (scene[1] @ scene[1].mean(axis=0) > 0).mean() < 0.9
+    assert is_single_sheet(*scene)
+    assert not is_single_sheet(*scene, least_facing_area=1.0)
     points, outward = sphere(rng)
     half = points[:, 2] > 0
+    away = outward / [0.8, 1.1, 0.6]
+    face = points * [0.8, 1.1, 0.6], away / np.linalg.norm(away, axis=1, keepdims=True)
+    assert is_single_sheet(*(values[points[:, 2] > 0.2] for values in face))
     assert not is_single_sheet(points, outward)
     assert not is_single_sheet(points[half], outward[half])
     assert not is_single_sheet(points[half], -outward[half])
@@ -98,6 +109,7 @@ def test_a_filled_volume_is_its_outer_surface(rng: np.random.Generator) -> None:
     assert "The points fill a volume instead of lying on its surface." in " ".join(counts.remarks())
     kept = (samples.frame.to_world(samples.points) - 10) / [1.0, 2.0, 1.5]
     assert np.median(np.linalg.norm(kept, axis=1)) > 0.85
+    assert np.linalg.norm(kept, axis=1).min() > 0.6  # inner points that look so by chance are left out
     assert (np.einsum("ij,ij->i", samples.normals, kept) > 0).mean() > 0.95
 
 

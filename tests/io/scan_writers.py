@@ -159,7 +159,7 @@ def _vtk(binary: bool, version: str = "3.0") -> Callable[[PointCloud, Path], Non
     return write
 
 
-def _vtp(form: str, compressed: bool = False) -> Callable[[PointCloud, Path], None]:
+def _vtp(form: str, compressed: bool = False, kind: str = "PolyData") -> Callable[[PointCloud, Path], None]:
     def write(cloud: PointCloud, path: Path) -> None:
         assert cloud.normals is not None
         appended = b""
@@ -188,12 +188,12 @@ def _vtp(form: str, compressed: bool = False) -> Callable[[PointCloud, Path], No
             return head + f' format="appended" offset="{start}"/>'.encode()
 
         count = len(cloud)
-        head = '<?xml version="1.0"?><VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
+        head = f'<?xml version="1.0"?><VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" '
         head += 'header_type="UInt64"' + (' compressor="vtkZLibDataCompressor"' if compressed else "")
-        content = (head + f'><PolyData><Piece NumberOfPoints="{count}"><PointData Normals="n">').encode()
+        content = (head + f'><{kind}><Piece NumberOfPoints="{count}"><PointData Normals="n">').encode()
         content += array("n", "Float64", cloud.normals) + array("rgb", "UInt8", cloud.attributes["colors"])
         content += array("intensity", "UInt16", cloud.attributes["intensity"]) + b"</PointData><Points>"
-        content += array("Points", "Float64", cloud.points) + b"</Points></Piece></PolyData>"
+        content += array("Points", "Float64", cloud.points) + f"</Points></Piece></{kind}>".encode()
         if appended:
             encoding = "base64" if form == "base64" else "raw"
             content += f'<AppendedData encoding="{encoding}">_'.encode() + appended + b"</AppendedData>"
@@ -317,6 +317,8 @@ FORMS = {
     "vtp-raw": Form(".vtp", _vtp("raw")),
     "vtp-raw-compressed": Form(".vtp", _vtp("raw", compressed=True)),
     "vtp-appended": Form(".vtp", _vtp("base64")),
+    "vtu": Form(".vtu", _vtp("raw", kind="UnstructuredGrid")),
+    "vts": Form(".vts", _vtp("binary", kind="StructuredGrid")),
     "glb": Form(".glb", _glb),
     "gltf": Form(".gltf", _gltf(embedded=False)),
     "gltf-embedded": Form(".gltf", _gltf(embedded=True)),

@@ -163,6 +163,20 @@ def test_vtp_polygons(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.faces, np.concatenate([one, one + 4]))
 
 
+def test_vtu_and_vts(tmp_path: Path) -> None:
+    array = '<DataArray type="Float32" NumberOfComponents="3">0 0 0 1 0 0 1 1 0 0 1 0</DataArray>'
+    cells = "".join(
+        f'<DataArray type="Int32" Name="{name}">{values}</DataArray>'
+        for name, values in (("connectivity", "0 1 2 3 1 0 1 2 0 2 3"), ("offsets", "4 5 8 11"), ("types", "10 1 5 5"))
+    )
+    grid = f'<Piece NumberOfPoints="4"><Points>{array}</Points><Cells>{cells}</Cells></Piece>'
+    (tmp_path / "a.vtu").write_text(f'<VTKFile type="UnstructuredGrid"><U>{grid}</U></VTKFile>')
+    np.testing.assert_array_equal(read_mesh(tmp_path / "a.vtu").faces, [[0, 1, 2], [0, 2, 3]])
+    grid = f'<Piece Extent="0 1 0 1 0 0"><Points>{array}</Points></Piece>'
+    (tmp_path / "a.vts").write_text(f'<VTKFile type="StructuredGrid"><S>{grid}</S></VTKFile>')
+    assert len(read_cloud(tmp_path / "a.vts")) == 4
+
+
 @pytest.mark.parametrize(
     ("name", "text", "sentence"),
     [
@@ -173,8 +187,8 @@ def test_vtp_polygons(tmp_path: Path) -> None:
         ("a.vtk", VTK.format("3.0") + "POLYGONS 9999999999 4\n3 0 1 2\n", "size that their section declares"),
         ("a.vtk", VTK.format("3.0") + "POLYGONS 1 4\n7 0 1 2\n", "size that their section declares"),
         ("a.vtk", VTK.format("3.0") + "HELLO 1\n", "does not begin a known section"),
-        ("a.vtp", "<VTKFile", "not a well-formed VTP"),
-        ("a.vtp", '<VTKFile type="ImageData"></VTKFile>', "type PolyData, but found 'ImageData'"),
+        ("a.vtp", "<VTKFile", "not a well-formed file of VTK"),
+        ("a.vtp", '<VTKFile type="ImageData"></VTKFile>', "grid of VTK, but found 'ImageData'"),
         ("a.vtp", '<VTKFile type="PolyData" compressor="vtkLZ4DataCompressor"></VTKFile>', "vtkLZ4DataCompressor"),
         ("a.e57", "ASTM-E57" + "x" * 99, "E57"),
         ("a.gltf", "{", "glTF"),

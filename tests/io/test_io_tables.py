@@ -37,6 +37,14 @@ def lines(separator: str = ",", decimal: str = ".", before: str = "", after: str
         lines().replace(",", "','").replace("\n", "'\n'").join(["'", ""])[:-1],
         lines(", ", before="(", after=")"),
         lines(" ") + "\x1a",
+        "x,y,z\n" + lines(after=","),
+        lines(before="[", after="],")[:-2],
+        "x y z\n" + "".join(f"{number} {line}\n" for number, line in enumerate(lines(" ").splitlines(), 1)),
+        lines().replace("-", "\u2212"),
+        "Bounding box: -3.0 -3.0 -3.0 3.0 3.0 3.0\n" + lines(" "),
+        'VARIABLES = "X", "Y", "Z"\nZONE I=20, F=POINT\n' + lines(" "),
+        "Este;Norte;Cota\n" + lines(";", ","),
+        "X_UTM,Y_UTM,Z_UTM\n" + lines(),
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
@@ -56,6 +64,49 @@ def test_what_is_guessed_is_said_and_columns_decide(tmp_path: Path) -> None:
     assert reading.remarks() == []
     with pytest.raises(UsageError, match="x, y and z"):
         parse_columns("x,y,-")
+
+
+def test_groups_of_digits_are_no_numbers_of_their_own(tmp_path: Path) -> None:
+    points = POINTS + np.array([452000.0, 5411000, 1000])
+    for mark in ("\xa0", "\u202f", "."):
+        rows = [
+            ";".join(f"{x:,.4f}".replace(".", "p").replace(",", mark).replace("p", ",") for x in row) for row in points
+        ]
+        (tmp_path / "a.csv").write_text("x;y;z\n" + "\n".join(rows), encoding="utf-8")
+        np.testing.assert_allclose(read_cloud(tmp_path / "a.csv").points, points, atol=1e-4)
+
+
+def test_columns_of_other_kinds_before_the_position(tmp_path: Path) -> None:
+    normals = np.round(POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True), 4)
+    for what, first in (("normals", normals), ("a running number", 10 * np.arange(1, 21)), ("", None)):
+        rows = np.column_stack([POINTS, 3 * POINTS] if first is None else [first, POINTS])
+        np.savetxt(tmp_path / "a.txt", rows, "%.4f")
+        cloud, reading = read_scans([tmp_path / "a.txt"])
+        np.testing.assert_array_equal(cloud.points, POINTS)
+        said = f"taken for {what}" if what else "values without a name are in column 4, 5, 6"
+        assert said in reading.remarks()[0]
+    assert set(cloud.attributes) == {"column_4", "column_5", "column_6"}
+    np.savetxt(tmp_path / "a.xyzn", np.hstack([POINTS, 0 * POINTS]))
+    normals = read_cloud(tmp_path / "a.xyzn").normals
+    assert normals is not None
+    assert not normals.any()
+    (tmp_path / "a.xyzn").rename(tmp_path / "a.xyz")
+    assert "colors" not in read_cloud(tmp_path / "a.xyz").attributes  # black would be
+
+
+def test_arrays_of_numpy(tmp_path: Path) -> None:
+    records = np.zeros(20, [("xyz", "f8", 3), ("rgb", "u1", 3)])
+    records["xyz"], records["rgb"] = POINTS, 7
+    np.save(tmp_path / "a.npy", records)
+    np.savez(tmp_path / "a.npz", pos=POINTS, norm=POINTS, rgb=records["rgb"], label="cup")
+    for name in ("a.npy", "a.npz"):
+        cloud = read_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.points, POINTS)
+        np.testing.assert_array_equal(cloud.attributes["colors"], records["rgb"])
+    assert cloud.normals is not None
+    np.savez(tmp_path / "b.npz", a=POINTS, b=POINTS)
+    with pytest.raises(InputError, match="the arrays a, b, but none named points"):
+        read_cloud(tmp_path / "b.npz")
 
 
 def test_a_time_before_the_position_is_no_coordinate(tmp_path: Path) -> None:
@@ -80,6 +131,7 @@ def test_a_time_before_the_position_is_no_coordinate(tmp_path: Path) -> None:
         ("intensity", [points, time], "%.4f", 0),
         ("x, y, z", [profiles, rng.uniform(0, 1, 400)], ["%.1f"] + 3 * ["%.4f"], 0),
         ("intensity", [rng.uniform(0, 1, (400, 3)), shade % 3], "%.4f", 0),
+        ("row", [np.arange(400) // 20, np.arange(400) % 20, points, shade], ["%d"] * 2 + ["%.4f"] * 4, 2),
     ):
         rows = np.column_stack(columns)
         np.savetxt(tmp_path / "a.txt", rows, formats)
@@ -106,7 +158,9 @@ def test_of_four_columns_the_one_beyond_a_byte_is_the_intensity(tmp_path: Path) 
         ("lat,lon,h\n" + lines(), "angles"),
         ("x [m],y [m],z [mm]\n" + lines(), "differ in their units"),
         ("NCOLS 4\nNROWS 1\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3 4\n", "grid of heights"),
-        ('VARIABLES = "X", "Y", "Z"\n' + lines(" "), "Name those to read with --columns"),
+        ("DSAA\n4 1\n0 3\n0 0\n1 4\n1 2 3 4\n", "grid of heights"),
+        ("x,y,z,time\n" + lines(), "Name those to read with --columns"),
+        ("Breite;Länge;Höhe\n" + lines(";"), "angles"),
         ("1,01,2,02,3,03\n4,05,5,06,6,07\n", "mark decimals as well"),
     ],
 )

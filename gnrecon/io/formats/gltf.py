@@ -9,9 +9,6 @@ and from ``COLOR_0`` in the file's JSON. All other attributes are float32, and t
 
 trimesh reads only the positions of point clouds. They are therefore passed to it as a mesh of one triangle that uses
 the first point three times: its indices are an accessor without a buffer, whose values are zero by the specification.
-
-A GLB has its JSON and one buffer in one file; text glTF has its buffers in the JSON or in other files. Both are given
-to trimesh as JSON and buffers by name.
 """
 
 from __future__ import annotations
@@ -110,7 +107,8 @@ def _prepare(tree: dict[str, Any], size: int) -> None:
     """Make colours a custom attribute, and points triangles, so that trimesh reads both in full."""
     _require_bounded(tree, size)
     for primitive in (primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]):
-        _rename(primitive["attributes"], "COLOR_0", "_COLOR_0")
+        if "COLOR_0" in (names := primitive["attributes"]):
+            names["_COLOR_0"] = names.pop("COLOR_0")
         if primitive.get("mode") == 0:  # points; mode 4 is triangles, component type 5121 is unsigned bytes
             tree["accessors"].append({"componentType": 5121, "type": "SCALAR", "count": 3})
             primitive.update(mode=4, indices=len(tree["accessors"]) - 1)
@@ -160,11 +158,6 @@ def _numbers(tree: dict[str, Any], primitive: dict[str, Any]) -> int:
     return sum(columns.get(accessor["type"], 4) * int(accessor["count"]) for accessor in accessors)
 
 
-def _rename(names: dict[str, Any], old: str, new: str) -> None:
-    if old in names:
-        names[new] = names.pop(old)
-
-
 def _attributes(stored: dict[str, Any]) -> dict[str, Values]:
     """The attributes of one mesh by their names in lower case; colours in sRGB, of shape (N, 3 or 4)."""
     found: dict[str, Values] = {}
@@ -206,8 +199,8 @@ def write_glb(mesh: Mesh, path: Path) -> None:
 def _set_colors_and_material(tree: dict[str, Any]) -> None:
     """Give the colours their glTF name, and the mesh a matt material: without one, viewers draw it as metal."""
     primitive = tree["meshes"][0]["primitives"][0]
-    _rename(primitive["attributes"], "_COLOR_0", "COLOR_0")
-    if "COLOR_0" in primitive["attributes"]:
-        tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
+    if "_COLOR_0" in (names := primitive["attributes"]):
+        names["COLOR_0"] = names.pop("_COLOR_0")
+        tree["accessors"][names["COLOR_0"]]["normalized"] = True
     tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
     primitive["material"] = 0

@@ -38,13 +38,12 @@ def las_chunks(path: Path, rows: int, *, most_chunk_bytes: int = 1 << 28) -> Ite
     import laspy
 
     _require_consistent_header(path)
-    # The parallel decompressor trusts the sizes in a damaged file and aborts the process.
-    backend = laspy.LazBackend.Lazrs
     try:
         with (
             path.open("rb") as file,
             guard_parser("LAS or LAZ"),
-            laspy.open(file, closefd=False, laz_backend=backend) as reader,
+            # The parallel decompressor trusts the sizes in a damaged file and aborts the process.
+            laspy.open(file, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader,
         ):
             count = left = reader.header.point_count
             rows = max(1, min(rows, most_chunk_bytes // max(reader.header.point_format.size, 1)))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gnrecon.geometry.arrays import Values
+from gnrecon.io.column_names import POSITION, columns_of_role
 from gnrecon.io.contents import Contents, from_columns, guard_parser
 from gnrecon.io.formats.table_columns import guessed, named_by_user
 from gnrecon.runtime.errors import InputError
@@ -25,15 +26,16 @@ def read_npy(path: Path, columns: Sequence[str] = ()) -> Contents:
     """
     with guard_parser("NPY or NPZ"):
         arrays = _arrays(path)
+    if columns_of_role(arrays, POSITION):
+        return from_columns({name: values for name, values in arrays.items() if values.ndim == 1})
     found = {name.lower(): name for name in arrays}
     usual = ["points", "xyz", "positions", "coords", "vertices", "pc", "pos", "data"]
     usual += found if len(found) == 1 else []
     if (chosen := next((found[name] for name in usual if name in found), None)) is None:
-        if {"x", "y", "z"} <= found.keys():
-            return from_columns({name: values for name, values in arrays.items() if values.ndim == 1})
-        raise InputError(f"the archive holds the arrays {', '.join(arrays)[:200]}, but none named points.")
+        raise InputError(f"it holds the arrays {', '.join(arrays)[:200]}, but none named points; name them so.")
     cloud = _cloud(arrays[chosen], columns)
-    rest = {name: one for name, one in arrays.items() if name != chosen and _fits(one, len(cloud.points))}
+    others = {name: one for name, one in arrays.items() if name != chosen and one.dtype.kind in "biuf"}
+    rest = {name: one for name, one in others.items() if one.ndim in (1, 2) and len(one) == len(cloud.points)}
     more = from_columns(rest, None, cloud.points)
     unread = [f"the array {name}" for name in arrays if name != chosen and name not in rest]
     return replace(
@@ -55,17 +57,12 @@ def _arrays(path: Path, *, largest_ratio: int = 1032) -> Mapping[str, Values]:
             with np.load(file, allow_pickle=False) as loaded:
                 return {name: loaded[name] for name in loaded.files}
     # Mapped, so that a damaged header cannot ask for more than the file holds.
-    return {"points": np.array(np.load(path, mmap_mode="r", allow_pickle=False))}
-
-
-def _fits(values: Values, count: int) -> bool:
-    return values.dtype.kind in "biuf" and values.ndim in (1, 2) and len(values) == count
+    values: Any = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    records = values.ravel()
+    return {name: records[name] for name in values.dtype.names} if values.dtype.names else {"points": values}
 
 
 def _cloud(values: Values, columns: Sequence[str]) -> Contents:
-    if values.dtype.names:
-        records: Any = values
-        return from_columns({name: records[name].ravel() for name in values.dtype.names})
     if values.dtype.kind not in "iuf" or values.ndim < 2:
         what = f"{values.dtype} of {values.shape}"
         raise InputError(f"expected numbers of shape (N, 3) or more columns, but found {what}.")

@@ -1,4 +1,7 @@
-"""OFF, the Object File Format: counts, vertices and polygons in text, with the variants COFF, NOFF and CNOFF."""
+"""OFF, the Object File Format: counts, vertices and polygons in text, with the variants COFF, NOFF and CNOFF.
+
+It is parsed here because trimesh drops the normals and colours of vertices.
+"""
 
 from __future__ import annotations
 

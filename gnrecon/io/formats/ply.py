@@ -188,8 +188,7 @@ def write_ply(mesh: Mesh, path: Path) -> None:
 PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
-    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
-    **{"bool": "u1"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8", "bool": "u1"},
 }
 """Names of number types in PLY and in numpy."""
 
@@ -234,9 +233,8 @@ def parse_header(data: bytes) -> tuple[str, list[Element], int]:
                 order = orders[encoding]
             case ["element", name, count] if count.isdecimal():
                 # Some programs name the element of a cloud otherwise.
-                elements.append(
-                    Element("vertex" if name.lower() in ("point", "points", "vertices") else name, int(count))
-                )
+                other = name.lower() in ("point", "points", "vertices")
+                elements.append(Element("vertex" if other else name, int(count)))
             case ["property", "list", count_type, kind, name] if elements and {count_type, kind} <= PLY_TYPES.keys():
                 elements[-1].properties.append(Property(name, PLY_TYPES[kind], PLY_TYPES[count_type]))
             case ["property", kind, name] if elements and kind in PLY_TYPES:
@@ -253,14 +251,12 @@ def truncation_error(element: Element, rows: int) -> InputError:
     return InputError(f"the header declares {element.count} {element.name} rows, but the file ends after {rows}.")
 
 
-Column = tuple[str, str, Values]
-"""Name, PLY type, and values of shape (V,)."""
-
-
-def vertex_columns(mesh: Mesh) -> list[Column]:
-    """Return all columns of a mesh; an attribute of several columns becomes NAME_0, NAME_1, and so on."""
+def vertex_columns(mesh: Mesh) -> list[tuple[str, str, Values]]:
+    """Return name, PLY type and values of all columns; an attribute of several becomes NAME_0, NAME_1, and so on."""
     # Doubles, because projected coordinates lose centimetres in single precision.
-    columns: list[Column] = [(name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")]
+    columns: list[tuple[str, str, Values]] = [
+        (name, "double", mesh.vertices[:, axis]) for axis, name in enumerate("xyz")
+    ]
     if mesh.normals is not None:
         columns += [(f"n{name}", "float", mesh.normals[:, axis]) for axis, name in enumerate("xyz")]
     color_names = ("red", "green", "blue", "alpha")

@@ -21,7 +21,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.io.contents import Contents, from_columns
 from gnrecon.io.formats.ply import vertex_columns
 from gnrecon.io.formats.table_columns import guessed, named_by_user
-from gnrecon.io.formats.table_dialect import BLANKS, COMMENT, MISSING, Dialect, encoding_of, find_dialect
+from gnrecon.io.formats.table_dialect import BLANKS, COMMENT, MISSING, Dialect, encoding_of, find_dialect, plain_text
 from gnrecon.runtime.errors import InputError
 
 TABLE_SUFFIXES = (".xyz", ".pts", ".txt", ".csv", ".asc", ".xyzn", ".xyzrgb", ".dat")
@@ -36,7 +36,10 @@ def table_chunks(
     of some tables are.
     """
     with path.open("r", encoding=encoding_of(path), errors="replace") as file:
-        lines = list(islice(file, sampled_lines))
+        lines, head = list[str](), [""]
+        while head and not COMMENT.sub("", "".join(head)).strip():
+            head = list(map(plain_text, islice(file, sampled_lines)))
+            lines += head
         if columns:
             # The user's names stand in place of any header, which may hold names of all kinds.
             lines = [line if re.search(r"\d", line) else "\n" for line in lines]
@@ -98,8 +101,7 @@ def _cleaned(block: str, dialect: Dialect) -> tuple[str, list[int]]:
         raise InputError("expected text, but the file holds binary data.")
     if any(mark in block for mark in ("#", "//", "%", "!")) or (dialect.separator != ";" and ";" in block):
         block = COMMENT.sub("", block)
-    if not block.isascii() or "\x1a" in block:  # with which DOS ends a text
-        block = block.translate({0xA0: " ", 0x202F: " ", 0x2212: "-", 0xFEFF: None, 0x1A: " "})
+    block = plain_text(block)
     counts: list[int] = []
     if dialect.count is not None:
         counts = [int(word) for word in re.findall(r"^[ \t]*([0-9]{1,18})[ \t]*$", block, re.MULTILINE)]

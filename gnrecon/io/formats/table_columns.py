@@ -32,13 +32,15 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
     places : of these columns among all of the file's, from 0
     suffix : extension of the file; points of ``.pts`` have their intensity before their colour
     """
-    names: list[str] = ["index"] if _is_index(rows) else []
-    reasons: dict[str, str] = {}
+    names: list[str] = ["index"] if _is_index(rows) else ["row", "column"] if _are_cells(rows) else []
+    reasons = {"nx": "unit length"}
     if rows.shape[1] - len(names) < 3:
         raise InputError(f"expected at least 3 columns (x, y, z), but found {rows.shape[1] - len(names)}.")
     first = rows[:, len(names) :]
     grows = first.shape[1] > 3 and _grows(first[:, 0])
-    if _is_before_position(first):
+    if _are_normals_first(first):
+        names += NORMAL
+    elif _is_before_position(first):
         names.append("time" if grows else "intensity")
     elif grows:
         reasons["x"] = f"column {places[len(names)] + 1} grows, as a time would"
@@ -56,22 +58,26 @@ def guessed(rows: Float, places: Sequence[int], suffix: str = "") -> tuple[list[
 
 def _sentences(names: list[str], reasons: dict[str, str], places: Sequence[int]) -> tuple[str, ...]:
     """One sentence on what was guessed; none where the first three columns are all that there is."""
-    spoken = {"index": "a running number", "time": "time", "intensity": "intensity"}
+    spoken = {"index": "a running number"} | {name: name for name in ("time", "intensity", "row", "column")}
     of_three = {"x": "x, y, z", "nx": "normals", "red": "colours"}
-    found = []
+    found, values = [], []
     for at, name in enumerate(names):
+        if name.startswith("column_"):
+            values.append(f"{places[at] + 1}")
         if name in spoken or (name in of_three and (name != "x" or places[at] or reasons.get("x"))):
             first = places[at] + 1
             which = f"column {first} is" if name in spoken else f"columns {first} to {places[at + 2] + 1} are"
             reason = f" ({reasons[name]})" if reasons.get(name) else ""
             found.append(f"{which} taken for {(spoken | of_three)[name]}{reason}")
+    found += [f"values without a name are in column {', '.join(values)}"] if values else []
     return (f"The table has no header: {', '.join(found)}; --columns says otherwise.",) if found else ()
 
 
 def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
     """Return the names of the next columns, and why: three of a normal or a colour, or one without a name."""
-    if "nx" not in names and rest.shape[1] >= 3 and _are_normals(rest[:, :3]):
-        return list(NORMAL), "unit length"
+    unit = rest.shape[1] >= 3 and _are_normals(rest[:, :3])
+    if "nx" not in names and (unit or (suffix == ".xyzn" and rest.shape[1] >= 3)):
+        return list(NORMAL), "unit length" if unit else ""
     if "red" in names or rest.shape[1] < 3 or not _are_colors(rest[:, :3]):
         return [""], ""
     four = rest.shape[1] >= 4 and _are_colors(rest[:, 1:4])
@@ -81,15 +87,32 @@ def _group(rest: Float, names: list[str], suffix: str) -> tuple[list[str], str]:
         odd = [bool(np.ptp(rest[:, end]) == 0 or rest[:, end].max() > 255 >= rest[:, 1:3].max()) for end in (0, 3)]
         if odd[0] > odd[1] or (odd[0] == odd[1] and suffix == ".pts"):
             return [""], ""
-    return list(COLOR), "0 to 255" if rest[:, :3].max(initial=0) > 1 else "0 to 1"
+    top = rest[:, :3].max(initial=0)
+    return list(COLOR), f"0 to {1 if top <= 1 else 255 if top <= 255 else 65535}"
 
 
 def _is_index(rows: Float, *, least_rows: int = 10) -> bool:
-    """Whether the first of at least four columns counts the rows, while others hold fractions."""
-    if rows.shape[1] < 4 or len(rows) < least_rows:
+    """Whether the first of at least four columns numbers the rows in even steps, while others hold fractions."""
+    if rows.shape[1] < 4 or len(rows) < least_rows or (rows[:, 0] % 1 != 0).any():
         return False
-    fractions = bool((rows[:, 1:4] % 1 != 0).any())
-    return fractions and bool((np.diff(rows[:, 0]) == 1).all()) and float(rows[0, 0]).is_integer()
+    steps = np.diff(rows[:, 0])
+    return bool((rows[:, 1:4] % 1 != 0).any() and steps[0] > 0 and np.ptp(steps) == 0)
+
+
+def _are_cells(rows: Float) -> bool:
+    """Whether the first two of at least five columns are the cells of a grid, as FARO's scanners write them."""
+    cells, digits = rows[:, :2], [_digits(column) for column in rows[:2000, :5].T]
+    fit = len(digits) == 5 and max(digits[:2]) == 0 < min(digits[2:]) == max(digits[2:])
+    ordered = fit and cells.min() >= 0 and (_grows(cells[:, 0]) or _grows(cells[:, 1]))
+    return bool(ordered and not _are_normals(rows[:, 3:6]) and len(np.unique(cells, axis=0)) == len(cells))
+
+
+def _are_normals_first(rows: Float) -> bool:
+    """Whether the first three of at least six columns are normals, and the next three neither normals nor colours."""
+    next_three = rows[:, 3:6]
+    return (
+        rows.shape[1] >= 6 and _are_normals(rows[:, :3]) and not (_are_normals(next_three) or _are_colors(next_three))
+    )
 
 
 def _grows(values: Float) -> bool:
@@ -117,6 +140,8 @@ def _is_before_position(
     rows = rows[np.isfinite(rows).all(axis=1)]
     if rows.shape[1] < 4 or len(rows) < least_rows or _grows(rows[:, 3]) or _are_normals(rows[:, 3:6]):
         return False
+    if _grows(rows[:, 0]) and rows[:, 0].min() > max(1e8, 30 * np.abs(rows[:, 1:4]).max()):
+        return True
     chosen = np.random.default_rng(0).permutation(len(rows))[:most_rows]
     sample, next_three = rows[chosen, :4], rows[chosen, 1:4]
     different, digits = [len(np.unique(column)) for column in sample.T], [_digits(column) for column in sample.T]
@@ -130,8 +155,7 @@ def _is_before_position(
         return False
     steps = np.diff(rows[:, 0])
     even = bool(np.quantile(steps, 0.99) <= 2 * np.median(steps))
-    beyond = bool(sample[:, 0].min() > max(1e8, 30 * np.abs(next_three).max()))
-    return even or beyond or digits[0] != digits[1] == digits[2] == digits[3]
+    return even or digits[0] != digits[1] == digits[2] == digits[3]
 
 
 def _thickness(points: Float, *, neighbors: int = 12) -> float:
@@ -167,8 +191,8 @@ def _are_normals(vectors: Float, *, least_share: float = 0.9, tolerance: float =
 
 
 def _are_colors(values: Values) -> bool:
-    """Whether all numbers, of shape (N, 3), are whole ones from 0 to 255 or 65535, or shares from 0 to 1."""
+    """Whether all numbers, of shape (N, 3), are whole ones from 0 to 255 or 65535, or shares from 0 to 1; not all 0."""
     finite = values[np.isfinite(values)]
-    if not len(finite) or finite.min() < 0:
+    if not finite.any() or finite.min() < 0:
         return False
     return bool(finite.max() <= 1) or bool(finite.max() <= 65535 and (finite == np.rint(finite)).all())

@@ -14,17 +14,20 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gnrecon.io.column_names import COLOR, NORMAL, POSITION, columns_of_role, simple_name
+import numpy as np
+
+from gnrecon.io.column_names import COLOR, NORMAL, POSITION, columns_of_role, is_angle
 from gnrecon.runtime.errors import InputError
 
 BLANKS = r"\s+"
 MISSING = (
     *("", "nan", "+nan", "na", "n/a", "#n/a", "null", "none", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan"),
-    *("1.#ind", "-1.#ind", "-", "--", "nil", "<na>", "#value!", "missing"),
+    *("1.#ind", "-1.#ind", "-", "--", "nil", "<na>", "missing", "#value!", "#ref!", "#div/0!", "#num!", "#name?"),
 )
 """Cells without a number, in lower case."""
 
-COMMENT = re.compile(r"^\s*(?:#|//|%|!|;(?!\s*[-+\d])).*$|(?<=[\s\d])(?:#(?!N/A)|//).*$", re.MULTILINE)
+_HASH = r"#(?!N/A|DIV/0|[A-Z]+[!?])"  # but not an error of a spreadsheet
+COMMENT = re.compile(rf"^\s*(?:{_HASH}|//|%|!|;(?!\s*[-+\d])).*$|(?<=[\s\d])(?:{_HASH}|//).*$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Dialect:
         """Return the cells of a line, without quotes and blanks around them."""
         for old, new in self.replaced:
             line = line.replace(old, new)
-        line = line.strip() if self.separator == BLANKS else line.strip("\r\n\ufeff")
+        line = line.strip() if self.separator == BLANKS else line.strip("\r\n")
         if self.separator == BLANKS:
             return [word.strip("\"'") for word in re.findall(r'"[^"]*"|\S+', line)]
         try:
@@ -74,11 +77,9 @@ class Dialect:
     def is_number(self, cell: str) -> bool:
         """Whether a cell holds a number in this dialect."""
         mark = re.escape(self.decimal)
-        if self.thousands and re.fullmatch(rf"[+-]?\d{{1,3}}({re.escape(self.thousands)}\d{{3}})+({mark}\d*)?", cell):
-            return True
-        if re.fullmatch(rf"[+-]?(\d+({mark}\d*)?|{mark}\d+)(e[+-]?\d+)?", cell, re.IGNORECASE | re.ASCII):
-            return True
-        return re.fullmatch("[+-]?(inf(inity)?|nan)", cell.lower()) is not None
+        known = rf"(\d+({mark}\d*)?|{mark}\d+)(e[+-]?\d+)?|inf(inity)?|nan"
+        known += rf"|\d{{1,3}}({re.escape(self.thousands)}\d{{3}})+({mark}\d*)?" if self.thousands else ""
+        return re.fullmatch(f"[+-]?({known})", cell, re.IGNORECASE | re.ASCII) is not None
 
     def is_value(self, cell: str) -> bool:
         """Whether a cell holds a number, or is one of those that stand for none."""
@@ -105,24 +106,37 @@ def encoding_of(path: Path) -> str:
     return "utf-8"
 
 
+def plain_text(text: str) -> str:
+    """Return a text with ASCII blanks and signs, and without marks of the byte order or of DOS at its end."""
+    if text.isascii() and "\x1a" not in text:
+        return text
+    if ";" in text or "\t" in text:
+        text = re.sub(r"(?<=\d)[\xa0\u202f\u2009\u2019](?=\d{3}(?!\d))", "", text)  # between groups of digits
+    return text.translate({0xA0: " ", 0x2009: " ", 0x202F: " ", 0x2212: "-", 0xFEFF: None, 0x1A: " "})
+
+
 def find_dialect(lines: list[str]) -> Dialect:
     """Return the dialect of a table whose first lines these are."""
-    if re.match(r"\s*ncols\s+\d+\s+nrows\s+\d", "".join(lines[:2]), re.IGNORECASE):
-        raise InputError("it is a grid of heights by Esri, not a table of points; gdal2xyz or QGIS make one of it.")
-    texts = [COMMENT.sub("", line.replace("\ufeff", "")) for line in lines]
+    if re.match(r"\s*(?:ncols\s+\d+\s+nrows\s+\d|DSAA\b)", "".join(lines[:2]), re.IGNORECASE):
+        kind = "a grid of heights by Esri or Surfer"
+        raise InputError(f"it is {kind}, not a table of points; gdal2xyz or QGIS make one of it.")
+    texts = [COMMENT.sub("", line) for line in lines]
     dialect, rows = _best(texts)
     # The last line read may be cut off; all others count.
     widths = Counter(len(cells) for _, cells in rows[:-1] or rows)
     dialect = replace(dialect, width=widths.most_common(1)[0][0])
     end = next(number for number, cells in rows if len(cells) == dialect.width)
     title, names = _header(dialect, lines[:end])
-    rows = [(number, cells) for number, cells in rows if number > title]
+    # A line of text before the rows may hold numbers, too, such as those of a box.
+    rows = [(at, cells) for at, cells in rows if at > title and (at >= end or dialect.is_value(cells[0]))]
+    if dialect.width > max(3, len(names or ())) and not any(len(c) == dialect.width and c[-1] for _, c in rows):
+        dialect = replace(dialect, width=dialect.width - 1)  # rows end with a separator
     first = rows[0][0]
     _require_unambiguous(dialect, [cells for _, cells in rows])
     counts = [int(line) for line in map(str.strip, lines[:first]) if re.fullmatch("[0-9]{1,18}", line)]
     dialect = replace(dialect, skipped=first, count=counts[-1] if counts else None)
     if names is not None:
-        dialect = _fitted(dialect, names)
+        dialect = _fitted(dialect, names, [cells[0] for _, cells in rows])
     else:
         _require_no_header(dialect, texts[:first], ragged=len(widths) > 2)
     columns = list(zip(*[cells[: dialect.width] for _, cells in rows if len(cells) >= dialect.width], strict=True))
@@ -151,11 +165,8 @@ def _best(texts: list[str]) -> tuple[Dialect, list[tuple[int, list[str]]]]:
         if re.search(r"\d\.\d{3},\d" if tried.decimal == "," else quoted + r"\d,\d{3}\.\d", "\n".join(texts)):
             tried = replace(tried, thousands="." if tried.decimal == "," else ",")
         rows = [(number, cells) for number, text in enumerate(texts) if _is_row(cells := tried.cells(text), tried)]
-        if (
-            candidate.replaced
-            and tried.separator == "\t"
-            and not all("," in cell for _, cells in rows for cell in cells)
-        ):
+        both = tried.separator == "\t" and candidate.replaced
+        if both and not all("," in cell for _, cells in rows for cell in cells):
             continue  # commas and blanks may separate decimal commas only
         score = (len(rows), sum(tried.is_number(cell) for _, cells in rows for cell in cells))
         # Another separator must explain more lines; another decimal mark, more cells.
@@ -197,7 +208,7 @@ def _header(dialect: Dialect, head: list[str]) -> tuple[int, list[str] | None]:
     """Return the place and the names of the last line of the head that names x, y and z; -1 and None without one."""
     for place, line in reversed(list(enumerate(head))):
         # A separator at the start stays: pandas leaves the name of its index empty.
-        text = line.replace("\ufeff", "").strip(" \r\n").lstrip("#/%!").strip(" ")
+        text = re.sub(r"(?i)^ *[#/%!]* *(?:(?:variables|columns|fields)\s*[:=]\s*)?", "", line.rstrip(" \r\n"))
         text = text.lstrip("; ") if dialect.separator != ";" else text
         if dialect.separator == BLANKS:
             text = re.sub(r"\s+(?=\[\w+\]|\(\w+\))", "", text)  # a unit belongs to its name
@@ -220,15 +231,15 @@ def _require_no_header(dialect: Dialect, head: list[str], *, ragged: bool) -> No
     names = dialect.cells(head[-1]) if head else []
     if len(names) == dialect.width and not any(map(dialect.is_number, names)):
         found = ", ".join(names)[:200]
-        if any(re.match("lat|lon", simple_name(name)) for name in names):
+        if any(map(is_angle, names)):
             raise InputError(f"the columns {found} hold angles; project latitude and longitude to metres first.")
         raise InputError(f"expected columns named x, y and z, but found {found}; name them with --columns.")
     if ragged:
         raise InputError("rows differ in length, and no header names their columns; name those to read with --columns.")
 
 
-def _fitted(dialect: Dialect, names: list[str]) -> Dialect:
-    """Return the dialect with as many names as columns."""
+def _fitted(dialect: Dialect, names: list[str], first: list[str]) -> Dialect:
+    """Return the dialect with as many names as columns, of which the first holds these cells."""
     width = dialect.width
     lists = next((place for place, name in enumerate(names) if "[]" in name), None)
     if lists is not None:
@@ -238,15 +249,13 @@ def _fitted(dialect: Dialect, names: list[str]) -> Dialect:
         names = names[:-1]
     if len(names) > width and dialect.separator == BLANKS:
         names = _joined(names, width)
-    elif len(names) == width - 1 and tuple(name.lower() for name in names[:3]) == POSITION:
-        raise InputError(_unequal(names, width) + " The first column seems to be a row's number; see --columns.")
+    elif len(names) == width - 1 and all(cell.isdecimal() or not dialect.is_number(cell) for cell in first):
+        numbers = [int(cell) if cell.isdecimal() else place for place, cell in enumerate(first)]
+        names = ["", *names] if set(np.diff(numbers)) <= {1} else names  # R names no column of the rows' names
     if len(names) != width:
-        raise InputError(f"{_unequal(names, width)} Name those to read with --columns.")
+        what = f"the header names {len(names)} columns, but the rows hold {width}."
+        raise InputError(f"{what} Name those to read with --columns.")
     return replace(dialect, names=tuple(names))
-
-
-def _unequal(names: list[str], width: int) -> str:
-    return f"the header names {len(names)} columns, but the rows hold {width}."
 
 
 def _joined(names: list[str], width: int) -> list[str]:

@@ -4,7 +4,6 @@ Implemented here because the format's own library and trimesh store coordinates 
 files have one object, in millimetres, the unit that readers assume; coordinates are text with all digits of float64.
 Most readers convert them to float32, so a mesh far from the origin is stored relative to its middle, and the build item
 has the translation. Archive members have a fixed date, so that equal meshes give equal bytes.
-
 Models may be large, so their XML is parsed as a stream, without a tree.
 
 Specifications: 3MF Core 1.3, Materials and Properties 1.2 (https://3mf.io/spec).
@@ -78,7 +77,9 @@ def _model(mesh: Mesh) -> Iterator[str]:
         yield '<m:colorgroup id="1">\n'
         yield from format_rows('<m:color color="#%08X"/>\n', palette)
         yield "</m:colorgroup>\n"
-    kind = "model" if _is_closed(mesh) else "surface"
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    closed = (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    kind = "model" if closed else "surface"  # as the specification says
     yield f'<object id="2" type="{kind}"{default}>\n<mesh>\n<vertices>\n'
     yield from format_rows('<vertex x="%r" y="%r" z="%r"/>\n', mesh.vertices - shift)
     yield "</vertices>\n<triangles>\n"
@@ -95,13 +96,6 @@ def _shift(mesh: Mesh) -> Float:
     rounding = float(np.abs(mesh.vertices).max()) * float(np.finfo(np.float32).eps)
     visible = IOParameters.visible_rounding_diagonals * float(np.linalg.norm(high - low))
     return (low + high) / 2 if rounding > visible else np.zeros(3)
-
-
-def _is_closed(mesh: Mesh) -> bool:
-    """Whether every edge has two faces; only such an object may have the type ``model``."""
-    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    counts = np.unique(edges, axis=0, return_counts=True)[1]
-    return bool((counts == 2).all())
 
 
 Key = tuple[str, str]

@@ -217,9 +217,6 @@ def _counted(values: Int, rows: int) -> tuple[Int, Int]:
     return values[starts], np.delete(values, starts)
 
 
-# The rest is shared with the XML format, see `gnrecon.io.formats.vtp`.
-
-
 def assemble_contents(
     points: Float, faces: Int, arrays: Mapping[str, Values], normals: str | None, unread: list[str]
 ) -> Contents:

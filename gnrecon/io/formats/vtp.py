@@ -1,8 +1,8 @@
-"""VTP, VTK's XML format of polydata: arrays as text, base64 or raw bytes, in place or appended, also compressed.
+"""VTP, VTU and VTS, VTK's XML formats: arrays as text, base64 or raw bytes, in place or appended, also compressed.
 
 After VTK's manual "VTK File Formats", section XML. Binary arrays begin with a count of bytes; compressed ones with the
-number of blocks, the size of a block, that of the last one, and the compressed size of each. It is parsed here because
-VTK itself takes 140 MB and aborts the process on some damaged files.
+number of blocks, the size of a block, that of the last one, and the compressed size of each. They are parsed here for
+the reasons in `gnrecon.io.formats.vtk`.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def read_vtp(path: Path) -> Contents:
     """Read all pieces into one: points with their arrays, and polygons and strips where there are some."""
     try:
         root, file = _open(path.read_bytes())
-        pieces = [_piece(piece, file) for piece in root.iterfind("PolyData/Piece")]
+        pieces = [_piece(piece, file) for piece in root.iterfind("*/Piece")]
     except (ElementTree.ParseError, zlib.error, lzma.LZMAError, binascii.Error) as error:
-        raise InputError(f"the file is not a well-formed VTP file ({error}).") from None
+        raise InputError(f"the file is not a well-formed file of VTK ({error}).") from None
     if not pieces:
-        raise InputError("the file holds no piece of polydata.")
+        raise InputError("the file holds no piece of a data set.")
     return concatenated(pieces)
 
 
@@ -56,8 +56,9 @@ def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
     tag, _, block = rest.partition(b">")
     # Raw bytes are not XML, so the tree ends before them.
     root = ElementTree.fromstring(xml + b"</VTKFile>" if rest else xml)
-    if root.tag != "VTKFile" or root.get("type") != "PolyData":
-        raise InputError(f"expected a VTKFile of the type PolyData, but found {root.get('type', root.tag)!r}.")
+    if root.tag != "VTKFile" or root.get("type") not in ("PolyData", "UnstructuredGrid", "StructuredGrid"):
+        found = root.get("type", root.tag)
+        raise InputError(f"expected polydata or a structured or unstructured grid of VTK, but found {found!r}.")
     compressor = root.get("compressor", "")
     if compressor and compressor not in libraries:
         raise InputError(f"the compression {compressor!r} is not read; use {' or '.join(libraries)}, or none.")
@@ -69,18 +70,17 @@ def _open(data: bytes) -> tuple[ElementTree.Element, _VtkXml]:
 
 
 def _piece(piece: ElementTree.Element, file: _VtkXml) -> Contents:
-    count = _whole(piece.get("NumberOfPoints"))
     found = [_values(array, file) for array in piece.iterfind("Points/DataArray")]
-    if len(found) != 1 or found[0].shape != (count, 3):
+    # A structured grid has an extent instead of a number.
+    count = piece.get("NumberOfPoints", f"{len(found[0])}" if found else "0")
+    if len(found) != 1 or found[0].shape != (_whole(count), 3):
         raise InputError(f"a piece declares {count} points, but does not hold them.")
-    data = piece.find("PointData")
-    arrays = {} if data is None else {array.get("Name", "unnamed"): _values(array, file) for array in data}
-    faces = [no_faces(), _faces(piece, "Polys", file), _faces(piece, "Strips", file)]
+    data = next(piece.iterfind("PointData"), ElementTree.Element("none"))
+    arrays = {array.get("Name", "unnamed"): _values(array, file) for array in data}
+    faces = [no_faces(), *(_faces(piece, name, file) for name in ("Polys", "Strips", "Cells"))]
     unread = ["lines"] if _whole(piece.get("NumberOfLines")) else []
-    cells = piece.find("CellData")
-    unread += ["values of polygons"] if cells is not None and len(cells) else []
-    normals = None if data is None else data.get("Normals")
-    return assemble_contents(found[0].astype(np.float64), np.concatenate(faces), arrays, normals, unread)
+    unread += ["values of polygons"] if piece.findall("CellData/*") else []
+    return assemble_contents(found[0].astype(np.float64), np.concatenate(faces), arrays, data.get("Normals"), unread)
 
 
 def _whole(text: str | None) -> int:
@@ -96,6 +96,9 @@ def _faces(piece: ElementTree.Element, name: str, file: _VtkXml) -> Int:
     corners = arrays["connectivity"].astype(np.int64).ravel()
     ends = arrays["offsets"].astype(np.int64).ravel()
     counts = counts_from_offsets(np.concatenate([[0], ends]), corners)
+    if "types" in arrays:
+        kept = np.isin(arrays["types"], (5, 7, 9))  # triangles, polygons and quadrangles
+        corners, counts = corners[np.repeat(kept, counts)], counts[kept]
     return fan_triangles(counts, corners, strips=name == "Strips")
 
 
