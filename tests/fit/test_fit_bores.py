@@ -76,7 +76,8 @@ def test_an_unseen_side_of_the_wall_is_completed() -> None:
 
 def test_air_between_two_lugs_is_no_gap_of_their_bores() -> None:
     lug, normals = bored_plate(3000, SIDE, 0.1, BORE)
-    lugs = np.concatenate([lug + [0, 0, 0.2], lug - [0, 0, 0.2]])
+    up = np.array([0.0, 0.0, 0.2])
+    lugs = np.concatenate([lug + up, lug - up])
     across = complete_holes(lugs, np.concatenate([normals, normals]))
     assert not (np.abs(across.points[:, 2]) < 0.08).any()
 
@@ -98,7 +99,7 @@ def test_a_bore_ends_at_its_floor() -> None:
     points, normals = np.concatenate([points, floor, closed]), np.concatenate([normals, up, -up])
     across = complete_holes(points, normals)
     wall = np.abs(np.hypot(across.points[:, 0], across.points[:, 1]) - BORE) < 2e-3
-    assert 0.0 < across.points[wall, 2].max(initial=-1.0)
+    assert across.points[wall, 2].max(initial=-1.0) > 0.0
     assert across.points[wall, 2].min() > -0.03
 
 
