@@ -139,10 +139,20 @@ def test_every_analytic_case_can_be_drawn(name: str) -> None:
     assert problem.genus == SOLIDS[case.shape].genus
 
 
+@pytest.mark.parametrize(("name", "genus"), [("clevis", 4), ("flange", 7), ("shaft", 1)])
+def test_parts_with_bores_are_scanned_from_outside(name: str, genus: int) -> None:
+    problem = CASES[f"{name}, 5000 points"].problem(NOWHERE, 0)
+    assert isinstance(problem.truth, Mesh)
+    assert (len(problem.scan), problem.genus, verify(problem.truth).genus) == (5000, genus, genus)
+    assert problem.radius is not None
+    feet, _ = SurfaceQuery(problem.truth).nearest(problem.scan.points)
+    assert np.linalg.norm(problem.scan.points - feet, axis=1).max() < 5e-3 * problem.radius
+
+
 def test_groups_and_names_choose_cases_once() -> None:
     assert list(chosen_cases(["noisy", "plate", "noisy"], GROUPS)) == ["plate", *GROUPS["noisy"]]
     assert list(chosen_cases(["clean", "noisy", "sparse"], GROUPS)) == list(GROUPS["analytic"])
-    assert [len(GROUPS[name]) for name in ("srb", "vipss", "organic", "open")] == [6, 2, 18, 6]
+    assert [len(GROUPS[name]) for name in ("srb", "vipss", "organic", "open", "bores")] == [6, 2, 18, 6, 10]
     assert set(chosen_cases(GROUPS, GROUPS)) == set(CASES)
     assert set(hard_cases()).isdisjoint(GROUPS["clean"])
     with pytest.raises(UsageError, match="no case 'teapot'"):

@@ -125,6 +125,13 @@ def test_crowded_points_cost_no_memory() -> None:
     assert len(across) < 3000
 
 
+def test_points_at_one_place_are_no_bore() -> None:
+    points, normals = block(2000)
+    crowd = np.full((6000, 3), [SIDE, 0.0, 0.0])
+    across = complete_holes(np.concatenate([points, crowd]), np.concatenate([normals, np.eye(3)[[0] * 6000]]))
+    assert len(across) < 3000
+
+
 def test_the_field_is_open_along_the_gap() -> None:
     points, normals = scanned(*block(4000), -0.12, 0.15)
     sdf, _ = fit(Samples(points, normals, Frame(np.zeros(3), 1.0)), FitOptions(seed=0, quality="draft"))

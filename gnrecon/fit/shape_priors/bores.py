@@ -47,6 +47,8 @@ def samples_on_bores(
     # Where points crowd, each has too many others within reach.
     while tree.count_neighbors(tree, 2.0 * widest) > p.max_pairs:
         widest /= 2.0
+        if widest < p.detection.min_round_radii * radius:
+            return []
     pairs = _pairs_on_bores(points, normals, tree, 2.0 * widest, 2.0 * max_height, p.detection)
     # A generator of its own, so that later draws are the same whether there are bores or not.
     rng = np.random.default_rng(0)
@@ -129,10 +131,9 @@ class _Bore:
         """
         p, wall = parameters, self.wall
         offset = self.points - wall.center
-        behind = self.rings - p.backing_radii * radius * wall.normal(self.rings.reshape(-1, 3)).reshape(
-            self.rings.shape
-        )
-        solid = coarse.winding_number(behind.reshape(-1, 3)).reshape(behind.shape[:2]) > 0.5
+        places = self.rings.reshape(-1, 3)
+        behind = places - p.backing_radii * radius * wall.normal(places)
+        solid = (coarse.winding_number(behind) > 0.5).reshape(self.rings.shape[:2])
         middle = self.rings.mean(axis=1)
         free = tree.query(middle)[0] > p.free_share * wall.radius
         passes = free & (solid.mean(axis=1) > 0.5)
@@ -146,7 +147,7 @@ class _Bore:
             kept[gap] = ends and (last - first) * self.spacing < 2.0 * p.max_gap_diameters * wall.radius
         # Mouths are often rounded or bevelled.
         kept &= ndimage.binary_erosion(passes)
-        away = tree.query(self.rings.reshape(-1, 3))[0].reshape(solid.shape)
+        away = tree.query(places)[0].reshape(solid.shape)
         unseen: Float = self.rings[kept[:, None] & solid & (away > max(self.spacing, p.unseen_radii * radius))]
         return unseen
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.accuracy.bored_parts import PARTS, BoredPart
 from benchmarks.accuracy.problem import Case, Problem
 from benchmarks.accuracy.scans import PAPER_SCANS, AnalyticScan, RangeScan, SampleScan, ShapeFile, UnorientedScan
 from benchmarks.accuracy.stored_peers import StoredName
@@ -109,6 +110,11 @@ def _open() -> dict[str, Case]:
     }
 
 
+def _bores() -> dict[str, Case]:
+    scans = {"5000 points": (5000, 0.0005), "20000 points, noise 0.2%": (20_000, 0.002)}
+    return {f"{shape}, {title}": BoredPart(shape, *scan) for shape in PARTS for title, scan in scans.items()}
+
+
 def _groups() -> dict[str, dict[str, Case]]:
     srb: dict[str, Case] = {
         "anchor": RangeScan("anchor.ply", "anchor_gt.off", genus=4),
@@ -176,6 +182,7 @@ def _groups() -> dict[str, dict[str, Case]]:
         "vipss": {name: Within("vipss500", case, stored.get(name)) for name, case in vipss.items()},
         "organic": _organic(),
         "open": _open(),
+        "bores": _bores(),
         "analytic": clean | noisy | sparse,
         "clean": clean,
         "noisy": noisy,

@@ -16,6 +16,7 @@ from gnrecon.fit.parameters import (
 )
 from gnrecon.fit.shape_priors.prior_parameters import (
     BallFitParameters,
+    BoreParameters,
     HoleCompletionParameters,
     ResamplingParameters,
     ShapePriorParameters,
@@ -52,6 +53,8 @@ PARTS: Mapping[str, FitParameters] = {
     "sharp faces": _priors(ShapePriorParameters(sharp=SharpShapeParameters(max_points=0))),
     "snapping": _priors(ShapePriorParameters(snapping=SnappingParameters(min_snapped_share=2.0))),
     "resampling": _priors(ShapePriorParameters(resampling=ResamplingParameters(max_points=0))),
+    # A bore without a radius.
+    "bores": _priors(ShapePriorParameters(holes=HoleCompletionParameters(bores=BoreParameters(max_bore_radii=1e-9)))),
     "holes": _priors(ShapePriorParameters(holes=HoleCompletionParameters(min_points=_NEVER))),
 }
 """The parameters of a fit without each part, by the part's name."""
