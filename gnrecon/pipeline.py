@@ -7,9 +7,8 @@ runs them in order, times them, passes on what users should know, and returns a 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -133,10 +132,18 @@ class Reconstruction:
         """
         return show_page(page_text(self.report, self.mesh, self.cloud), height=height)
 
-    def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
+    def save(
+        self, path: str | Path, overwrite: bool = False, *, complete: Callable[[], None] = lambda: None
+    ) -> list[str]:
         """Write the mesh atomically, reading it back and verifying it first.
 
         Returns sentences about what the format cannot hold, such as attributes or digits.
+
+        Parameters
+        ----------
+        path : file to write; its extension names the format
+        overwrite : whether an existing file may be replaced
+        complete : called once the file is written and verified, before it gets its name
 
         Raises
         ------
@@ -147,7 +154,12 @@ class Reconstruction:
         """
         bordered = not self.report["mesh"]["closed"]  # only by trimming; the file is verified as the mesh was
         mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
-        return write_mesh(mesh, path, overwrite, verify=partial(verify_file, bordered=bordered))
+
+        def verify(temporary: Path) -> None:
+            verify_file(temporary, bordered=bordered)
+            complete()
+
+        return write_mesh(mesh, path, overwrite, verify)
 
     def to_trimesh(self) -> Any:
         """Return the mesh as a `trimesh.Trimesh`."""

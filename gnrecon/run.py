@@ -35,6 +35,7 @@ from gnrecon.report.html import page_text
 from gnrecon.report.time_left import TimeLeft
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, printable, require_files
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.logs import logged
 
 STAGES = {
@@ -173,7 +174,8 @@ def _write(files: Files, result: Reconstruction, *, thumbnail_pixels: tuple[int,
         if files.html is not None:
             page = stack.enter_context(atomic_write(files.html, files.overwrite))
             page.write_text(printable(page_text(result.report, result.mesh, result.cloud)), encoding="utf-8")
-        return result.save(files.output, files.overwrite)
+        # From here on, an interrupt would leave the mesh without its side files, or say that nothing was written.
+        return result.save(files.output, files.overwrite, complete=ignore_interrupts)
 
 
 def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, Any]) -> str:

@@ -28,6 +28,7 @@ from gnrecon.report.report import plain, versions
 from gnrecon.runtime.compute_limits import limited
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write, require_files
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.typed_values import most_threads, require_at_most
 from gnrecon.shape_learning import (
     OPTIMISERS,
@@ -189,6 +190,7 @@ def _write(output: Path, report: Path | None, mesh: Mesh, facts: dict[str, Any],
 
     def verified(path: Path) -> None:
         verify_file(path, bordered)
+        ignore_interrupts()
 
     with ExitStack() as stack:
         if report is not None:

@@ -19,6 +19,7 @@ from gnrecon.run import progress_bar, summarise
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.errors import ExitCode, InputError
 from gnrecon.runtime.files import require_files
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.solid import Shape, shaped
 from gnrecon.vertex_attributes import curvature_attributes, requested_names
 
@@ -94,3 +95,4 @@ def _with_attributes(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path)
 
 def _verify(path: Path) -> None:
     verify_file(path)
+    ignore_interrupts()

@@ -22,7 +22,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import fan_triangles, from_columns, no_faces
 from gnrecon.runtime.errors import InputError, UsageError
-from gnrecon.runtime.quiet_imports import import_open3d
+from gnrecon.runtime.quiet_imports import import_open3d, import_uninterrupted
 
 
 def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
@@ -259,11 +259,11 @@ def to_trimesh(shape: Mesh | PointCloud) -> Any:
 
     The normals of a cloud are its metadata ``vertex_normals``.
     """
-    import trimesh
+    trimesh = import_uninterrupted("trimesh")
 
     if isinstance(shape, PointCloud):
         metadata = None if shape.normals is None else {"vertex_normals": shape.normals.copy()}
-        return trimesh.PointCloud(shape.points.copy(), _colors(shape), metadata)  # type: ignore[no-untyped-call]
+        return trimesh.PointCloud(shape.points.copy(), _colors(shape), metadata)
     return trimesh.Trimesh(
         shape.vertices,
         shape.faces,

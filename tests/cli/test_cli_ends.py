@@ -189,3 +189,20 @@ def test_a_failure_after_a_signal_is_an_interruption(
 
     monkeypatch.setattr("gnrecon.run.reconstruct", failing)
     command.refuses(ExitCode.INTERRUPTED, "Interrupted; nothing was written.", scan, "-o", tmp_path / "mesh.ply")
+
+
+def test_a_signal_while_files_get_their_names_is_too_late(
+    command: CommandLine, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the mesh would lack its report, and a sentence would say that nothing was written."""
+
+    def rename(temporary: Path, target: Path, overwrite: bool) -> None:
+        assert not overwrite
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGHUP)
+        temporary.replace(target)
+
+    monkeypatch.setattr("gnrecon.runtime.files._rename", rename)
+    done = command(scan, "-o", tmp_path / "mesh.ply", "--report", tmp_path / "mesh.json", "-q", *FEW)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.json", "mesh.ply", "scan.ply"]
