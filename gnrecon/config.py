@@ -83,6 +83,8 @@ def read_settings(path: Path | None, words: Sequence[str], given: Mapping[str, A
         raise UsageError(f'{where}options for certain scans go into tables such as [scans."left/*.ply"].')
     folder = Path() if path is None else path.parent
     general = _checked(tree, where, folder)
+    for name in tables:
+        _require_pattern(name, where)
     for_scans = tuple((name, _checked(table, f"{where}{name}: ", folder)) for name, table in tables.items())
     chosen = _checked(dict(map(_split, words)), "--set: ", Path())
     if twice := [name for name in chosen if name in given]:
@@ -117,6 +119,13 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"The configuration {path} cannot be read: {error.strerror or error}.") from error
     except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, or a number of thousands of digits
         raise InputError(f"The configuration {path} is not TOML: {str(error).partition(';')[0]}.") from error
+
+
+def _require_pattern(pattern: str, where: str) -> None:
+    try:
+        PurePath("scan.ply").match(pattern)
+    except ValueError:
+        raise UsageError(f"{where}the table of scans {pattern!r} has no pattern that a path could match.") from None
 
 
 def _split(word: str) -> tuple[str, Any]:

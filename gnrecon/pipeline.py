@@ -51,14 +51,13 @@ from gnrecon.io import (
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
-from gnrecon.report.estimate import estimate, mesh_memory_mb
+from gnrecon.report.estimate import expected_within_memory
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
 from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark, thin_sheet_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
-from gnrecon.runtime.memory_budget import require_memory
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import AttributeSources, compute_attributes, requested_names, without_unsupported
 
@@ -135,15 +134,9 @@ class Reconstruction:
     def save(
         self, path: str | Path, overwrite: bool = False, *, complete: Callable[[], None] = lambda: None
     ) -> list[str]:
-        """Write the mesh atomically, reading it back and verifying it first.
+        """Write the mesh atomically, reading it back and verifying it first; then, before it gets its name, `complete`.
 
         Returns sentences about what the format cannot hold, such as attributes or digits.
-
-        Parameters
-        ----------
-        path : file to write; its extension names the format
-        overwrite : whether an existing file may be replaced
-        complete : called once the file is written and verified, before it gets its name
 
         Raises
         ------
@@ -155,8 +148,8 @@ class Reconstruction:
         bordered = not self.report["mesh"]["closed"]  # only by trimming; the file is verified as the mesh was
         mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
 
-        def verify(temporary: Path) -> None:
-            verify_file(temporary, bordered=bordered)
+        def verify(file: Path) -> None:
+            verify_file(file, bordered=bordered)
             complete()
 
         return write_mesh(mesh, path, overwrite, verify)
@@ -289,11 +282,9 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(points, bounds, sheet)
     run.options.require_reachable(bounds)
-    if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
-        require_memory(expected.memory_mb)
+    if (expected := expected_within_memory(scan.reading.points, len(samples), bounds, run.options)) is not None:
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     layers, cells, longest = ingested.layers, run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
-    require_memory(mesh_memory_mb(cells, bounds))
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
     warnings += coarse_parts_remark(points, longest / cells)
     warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)

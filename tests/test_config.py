@@ -64,6 +64,8 @@ def test_a_reference_lies_beside_the_configuration(tmp_path: Path) -> None:
         ("max-points = 1\nmax_points = 2", "max_points is there twice"),
         ("scans = 3", "go into tables such as"),
         ("[scans]\nseed = 3", "go into tables such as"),
+        ("[scans.'']\nseed = 3", "has no pattern that a path could match"),
+        ("[scans.'./']\nseed = 3", "has no pattern that a path could match"),
         ("[scans.'a*']\nsead = 3", r"a\*: there is no option 'sead'; perhaps you mean 'seed'"),
     ],
 )

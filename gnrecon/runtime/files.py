@@ -49,6 +49,9 @@ def atomic_write(
             sync(temporary)
             _rename(temporary, target, overwrite)
             sync(target.parent)
+    except OutputError as error:
+        # A block that itself writes atomically names its own target, which the user does not know.
+        raise OutputError(str(error).replace(str(temporary), str(path))) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
