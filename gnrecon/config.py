@@ -23,7 +23,7 @@ import tomli_w
 
 from gnrecon.option_table import option_rows
 from gnrecon.runtime.errors import InputError, UsageError, suggestion
-from gnrecon.runtime.files import printable
+from gnrecon.runtime.files import one_line, printable
 from gnrecon.runtime.typed_values import described, shown
 from gnrecon.version import __version__
 
@@ -101,7 +101,7 @@ def settings_text(values: Mapping[str, Any], scan: Path) -> str:
     scan : whose options these are
     """
     plain = {name: _plain(value) for name, value in values.items() if value is not None}
-    head = f"# All options in effect, for {_plain(scan.name)}, of gnrecon {__version__}.\n"
+    head = f"# All options in effect, for {one_line(scan.name)}, of gnrecon {__version__}.\n"
     return head + tomli_w.dumps(plain)
 
 

@@ -134,9 +134,7 @@ class Reconstruction:
     def save(
         self, path: str | Path, overwrite: bool = False, *, complete: Callable[[], None] = lambda: None
     ) -> list[str]:
-        """Write the mesh atomically, reading it back and verifying it first; then, before it gets its name, `complete`.
-
-        Returns sentences about what the format cannot hold, such as attributes or digits.
+        """Write the mesh, verify it, call `complete`, give it its name, and return sentences on what was not kept.
 
         Raises
         ------
@@ -145,13 +143,12 @@ class Reconstruction:
         OutputError
             When the file cannot be written.
         """
-        bordered = not self.report["mesh"]["closed"]  # only by trimming; the file is verified as the mesh was
-        mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
 
         def verify(file: Path) -> None:
-            verify_file(file, bordered=bordered)
+            verify_file(file, bordered=not self.report["mesh"]["closed"])  # the file is verified as the mesh was
             complete()
 
+        mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
         return write_mesh(mesh, path, overwrite, verify)
 
     def to_trimesh(self) -> Any:

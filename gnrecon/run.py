@@ -34,7 +34,7 @@ from gnrecon.rendering import render, render_sheet
 from gnrecon.report.html import page_text
 from gnrecon.report.time_left import TimeLeft
 from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.runtime.files import atomic_write, printable, require_files
+from gnrecon.runtime.files import atomic_write, one_line, printable, require_files
 from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.logs import logged
 
@@ -140,11 +140,14 @@ def run(
         warnings = _write(files, result)
     summary = summarise(files.output, result.report["mesh"], result.report["resources"])
     for sentence in [*warnings, summary]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
     if result.metrics is not None:
         print("\n".join(result.metrics.describe()))
     if result.interrupted:
-        print(f"gnrecon: Interrupted; {files.output} is the mesh of the best field so far.", file=console.file)
+        print(
+            f"gnrecon: Interrupted; {one_line(str(files.output))} is the mesh of the best field so far.",
+            file=console.file,
+        )
         return ExitCode.INTERRUPTED
     return ExitCode.OK
 
@@ -240,7 +243,7 @@ class ConsoleProgress(PipelineProgress):
 
     def remark(self, sentence: str) -> None:
         """Print a sentence above the bar."""
-        self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
 
 
 @contextmanager

@@ -28,6 +28,7 @@ from gnrecon.batch.progress_board import ProgressBoard
 from gnrecon.batch.request import Request
 from gnrecon.batch.summary import BatchSummary, write_summary
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
+from gnrecon.runtime.files import one_line
 from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.memory_budget import require_room_for_libraries
 
@@ -144,7 +145,8 @@ def _closing_lines(summary: BatchSummary) -> list[RenderableType]:
         table.add_column(heading, overflow="fold")
     for outcome in summary.outcomes:
         if outcome.failed:
-            table.add_row(outcome.scan, str(outcome.cause), f"{outcome.seconds:.1f}", outcome.message)
+            names = one_line(outcome.scan), one_line(outcome.message)
+            table.add_row(names[0], str(outcome.cause), f"{outcome.seconds:.1f}", names[1])
     return [table, f"{line}; failed: {causes}."]
 
 

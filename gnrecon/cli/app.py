@@ -32,6 +32,7 @@ from gnrecon.cli.reconstruct_command import reconstruct_command
 from gnrecon.cli.streams import lenient_streams
 from gnrecon.cli.supervision import continue_in_child
 from gnrecon.runtime.errors import ExitCode, failure
+from gnrecon.runtime.files import one_line
 from gnrecon.runtime.interrupts import ignore_interrupts, polite_ends, reraised
 from gnrecon.runtime.memory_budget import is_capped, require_room_for_libraries
 from gnrecon.version import __version__
@@ -144,5 +145,5 @@ def _fail(sentence: str, code: ExitCode, words: list[str]) -> int:
         import traceback
 
         traceback.print_exc()
-    print(f"gnrecon: {sentence}", file=sys.stderr)
+    print(f"gnrecon: {one_line(sentence)}", file=sys.stderr)
     return int(code)

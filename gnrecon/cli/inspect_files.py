@@ -27,7 +27,7 @@ from gnrecon.io import (
 )
 from gnrecon.io.formats.stl import origin_remark
 from gnrecon.runtime.errors import ExitCode, MeshError, UsageError
-from gnrecon.runtime.files import require_files, write_text
+from gnrecon.runtime.files import one_line, require_files, write_text
 from gnrecon.runtime.interrupts import ignore_interrupts
 
 
@@ -113,7 +113,7 @@ def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool 
     sentences = [f"{source} holds what is not read: {', '.join(unread)}."] if unread else []
     console = Console(stderr=True, quiet=quiet)
     for sentence in [*sentences, *_write(found, target, overwrite), _summary(found, target)]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
     return ExitCode.OK
 
 
