@@ -132,7 +132,7 @@ class Reconstruction:
         return show_page(page_text(self.report, self.mesh, self.cloud), height=height)
 
     def save(
-        self, path: str | Path, overwrite: bool = False, *, complete: Callable[[], None] = lambda: None
+        self, path: str | Path, overwrite: bool = False, *, complete: Callable[[], None] | None = None
     ) -> list[str]:
         """Write the mesh, verify it, call `complete`, give it its name, and return sentences on what was not kept.
 
@@ -146,7 +146,8 @@ class Reconstruction:
 
         def verify(file: Path) -> None:
             verify_file(file, bordered=not self.report["mesh"]["closed"])  # the file is verified as the mesh was
-            complete()
+            if complete is not None:
+                complete()
 
         mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
         return write_mesh(mesh, path, overwrite, verify)
