@@ -236,7 +236,7 @@ def _array(obj: Any, expected: str = "") -> Float:
     try:
         plain = obj.detach().cpu().numpy() if hasattr(obj, "detach") else obj  # a torch tensor, on any device
         if isinstance(plain, np.ma.MaskedArray):
-            plain = plain.astype(np.float64).filled(np.nan)
+            plain = np.ma.filled(plain.astype(np.float64), np.nan)
         if np.asarray(plain).dtype.kind != "c":
             return np.array(plain, dtype=np.float64)
         kind = "complex numbers"
