@@ -23,7 +23,7 @@ import tomli_w
 
 from gnrecon.option_table import option_rows
 from gnrecon.runtime.errors import InputError, UsageError, suggestion
-from gnrecon.runtime.files import printable
+from gnrecon.runtime.files import one_line, printable
 from gnrecon.runtime.typed_values import described, shown
 from gnrecon.version import __version__
 
@@ -83,6 +83,8 @@ def read_settings(path: Path | None, words: Sequence[str], given: Mapping[str, A
         raise UsageError(f'{where}options for certain scans go into tables such as [scans."left/*.ply"].')
     folder = Path() if path is None else path.parent
     general = _checked(tree, where, folder)
+    for name in tables:
+        _require_pattern(name, where)
     for_scans = tuple((name, _checked(table, f"{where}{name}: ", folder)) for name, table in tables.items())
     chosen = _checked(dict(map(_split, words)), "--set: ", Path())
     if twice := [name for name in chosen if name in given]:
@@ -99,7 +101,7 @@ def settings_text(values: Mapping[str, Any], scan: Path) -> str:
     scan : whose options these are
     """
     plain = {name: _plain(value) for name, value in values.items() if value is not None}
-    head = f"# All options in effect, for {_plain(scan.name)}, of gnrecon {__version__}.\n"
+    head = f"# All options in effect, for {one_line(scan.name)}, of gnrecon {__version__}.\n"
     return head + tomli_w.dumps(plain)
 
 
@@ -117,6 +119,13 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"The configuration {path} cannot be read: {error.strerror or error}.") from error
     except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, or a number of thousands of digits
         raise InputError(f"The configuration {path} is not TOML: {str(error).partition(';')[0]}.") from error
+
+
+def _require_pattern(pattern: str, where: str) -> None:
+    try:
+        PurePath("scan.ply").match(pattern)
+    except ValueError:
+        raise UsageError(f"{where}the table of scans {pattern!r} has no pattern that a path could match.") from None
 
 
 def _split(word: str) -> tuple[str, Any]:

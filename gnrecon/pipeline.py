@@ -7,9 +7,8 @@ runs them in order, times them, passes on what users should know, and returns a 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,14 +51,13 @@ from gnrecon.io import (
 )
 from gnrecon.optim import Record
 from gnrecon.options import Options
-from gnrecon.report.estimate import estimate, mesh_memory_mb
+from gnrecon.report.estimate import expected_within_memory
 from gnrecon.report.html import page_text, result_html, show_page
 from gnrecon.report.report import Stages
 from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan, ScanRead, run_report
 from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark, thin_sheet_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
-from gnrecon.runtime.memory_budget import require_memory
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import AttributeSources, compute_attributes, requested_names, without_unsupported
 
@@ -133,10 +131,10 @@ class Reconstruction:
         """
         return show_page(page_text(self.report, self.mesh, self.cloud), height=height)
 
-    def save(self, path: str | Path, overwrite: bool = False) -> list[str]:
-        """Write the mesh atomically, reading it back and verifying it first.
-
-        Returns sentences about what the format cannot hold, such as attributes or digits.
+    def save(
+        self, path: str | Path, overwrite: bool = False, *, complete: Callable[[], None] | None = None
+    ) -> list[str]:
+        """Write the mesh, verify it, call `complete`, give it its name, and return sentences on what was not kept.
 
         Raises
         ------
@@ -145,9 +143,14 @@ class Reconstruction:
         OutputError
             When the file cannot be written.
         """
-        bordered = not self.report["mesh"]["closed"]  # only by trimming; the file is verified as the mesh was
+
+        def verify(file: Path) -> None:
+            verify_file(file, bordered=not self.report["mesh"]["closed"])  # the file is verified as the mesh was
+            if complete is not None:
+                complete()
+
         mesh = without_unsupported(self.mesh, Path(path), self.report["options"]["attributes"])
-        return write_mesh(mesh, path, overwrite, verify=partial(verify_file, bordered=bordered))
+        return write_mesh(mesh, path, overwrite, verify)
 
     def to_trimesh(self) -> Any:
         """Return the mesh as a `trimesh.Trimesh`."""
@@ -277,11 +280,9 @@ def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(points, bounds, sheet)
     run.options.require_reachable(bounds)
-    if (expected := estimate(scan.reading.points, len(samples), bounds, run.options)) is not None:
-        require_memory(expected.memory_mb)
+    if (expected := expected_within_memory(scan.reading.points, len(samples), bounds, run.options)) is not None:
         run.progress.expect(expected.fit_seconds, expected.mesh_seconds)
     layers, cells, longest = ingested.layers, run.options.mesh().cells(bounds), float(np.ptp(bounds, axis=0).max())
-    require_memory(mesh_memory_mb(cells, bounds))
     warnings = few_points_remark(points) + ([] if layers is None else [layers.describe()])
     warnings += coarse_parts_remark(points, longest / cells)
     warnings += thin_sheet_remark(sheet, layers.offset if layers and samples.estimated else None, cells, longest)

@@ -34,7 +34,8 @@ from gnrecon.rendering import render, render_sheet
 from gnrecon.report.html import page_text
 from gnrecon.report.time_left import TimeLeft
 from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.runtime.files import atomic_write, printable, require_files
+from gnrecon.runtime.files import atomic_write, one_line, printable, require_files
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.logs import logged
 
 STAGES = {
@@ -139,11 +140,14 @@ def run(
         warnings = _write(files, result)
     summary = summarise(files.output, result.report["mesh"], result.report["resources"])
     for sentence in [*warnings, summary]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
     if result.metrics is not None:
         print("\n".join(result.metrics.describe()))
     if result.interrupted:
-        print(f"gnrecon: Interrupted; {files.output} is the mesh of the best field so far.", file=console.file)
+        print(
+            f"gnrecon: Interrupted; {one_line(str(files.output))} is the mesh of the best field so far.",
+            file=console.file,
+        )
         return ExitCode.INTERRUPTED
     return ExitCode.OK
 
@@ -173,7 +177,8 @@ def _write(files: Files, result: Reconstruction, *, thumbnail_pixels: tuple[int,
         if files.html is not None:
             page = stack.enter_context(atomic_write(files.html, files.overwrite))
             page.write_text(printable(page_text(result.report, result.mesh, result.cloud)), encoding="utf-8")
-        return result.save(files.output, files.overwrite)
+        # From here on, an interrupt would leave the mesh without its side files, or say that nothing was written.
+        return result.save(files.output, files.overwrite, complete=ignore_interrupts)
 
 
 def summarise(output: Path, facts: Mapping[str, Any], resources: Mapping[str, Any]) -> str:
@@ -238,7 +243,7 @@ class ConsoleProgress(PipelineProgress):
 
     def remark(self, sentence: str) -> None:
         """Print a sentence above the bar."""
-        self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
 
 
 @contextmanager

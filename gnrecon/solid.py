@@ -125,14 +125,15 @@ def shaped(
         return result if shape.crop is None else crop(result, shape.crop), remarks
 
 
-def _require_in_proportion(shape: Shape, limits: Float, *, most_sizes: float = 100.0, least_size: float = 1e-6) -> None:
+def _require_in_proportion(shape: Shape, limits: Float, *, most_sizes: float = 10.0, least_size: float = 1e-6) -> None:
     """Refuse lengths that have nothing to do with the model, before the work.
 
     Parameters
     ----------
     shape : whose lengths are checked
     limits : box of the model, of shape (2, 3)
-    most_sizes : of the box's longest side, for offsets: the model is a point within a ball then
+    most_sizes : of the box's longest side, for offsets: the model is a point within a ball then, and meshing that takes
+        minutes
     least_size : of the same, for the sides of a crop: the field is stored with single precision
     """
     size = float(np.ptp(limits, axis=0).max())

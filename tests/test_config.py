@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,8 @@ def test_a_reference_lies_beside_the_configuration(tmp_path: Path) -> None:
         ("max-points = 1\nmax_points = 2", "max_points is there twice"),
         ("scans = 3", "go into tables such as"),
         ("[scans]\nseed = 3", "go into tables such as"),
+        ("[scans.'']\nseed = 3", "has no pattern that a path could match"),
+        ("[scans.'./']\nseed = 3", "has no pattern that a path could match"),
         ("[scans.'a*']\nsead = 3", r"a\*: there is no option 'sead'; perhaps you mean 'seed'"),
     ],
 )
@@ -144,3 +147,8 @@ def test_an_edge_length_in_effect_reads_back_without_a_resolution(tmp_path: Path
     options = Options(edge_length=0.5)
     values = read_settings(config(tmp_path, settings_text(options.as_dict(), Path("a"))), [], {}).of(Path("a"))
     assert Options(**values) == options
+
+
+def test_no_name_of_a_scan_becomes_an_option() -> None:
+    text = settings_text({"seed": 1}, Path("a\nsteps = 5 #\x1b[31m\udcff.xyz"))
+    assert tomllib.loads(text) == {"seed": 1}

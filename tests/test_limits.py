@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 from typing import Any
 
@@ -95,3 +97,7 @@ def test_names_are_no_formulas_and_need_not_be_text() -> None:
     lines = summary_csv([JobOutcome("=1+1", "-scan.ply", Status.FAILED)]).splitlines()
     assert lines[1].startswith("'=1+1,'-scan.ply,")
     assert printable("a\udcff.ply") == "a\\udcff.ply"
+    odd = ["\rb\r.ply", 'c\r\n",d.ply']
+    table = summary_csv([JobOutcome("a", name, Status.FAILED) for name in odd])
+    rows = list(csv.DictReader(io.StringIO(table, newline="")))
+    assert [row["scan"] for row in rows] == [f"'{odd[0]}", odd[1]]

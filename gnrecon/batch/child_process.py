@@ -94,6 +94,7 @@ class ForkServerClient:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._folder: Path | None = None
+        self._ready = False
 
     def start_child(self, argument: Mapping[str, Any], log: Path, environment: Mapping[str, str]) -> ForkedChild:
         """Start a child that does the work with an argument.
@@ -133,24 +134,31 @@ class ForkServerClient:
         return self._folder / "socket"
 
     def _start(self) -> None:
-        self._folder = Path(tempfile.mkdtemp(prefix="gnrecon-"))
+        self._folder, self._ready = Path(tempfile.mkdtemp(prefix="gnrecon-")), False
         command = [sys.executable, "-m", "gnrecon.batch.fork_server", str(self._address), self._work]
-        with (self._folder / "errors").open("w", encoding="utf-8") as errors:
-            self._process = subprocess.Popen(
+        with (self._folder / "errors").open("w+", encoding="utf-8") as errors:
+            # A session of its own: signals to the group of this process, as of a terminal that is closed, are this
+            # process's to handle.
+            process = subprocess.Popen(
                 command,
                 env=self._environment(),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
+                start_new_session=True,
             )
-        assert self._process.stdout is not None
-        if self._process.stdout.readline() != "ready\n":
-            lines = (self._folder / "errors").read_text(encoding="utf-8").strip().splitlines()
-            self.close()
-            raise ForkServerError(
-                f"No process could be started for the scans: {lines[-1] if lines else 'it ended at once'}."
-            )
+            self._process = process
+            assert process.stdout is not None
+            self._ready = process.stdout.readline() == "ready\n"
+            if not self._ready:
+                errors.seek(0)
+                lines = errors.read().strip().splitlines()
+                self.close()
+                process.stdout.close()
+                raise ForkServerError(
+                    f"No process could be started for the scans: {lines[-1] if lines else 'it ended at once'}."
+                )
 
     def _environment(self) -> dict[str, str]:
         # The server must run this very copy of gnrecon, and find the work module where this process would.
@@ -160,22 +168,26 @@ class ForkServerClient:
         return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **threads, "PYTHONPATH": os.pathsep.join(path)}
 
     def close(self, *, exit_seconds: float = 10.0) -> None:
-        """End the fork server and all of its children; it is killed where it has not ended after `exit_seconds`."""
-        if self._process is not None:
-            assert self._process.stdin is not None
-            assert self._process.stdout is not None
+        """End the fork server and all of its children; it is killed where it has not ended after `exit_seconds`.
+
+        Another thread may be starting one, and close it itself when that fails; one that is not ready is killed.
+        """
+        process, self._process = self._process, None
+        if process is not None:
+            assert process.stdin is not None
+            assert process.stdout is not None
             with contextlib.suppress(OSError):
-                self._process.stdin.close()
+                process.stdin.close()
             try:
-                self._process.wait(exit_seconds)
+                process.wait(exit_seconds if self._ready else 0.0)
             except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-            self._process.stdout.close()
-            self._process = None
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._folder = None
+                process.kill()
+                process.wait()
+            if self._ready:  # else the other thread still reads from it
+                process.stdout.close()
+        folder, self._folder = self._folder, None
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 _servers: dict[tuple[int, str], ForkServerClient] = {}

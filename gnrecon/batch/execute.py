@@ -268,7 +268,7 @@ def run_child(
 ) -> ChildEnd:
     """Run work in a child process, within limits of time and memory, and wait for its end.
 
-    Where the fork server was killed from outside, it is started again, and so is the work.
+    Where the fork server was killed from outside, it is started again, and so is the work, unless it should end.
 
     Parameters
     ----------
@@ -283,12 +283,15 @@ def run_child(
     Raises
     ------
     ForkServerError
-        When no child can be started, or the fork server has ended twice.
+        When no child can be started, the fork server has ended twice, or it has ended and so should the work.
     """
-    run = partial(_run_child_once, argument, threads, log, environment, limits, stop or threading.Event(), work)
+    stop = stop or threading.Event()
+    run = partial(_run_child_once, argument, threads, log, environment, limits, stop, work)
     try:
         return run()
     except ForkServerError:
+        if stop.is_set():
+            raise
         return run()
 
 

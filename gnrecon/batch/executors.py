@@ -27,6 +27,7 @@ from gnrecon.options import Options
 from gnrecon.report.estimate import estimate
 from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.memory_budget import available_memory_mb
 
 
@@ -50,14 +51,14 @@ def run_locally(jobs: Sequence[Job], count: int, devices: Sequence[str], done: C
 
     try:
         with ThreadPoolExecutor(count, thread_name_prefix="gnrecon-job") as pool:
-            futures = [pool.submit(run, job) for job in jobs]
             try:
-                for future in as_completed(futures):
+                for future in as_completed([pool.submit(run, job) for job in jobs]):
                     done(future.result())
-            except BaseException:
+            except BaseException as error:
+                if isinstance(error, KeyboardInterrupt):
+                    ignore_interrupts()  # a second one would leave processes, and the batch without its summary
                 stop.set()
-                for future in futures:
-                    future.cancel()
+                pool.shutdown(wait=False, cancel_futures=True)
                 raise
     finally:
         close_fork_servers()

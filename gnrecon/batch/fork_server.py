@@ -159,7 +159,8 @@ def detach_child(log: str, environment: Mapping[str, str], parent: int) -> None:
     # A session of its own, so that the whole process group can be killed.
     os.setsid()
     die_with_parent(parent)
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _redirect(os.open(os.devnull, os.O_RDONLY), 0)
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
@@ -180,11 +181,12 @@ def _redirect(descriptor: int, target: int) -> None:
 def main(arguments: list[str]) -> NoReturn:
     """Listen on the socket given by the first argument, for work of the module given by the second."""
     path, work = arguments
+    # The batch handles interrupts; this process ends with its standard input.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     module = import_module(work)
     if hasattr(module, "prepare"):
         module.prepare()
-    # The batch handles an interrupt from the terminal.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(path)
         listener.listen(64)

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from gnrecon.batch.job import JobOutcome, Status, progress_file, running_folder
 from gnrecon.run import STAGES
+from gnrecon.runtime.files import one_line
 
 
 class ProgressBoard:
@@ -41,7 +42,9 @@ class ProgressBoard:
         if not self._console.is_terminal:
             result = outcome.message if outcome.failed else f"{outcome.files['mesh']} ({outcome.status})"
             line = f"[{len(self._outcomes)}/{self._total}] {outcome.scan}: {outcome.cause or ''}"
-            self._console.print(f"{line.rstrip(': ')}: {result}", highlight=False, markup=False, soft_wrap=True)
+            self._console.print(
+                one_line(f"{line.rstrip(': ')}: {result}"), highlight=False, markup=False, soft_wrap=True
+            )
 
     @contextmanager
     def shown(self) -> Iterator[None]:
@@ -75,7 +78,9 @@ class ProgressBoard:
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
         for name, stage, share, seconds in _running_scans(self._output):
             title = STAGES.get(stage, "Starting")
-            table.add_row(name, title, ProgressBar(total=1.0, completed=share, width=24), _clock(seconds))
+            table.add_row(
+                Text(one_line(name)), title, ProgressBar(total=1.0, completed=share, width=24), _clock(seconds)
+            )
         return table
 
     def _finished(self) -> Table:
@@ -83,7 +88,11 @@ class ProgressBoard:
         for outcome in self._outcomes[-self._finished_rows :]:
             result = outcome.message if outcome.failed else outcome.files["mesh"]
             status = Text(str(outcome.cause or outcome.status), style=_style(outcome.status))
-            table.add_row(outcome.name, status, Text(result, overflow="ellipsis", no_wrap=True, style="dim"))
+            table.add_row(
+                Text(one_line(outcome.name)),
+                status,
+                Text(one_line(result), overflow="ellipsis", no_wrap=True, style="dim"),
+            )
         return table
 
 

@@ -28,6 +28,8 @@ from gnrecon.batch.progress_board import ProgressBoard
 from gnrecon.batch.request import Request
 from gnrecon.batch.summary import BatchSummary, write_summary
 from gnrecon.runtime.errors import ExitCode, OutputError, UsageError
+from gnrecon.runtime.files import one_line
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.memory_budget import require_room_for_libraries
 
 
@@ -81,6 +83,7 @@ def run_batch(request: Request, *, least_addresses_mb: float = 2000.0) -> int:
                     run_locally(jobs, count, devices, done)
         except KeyboardInterrupt:  # the summary still lists what was finished
             interrupted = True
+        ignore_interrupts()  # a second one, or one that comes only now, does not cost the summary
         ordered = tuple(outcomes[job.name] for job in jobs if job.name in outcomes)
         summary = BatchSummary(ordered, len(jobs), count, threads, time.monotonic() - start, request.command)
         reserve.unlink(missing_ok=True)
@@ -142,7 +145,8 @@ def _closing_lines(summary: BatchSummary) -> list[RenderableType]:
         table.add_column(heading, overflow="fold")
     for outcome in summary.outcomes:
         if outcome.failed:
-            table.add_row(outcome.scan, str(outcome.cause), f"{outcome.seconds:.1f}", outcome.message)
+            names = one_line(outcome.scan), one_line(outcome.message)
+            table.add_row(names[0], str(outcome.cause), f"{outcome.seconds:.1f}", names[1])
     return [table, f"{line}; failed: {causes}."]
 
 

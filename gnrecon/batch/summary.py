@@ -114,11 +114,16 @@ def summary_csv(outcomes: Sequence[JobOutcome]) -> str:
     columns = ["name", "scan", "status", "cause", "message", "exit_code", "attempts", "seconds", "peak_memory_mb"]
     columns += ["points", *MESH_FIGURES, *dict.fromkeys(metrics), *FILE_ENDINGS]
     text = io.StringIO(newline="")
-    table = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
+    table, quoted = (
+        csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n", quoting=quoting)
+        for quoting in (csv.QUOTE_MINIMAL, csv.QUOTE_ALL)
+    )
     table.writeheader()
     for outcome in outcomes:
         row = {**outcome.as_dict(), **outcome.figures, **_numeric(outcome.metrics)}
-        table.writerow({name: _not_a_formula(value) for name, value in row.items()})
+        # A carriage return ends a line for programs that read the table, and Python does not quote it by itself.
+        writer = quoted if any("\r" in str(value) for value in row.values()) else table
+        writer.writerow({name: _not_a_formula(value) for name, value in row.items()})
     return text.getvalue()
 
 

@@ -32,7 +32,8 @@ from gnrecon.cli.reconstruct_command import reconstruct_command
 from gnrecon.cli.streams import lenient_streams
 from gnrecon.cli.supervision import continue_in_child
 from gnrecon.runtime.errors import ExitCode, failure
-from gnrecon.runtime.interrupts import polite_ends, reraised
+from gnrecon.runtime.files import one_line
+from gnrecon.runtime.interrupts import ignore_interrupts, polite_ends, reraised
 from gnrecon.runtime.memory_budget import is_capped, require_room_for_libraries
 from gnrecon.version import __version__
 
@@ -72,10 +73,16 @@ def command_line_app() -> typer.Typer:
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
-    with lenient_streams() as streams, polite_ends():
+    with lenient_streams() as streams, polite_ends(process_ends=arguments is None):
         if is_capped():
             continue_in_child()
-        code = streams.exit_code(_run(list(sys.argv[1:] if arguments is None else arguments)))
+        words = list(sys.argv[1:] if arguments is None else arguments)
+        try:
+            code = _run(words)
+        except KeyboardInterrupt:  # before the first step of a command, or after its last
+            code = _fail(*failure(KeyboardInterrupt()), words)
+        ignore_interrupts()
+        code = streams.exit_code(code)
     sys.exit(code)
 
 
@@ -138,5 +145,5 @@ def _fail(sentence: str, code: ExitCode, words: list[str]) -> int:
         import traceback
 
         traceback.print_exc()
-    print(f"gnrecon: {sentence}", file=sys.stderr)
+    print(f"gnrecon: {one_line(sentence)}", file=sys.stderr)
     return int(code)

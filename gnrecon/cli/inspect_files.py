@@ -27,7 +27,8 @@ from gnrecon.io import (
 )
 from gnrecon.io.formats.stl import origin_remark
 from gnrecon.runtime.errors import ExitCode, MeshError, UsageError
-from gnrecon.runtime.files import require_files, write_text
+from gnrecon.runtime.files import one_line, require_files, write_text
+from gnrecon.runtime.interrupts import ignore_interrupts
 
 
 def check(path: Path, *, as_json: bool = False) -> int:
@@ -83,6 +84,7 @@ def evaluate(
     metrics = measure(read_mesh(path), read_reference(reference), samples=samples, seed=seed)
     if report is not None:
         figures = {"mesh": str(path), "reference": str(reference), "seed": seed, **metrics.as_dict()}
+        ignore_interrupts()
         write_text(report, json.dumps(figures, indent=2) + "\n", overwrite)
     print("\n".join(metrics.describe()))
     return ExitCode.OK
@@ -111,7 +113,7 @@ def convert(source: Path, target: Path, *, overwrite: bool = False, quiet: bool 
     sentences = [f"{source} holds what is not read: {', '.join(unread)}."] if unread else []
     console = Console(stderr=True, quiet=quiet)
     for sentence in [*sentences, *_write(found, target, overwrite), _summary(found, target)]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
     return ExitCode.OK
 
 
@@ -121,6 +123,7 @@ def _write(found: Mesh | PointCloud, target: Path, overwrite: bool) -> list[str]
 
     def compare(path: Path) -> None:
         lost.extend(round_trip_losses(found, read_any(path)[0]))
+        ignore_interrupts()
 
     if isinstance(found, Mesh) and target.suffix.lower() in writable():
         unheld = [name for name, values in found.attributes.items() if not supports_attribute(target, name, values)]

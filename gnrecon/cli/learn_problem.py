@@ -27,7 +27,8 @@ from gnrecon.io import all_input_files, check_writable, write_mesh
 from gnrecon.report.report import plain, versions
 from gnrecon.runtime.compute_limits import limited
 from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.runtime.files import atomic_write, require_files
+from gnrecon.runtime.files import atomic_write, one_line, require_files
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.typed_values import most_threads, require_at_most
 from gnrecon.shape_learning import (
     OPTIMISERS,
@@ -168,7 +169,7 @@ def measurement_text(found: Measurement) -> str:
 
 
 def _say(console: Console, sentence: str) -> None:
-    console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
 
 
 def _mesh(learned: Learned, problem: ShapeProblem, options: LearnOptions) -> tuple[Mesh, list[str]]:
@@ -189,6 +190,7 @@ def _write(output: Path, report: Path | None, mesh: Mesh, facts: dict[str, Any],
 
     def verified(path: Path) -> None:
         verify_file(path, bordered)
+        ignore_interrupts()
 
     with ExitStack() as stack:
         if report is not None:

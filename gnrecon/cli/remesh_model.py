@@ -18,7 +18,8 @@ from gnrecon.report.report import Stages
 from gnrecon.run import progress_bar, summarise
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.errors import ExitCode, InputError
-from gnrecon.runtime.files import require_files
+from gnrecon.runtime.files import one_line, require_files
+from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.solid import Shape, shaped
 from gnrecon.vertex_attributes import curvature_attributes, requested_names
 
@@ -62,7 +63,7 @@ def remesh_model(
         losses = write_mesh(mesh, output, overwrite, verify=_verify)
     summary = summarise(output, facts.as_dict(), stages.resources())
     for sentence in [*remarks, *losses, summary]:
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        console.print(one_line(sentence), highlight=False, markup=False, soft_wrap=True)
     return ExitCode.OK
 
 
@@ -94,3 +95,4 @@ def _with_attributes(mesh: Mesh, sdf: NeuralSDF, options: Options, output: Path)
 
 def _verify(path: Path) -> None:
     verify_file(path)
+    ignore_interrupts()

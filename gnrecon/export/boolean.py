@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.quiet_imports import import_uninterrupted
 
 
 def crop(mesh: Mesh, box: Float, *, snap_sizes: float = 1e-9) -> Mesh:
@@ -41,7 +42,7 @@ def crop(mesh: Mesh, box: Float, *, snap_sizes: float = 1e-9) -> Mesh:
     low, high = np.asarray(box, dtype=np.float64)
     if (mesh.vertices >= low).all() and (mesh.vertices <= high).all():
         return mesh
-    import manifold3d
+    manifold3d = import_uninterrupted("manifold3d")
 
     centre, size = centre_and_size(mesh)
     corner, sides = (low - centre) / size, (high - low) / size
@@ -127,7 +128,7 @@ def to_solid(mesh: Mesh, *, merge: bool) -> Any:
     Coordinates are centred and scaled to one, because manifold3d's tolerances are relative to the largest coordinate.
     With `merge`, open edges whose ends coincide are joined.
     """
-    import manifold3d
+    manifold3d = import_uninterrupted("manifold3d")
 
     centre, size = centre_and_size(mesh)
     data = manifold3d.Mesh64((mesh.vertices - centre) / size, mesh.faces.astype(np.uint64))
@@ -145,7 +146,7 @@ def from_solid(solid: Any, like: Mesh) -> Mesh:
 
 def manifold_error(solid: Any) -> str | None:
     """Name of manifold3d's error, or None where it accepts the solid."""
-    import manifold3d
+    manifold3d = import_uninterrupted("manifold3d")
 
     status = solid.status()
     return None if status == manifold3d.Error.NoError else str(status.name)

@@ -22,7 +22,7 @@ from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.io.contents import fan_triangles, from_columns, no_faces
 from gnrecon.runtime.errors import InputError, UsageError
-from gnrecon.runtime.quiet_imports import import_open3d
+from gnrecon.runtime.quiet_imports import import_open3d, import_uninterrupted
 
 
 def as_cloud(obj: Any, normals: npt.ArrayLike | None = None) -> PointCloud:
@@ -233,12 +233,18 @@ def _array(obj: Any, expected: str = "") -> Float:
     """An array of float64; `expected` is what the message on anything else asks for, by default points."""
     points = "points as an array of shape (N, 3) or (N, 6), named columns with x, y and z, a file's path"
     expected = expected or f"{points}, or a cloud of open3d, trimesh, pymeshlab, pyvista or meshio"
-    if hasattr(obj, "detach"):  # a torch tensor, on any device
-        obj = obj.detach().cpu().numpy()
     try:
-        return np.array(obj, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"Expected {expected}, but got {type(obj).__name__}.") from None
+        plain = obj.detach().cpu().numpy() if hasattr(obj, "detach") else obj  # a torch tensor, on any device
+        if isinstance(plain, np.ma.MaskedArray):
+            plain = np.ma.filled(plain.astype(np.float64), np.nan)
+        if np.asarray(plain).dtype.kind != "c":
+            return np.array(plain, dtype=np.float64)
+        kind = "complex numbers"
+    except MemoryError:
+        raise
+    except Exception:  # what an object raises that cannot become an array is its own choice
+        kind = type(obj).__name__
+    raise InputError(f"Expected {expected}, but got {kind}.")
 
 
 def _from_array(rows: Float) -> PointCloud:
@@ -259,11 +265,11 @@ def to_trimesh(shape: Mesh | PointCloud) -> Any:
 
     The normals of a cloud are its metadata ``vertex_normals``.
     """
-    import trimesh
+    trimesh = import_uninterrupted("trimesh")
 
     if isinstance(shape, PointCloud):
         metadata = None if shape.normals is None else {"vertex_normals": shape.normals.copy()}
-        return trimesh.PointCloud(shape.points.copy(), _colors(shape), metadata)  # type: ignore[no-untyped-call]
+        return trimesh.PointCloud(shape.points.copy(), _colors(shape), metadata)
     return trimesh.Trimesh(
         shape.vertices,
         shape.faces,

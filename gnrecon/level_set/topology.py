@@ -25,6 +25,7 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import Box
 from gnrecon.level_set.level_set import LevelSet
 from gnrecon.level_set.level_set_parameters import LevelSetParameters
+from gnrecon.runtime.quiet_imports import import_uninterrupted
 
 
 @dataclass(frozen=True)
@@ -232,7 +233,7 @@ class SeparateComponents(NamedTuple):
 
 def separate_components(values: Float) -> SeparateComponents:
     """Find the components of {f < 0} on a grid, of shape (I, J, K), infinite outside of the region."""
-    import gudhi
+    gudhi = import_uninterrupted("gudhi")
     from scipy.ndimage import label
 
     if label(values < 0)[1] == 1:

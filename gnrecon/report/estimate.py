@@ -23,6 +23,7 @@ import numpy as np
 from gnrecon.geometry.arrays import Float
 from gnrecon.options import Options
 from gnrecon.report.report_parameters import CostModel
+from gnrecon.runtime.memory_budget import require_memory
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,31 @@ def mesh_memory_mb(cells: float, bounds: Float, *, model: CostModel = CostModel(
     # The faces of the flattest of those boxes had half the area of a cube's.
     filled = min(1.0, 2.0 * float(x * y + y * z + z * x) / 3.0)
     return model.mesh_memory_mb + model.mesh_cells_memory_mb * filled * (cells / model.mesh_memory_cells) ** 2
+
+
+def network_memory_mb(widths: tuple[int, ...], *, model: CostModel = CostModel()) -> float:
+    """Return the peak of resident memory of the fit of one network, in MB of 10^6 bytes, without its Jacobians.
+
+    Its start solves the equations of the last layer, whose dense matrices grow with the square of that layer's width.
+    """
+    return model.fit_memory_mb + model.last_layer_matrices * 8 * (widths[-1] + 1) ** 2 / 1e6
+
+
+def expected_within_memory(read: int, points: int, bounds: Float, options: Options) -> Estimate | None:
+    """Return what `estimate` does, and refuse what needs more memory than is left.
+
+    Raises
+    ------
+    MemoryLimitError
+        When the run, its mesh, or its single network needs more.
+    """
+    expected, fit = estimate(read, points, bounds, options), options.fit()
+    if expected is not None:
+        require_memory(expected.memory_mb)
+    require_memory(mesh_memory_mb(options.mesh().cells(bounds), bounds))
+    if not fit.adaptive and options.device.startswith("cpu"):
+        require_memory(network_memory_mb(fit.widths_for(points)))
+    return expected
 
 
 def _rounded(seconds: float) -> str:

@@ -27,6 +27,7 @@ class CostModel:
     mesh_memory_mb: float = 505.0  # measured: mesh of few cells
     mesh_cells_memory_mb: float = 886.0  # measured: what a mesh of `mesh_memory_cells` takes more
     mesh_memory_cells: int = 512  # the resolution of that measurement
+    last_layer_matrices: int = 4  # equations of the data and of the volume, their sum, and its factor
     read_point_bytes: float = 600.0  # measured: each point that is read
 
 

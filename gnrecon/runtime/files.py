@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import secrets
 import stat
+import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -49,6 +50,9 @@ def atomic_write(
             sync(temporary)
             _rename(temporary, target, overwrite)
             sync(target.parent)
+    except OutputError as error:
+        # A block that itself writes atomically names its own target, which the user does not know.
+        raise OutputError(str(error).replace(str(temporary), str(path))) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -70,6 +74,14 @@ def _output_errors(path: str | Path) -> Iterator[None]:
 def printable(text: str) -> str:
     r"""Return a text that UTF-8 can hold: bytes of file names that are no UTF-8 are written as ``\udcff``."""
     return text.encode("utf-8", errors="backslashreplace").decode("utf-8")
+
+
+def one_line(text: str) -> str:
+    r"""Return a text for a terminal or a line of a file: control characters of file names are written as ``\x1b``."""
+    return "".join(
+        sign.encode("unicode_escape").decode("ascii") if unicodedata.category(sign) in ("Cc", "Cs") else sign
+        for sign in text
+    )
 
 
 def write_text(path: str | Path, text: str, overwrite: bool = False) -> None:

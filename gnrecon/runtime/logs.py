@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gnrecon.runtime.errors import OutputError, UsageError
-from gnrecon.runtime.files import same_file
+from gnrecon.runtime.files import one_line, same_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,7 +36,7 @@ class _ConsoleHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""
-        self._console.print(record.getMessage(), style="dim", highlight=False, markup=False, soft_wrap=True)
+        self._console.print(one_line(record.getMessage()), style="dim", highlight=False, markup=False, soft_wrap=True)
 
 
 class _FileHandler(logging.FileHandler):
@@ -55,6 +55,14 @@ class _FileHandler(logging.FileHandler):
         """Close the file; what it does not take has been announced."""
         with suppress(OSError):
             super().close()
+
+
+class _OneLineFormatter(logging.Formatter):
+    """Writes a message in one line, whatever the names in it hold; tracebacks follow in lines of their own."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        """Return the line."""
+        return one_line(super().formatMessage(record))
 
 
 @contextmanager
@@ -115,7 +123,7 @@ def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
     except OSError as error:
         raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error
     handler.setLevel(logging.DEBUG)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(_OneLineFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler
 
 

@@ -14,7 +14,10 @@ from pathlib import Path
 from gnrecon.runtime.errors import MemoryLimitError
 from gnrecon.runtime.memory import status_bytes
 
-ADVICE = "use fewer points (--max-points), a coarser mesh (--resolution) or --quality draft, or raise the limit."
+ADVICE = (
+    "use fewer points (--max-points), a coarser mesh (--resolution), smaller --widths or --quality draft, or raise the "
+    "limit."
+)
 
 
 @dataclass(frozen=True)

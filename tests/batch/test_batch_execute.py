@@ -231,8 +231,38 @@ def test_temporary_files_of_libraries_are_deleted(tmp_path: Path) -> None:
 
 def test_a_fork_server_that_was_killed_is_started_again(tmp_path: Path) -> None:
     done(job(tmp_path, "first", "good"))
-    (server,) = [p for p in psutil.Process().children() if "gnrecon.batch.fork_server" in p.cmdline()]
-    threading.Timer(0.5, lambda: os.kill(server.pid, signal.SIGKILL)).start()
+    server = fork_server()
+    threading.Timer(0.5, lambda: os.kill(server, signal.SIGKILL)).start()
     assert done(job(tmp_path, "second", "good 1.5")).status == Status.MADE
     assert notes(tmp_path / "scans", "began") == ["first", "second", "second"]
     assert notes(tmp_path / "scans", "ended") == ["first", "second"]
+
+
+def fork_server() -> int:
+    (server,) = [p.pid for p in psutil.Process().children() if "gnrecon.batch.fork_server" in p.cmdline()]
+    return server
+
+
+def test_signals_of_a_closed_terminal_or_a_service_manager_leave_the_fork_server(tmp_path: Path) -> None:
+    done(job(tmp_path, "first", "good"))
+    server = fork_server()
+    assert os.getsid(server) == server
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        os.kill(server, number)
+    assert done(job(tmp_path, "second", "good")).status == Status.MADE
+    assert done(job(tmp_path, "third", "signal SIGTERM")).message == "Killed by SIGTERM."
+    assert fork_server() == server
+
+
+def test_work_that_should_end_is_not_begun_again(tmp_path: Path) -> None:
+    done(job(tmp_path, "first", "good"))
+    stop = threading.Event()
+
+    def end() -> None:
+        stop.set()
+        os.kill(fork_server(), signal.SIGKILL)
+
+    threading.Timer(0.5, end).start()
+    assert done(job(tmp_path, "second", "good 5"), stop).failed
+    assert notes(tmp_path / "scans", "began") == ["first", "second"]
+    close_fork_servers()

@@ -23,6 +23,7 @@ from made_shapes import box, sphere
 from scan_files import start, torus, write_scan
 
 from gnrecon.batch import executors, runner
+from gnrecon.batch.child_process import close_fork_servers
 from gnrecon.batch.execute import run_job
 from gnrecon.batch.job import JobOutcome, progress_file, running_folder
 from gnrecon.batch.request import Request
@@ -33,6 +34,7 @@ from gnrecon.export import verify_file
 from gnrecon.report.report import report_schema
 from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.runtime.files import sync
+from gnrecon.runtime.interrupts import polite_ends
 
 OPTIONS = {"widths": (100,), "steps": 0, "resolution": 24}
 WORDS = ("--widths", "100", "--steps", "0", "--resolution", "24")
@@ -236,10 +238,16 @@ def test_an_interrupted_batch_writes_its_summary(
         def done(self, outcome: JobOutcome) -> None:
             raise KeyboardInterrupt(outcome.name)
 
+    def impatient_close() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        close_fork_servers()
+
     monkeypatch.setattr(runner, "ProgressBoard", Impatient)
+    monkeypatch.setattr(executors, "close_fork_servers", impatient_close)
     began = time.monotonic()
     request = Request((str(scans),), tmp_path / "out", jobs=2, quiet=True)
-    assert run_batch(request) == ExitCode.INTERRUPTED
+    with polite_ends():
+        assert run_batch(request) == ExitCode.INTERRUPTED
     assert time.monotonic() - began < 30
     written = tmp_path / "out" / "summary.json"
     assert list(summary(tmp_path / "out")) == ["a"]

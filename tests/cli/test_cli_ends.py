@@ -189,3 +189,32 @@ def test_a_failure_after_a_signal_is_an_interruption(
 
     monkeypatch.setattr("gnrecon.run.reconstruct", failing)
     command.refuses(ExitCode.INTERRUPTED, "Interrupted; nothing was written.", scan, "-o", tmp_path / "mesh.ply")
+
+
+def test_a_signal_while_files_get_their_names_is_too_late(
+    command: CommandLine, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the mesh would lack its report, and a sentence would say that nothing was written."""
+
+    def rename(temporary: Path, target: Path, overwrite: bool) -> None:
+        assert not overwrite
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGHUP)
+        temporary.replace(target)
+
+    monkeypatch.setattr("gnrecon.runtime.files._rename", rename)
+    done = command(scan, "-o", tmp_path / "mesh.ply", "--report", tmp_path / "mesh.json", "-q", *FEW)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.json", "mesh.ply", "scan.ply"]
+
+
+def test_names_command_no_terminal(command: CommandLine, scan: Path, tmp_path: Path) -> None:
+    odd = tmp_path / "a\n\x1b[31m\r\udcff.ply"
+    scan.rename(odd)
+    target, log = tmp_path / "mesh\x1b[2J.ply", tmp_path / "log"
+    done = command(odd, "-o", target, "--log", log, "-v", *FEW)
+    assert (done.returncode, target.is_file()) == (ExitCode.OK, True)
+    command.refuses(ExitCode.OUTPUT, r"mesh\x1b[2J.ply exists already", odd, "-o", target)
+    for text in (done.stderr, log.read_bytes().decode()):
+        assert r"a\n\x1b[31m\r" in text
+        assert not {"\x1b", "\r"} & set(text)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from gnrecon.geometry.colors import as_bytes
 from gnrecon.geometry.mesh import Mesh
@@ -230,3 +231,26 @@ def test_paths_are_read(tmp_path: Path, kind: type) -> None:
         as_shape(path)  # what a plugin returned is no path to read
     with pytest.raises(InputError, match="there is no such file"):
         as_cloud(kind(tmp_path / "none.ply"))
+
+
+class _Unwilling:
+    """An object that numpy cannot turn into an array."""
+
+    def __array__(self, *_: object, **__: object) -> None:
+        raise RuntimeError("no")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "obj", [[[10**400] * 3] * 20, np.ones((20, 3)) + 1j, _Unwilling(), torch.empty((20, 3), device="meta")]
+)
+def test_what_is_no_array_of_real_numbers_is_refused(obj: Any) -> None:
+    with pytest.raises(InputError, match=r"Expected .*, but got (list|complex numbers|_Unwilling|Tensor)\."):
+        as_cloud(obj)
+    with pytest.raises(InputError, match="Expected"):
+        as_cloud(np.ones((20, 3)), obj)
+
+
+def test_masked_coordinates_are_missing() -> None:
+    points = np.ma.masked_equal(np.arange(30.0).reshape(10, 3), 4.0)
+    assert np.isnan(as_cloud(points).points).sum() == 1

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gnrecon.options import Options
-from gnrecon.report.estimate import Estimate, estimate, mesh_memory_mb
+from gnrecon.report.estimate import Estimate, estimate, expected_within_memory, mesh_memory_mb
+from gnrecon.runtime.errors import MemoryLimitError
 
 BOX = np.array([[0.0, 0, 0], [1.0, 1, 1]])
 
@@ -49,3 +50,9 @@ def test_the_sentence() -> None:
     assert Estimate(43.2, 950).describe() == "It would take about 40 seconds on two idle cores, and 0.9 GB of memory."
     assert "about 12 seconds" in Estimate(12.2, 950).describe()
     assert "about 4 minutes" in Estimate(251, 950).describe()
+
+
+def test_a_network_whose_last_layer_fills_the_memory_is_refused() -> None:
+    with pytest.raises(MemoryLimitError, match="smaller --widths"):
+        expected_within_memory(50, 50, BOX, Options(widths=(300_000,), resolution=16))
+    assert expected_within_memory(50, 50, BOX, Options(widths=(64, 64), resolution=16)) is None

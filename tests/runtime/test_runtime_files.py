@@ -126,3 +126,14 @@ def test_a_killed_process_leaves_the_target_as_it_was(tmp_path: Path, existing: 
     assert left.name.startswith(".mesh.")
     assert target.exists() == (existing is not None)
     assert existing is None or target.read_text() == existing
+
+
+def test_a_failure_within_a_failure_names_the_target(tmp_path: Path) -> None:
+    def write_nested() -> None:
+        with atomic_write(tmp_path / "a.png") as temporary, atomic_write(temporary, overwrite=True):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError) as error:
+        write_nested()
+    assert str(error.value) == f"{tmp_path / 'a.png'} could not be written: No space left on device."
+    assert not list(tmp_path.iterdir())

@@ -28,6 +28,7 @@ from gnrecon.io.contents import Contents, concatenated, guard_parser, without_op
 from gnrecon.io.parse import require_buildable, sibling_path
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.logs import unprinted_log
+from gnrecon.runtime.quiet_imports import import_uninterrupted
 
 
 def glb_supports(name: str, values: Values) -> bool:
@@ -47,7 +48,7 @@ def read_gltf(path: Path) -> Contents:
 
     Attributes are kept where all meshes have them, with their names in lower case.
     """
-    import trimesh
+    trimesh = import_uninterrupted("trimesh")
 
     data = path.read_bytes()
     with guard_parser("glTF or GLB"), unprinted_log("trimesh"):
@@ -173,7 +174,7 @@ def _attributes(stored: dict[str, Any]) -> dict[str, Values]:
 
 def write_glb(mesh: Mesh, path: Path) -> None:
     """Write one node with the mesh, its vertex normals and attributes, and a translation to the mesh's middle."""
-    import trimesh
+    trimesh = import_uninterrupted("trimesh")
 
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     matrix = np.eye(4)
