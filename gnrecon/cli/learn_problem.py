@@ -60,7 +60,7 @@ class LearnOptions:
     def __post_init__(self) -> None:
         """Refuse values out of range, before any work."""
         # A thousand units more in each layer are some millions of parameters.
-        most = {"steps": 2**48, "seed": 2**63 - 1, "resolution": 16_384, "wider": 1000, "threads": most_threads()}
+        most = {"steps": 1_000_000, "seed": 2**63 - 1, "resolution": 16_384, "wider": 1000, "threads": most_threads()}
         require_at_most(self, most)
         if self.seed < 0:
             raise UsageError(f"The seed must not be negative, not {self.seed}.")

@@ -235,8 +235,7 @@ def _array(obj: Any, expected: str = "") -> Float:
     expected = expected or f"{points}, or a cloud of open3d, trimesh, pymeshlab, pyvista or meshio"
     try:
         plain = obj.detach().cpu().numpy() if hasattr(obj, "detach") else obj  # a torch tensor, on any device
-        if isinstance(plain, np.ma.MaskedArray):
-            plain = np.ma.filled(plain.astype(np.float64), np.nan)
+        plain = np.ma.filled(plain.astype(float), np.nan) if isinstance(plain, np.ma.MaskedArray) else plain
         if np.asarray(plain).dtype.kind != "c":
             return np.array(plain, dtype=np.float64)
         kind = "complex numbers"
@@ -266,7 +265,6 @@ def to_trimesh(shape: Mesh | PointCloud) -> Any:
     The normals of a cloud are its metadata ``vertex_normals``.
     """
     trimesh = import_uninterrupted("trimesh")
-
     if isinstance(shape, PointCloud):
         metadata = None if shape.normals is None else {"vertex_normals": shape.normals.copy()}
         return trimesh.PointCloud(shape.points.copy(), _colors(shape), metadata)
@@ -289,8 +287,7 @@ def to_open3d(shape: Mesh | PointCloud, *, tensor: bool = False) -> Any:
     shape : Mesh or PointCloud
     tensor : whether to return one of ``open3d.t.geometry``, which keeps all attributes, instead of a legacy one
     """
-    core: Any = import_open3d().core
-    geometry: Any = import_open3d().t.geometry
+    core, geometry = import_open3d().core, import_open3d().t.geometry
     held, colors, (points, faces, normals) = dict(shape.attributes), _colors(shape), _parts(shape)
     if not tensor:
         held = {} if colors is None else {"colors": colors[:, :3] / 255}

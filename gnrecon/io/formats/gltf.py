@@ -49,7 +49,6 @@ def read_gltf(path: Path) -> Contents:
     Attributes are kept where all meshes have them, with their names in lower case.
     """
     trimesh = import_uninterrupted("trimesh")
-
     data = path.read_bytes()
     with guard_parser("glTF or GLB"), unprinted_log("trimesh"):
         text, chunk = data, b""
@@ -175,7 +174,6 @@ def _attributes(stored: dict[str, Any]) -> dict[str, Values]:
 def write_glb(mesh: Mesh, path: Path) -> None:
     """Write one node with the mesh, its vertex normals and attributes, and a translation to the mesh's middle."""
     trimesh = import_uninterrupted("trimesh")
-
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     matrix = np.eye(4)
     matrix[:3, 3] = middle
