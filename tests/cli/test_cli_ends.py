@@ -209,7 +209,7 @@ def test_a_signal_while_files_get_their_names_is_too_late(
 
 
 def test_names_command_no_terminal(command: CommandLine, scan: Path, tmp_path: Path) -> None:
-    odd = tmp_path / "a\n\x1b[31m\r\udcff.ply"
+    odd = tmp_path / "a\n\x1b[31m\r.ply"
     scan.rename(odd)
     target, log = tmp_path / "mesh\x1b[2J.ply", tmp_path / "log"
     done = command(odd, "-o", target, "--log", log, "-v", *FEW)
