@@ -139,7 +139,7 @@ def test_every_analytic_case_can_be_drawn(name: str) -> None:
     assert problem.genus == SOLIDS[case.shape].genus
 
 
-@pytest.mark.parametrize(("name", "genus"), [("clevis", 4), ("flange", 7), ("shaft", 1)])
+@pytest.mark.parametrize(("name", "genus"), [("flange", 7), ("shaft", 1)])
 def test_parts_with_bores_are_scanned_from_outside(name: str, genus: int) -> None:
     problem = CASES[f"{name}, 5000 points"].problem(NOWHERE, 0)
     assert isinstance(problem.truth, Mesh)
