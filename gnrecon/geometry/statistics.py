@@ -69,6 +69,12 @@ def robust_deviation(residuals: Float) -> float:
     return 1.4826 * float(np.median(np.abs(residuals)))
 
 
+def perpendicular(axis: Float) -> Float:
+    """Return a vector at right angles to an axis, both of shape (3,); its length is not one."""
+    across: Float = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    return across
+
+
 def widest_gap(directions: Float, axis: Float) -> float:
     """Return the widest angle about an axis, of shape (3,), that contains none of the directions, in radians.
 
@@ -79,6 +85,6 @@ def widest_gap(directions: Float, axis: Float) -> float:
     """
     if not len(directions):
         return 2 * np.pi
-    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across = perpendicular(axis)
     angles = np.sort(np.arctan2(directions @ np.cross(axis, across), directions @ across))
     return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())

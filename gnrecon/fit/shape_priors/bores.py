@@ -20,7 +20,7 @@ from gnrecon.fit.shape_priors.primitives import Cylinder, cosine_of
 from gnrecon.fit.shape_priors.prior_parameters import BoreParameters, DetectionParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import CoarseDistance
-from gnrecon.geometry.statistics import widest_gap
+from gnrecon.geometry.statistics import perpendicular, widest_gap
 from gnrecon.runtime.chunks import slices
 
 
@@ -109,7 +109,7 @@ class _Bore:
     @classmethod
     def of(cls, wall: Cylinder, points: Float, spacing: float) -> _Bore:
         """Return the bore with places on its wall."""
-        aside = np.cross(wall.axis, np.eye(3)[np.argmin(np.abs(wall.axis))])
+        aside = perpendicular(wall.axis)
         aside /= np.linalg.norm(aside)
         count = round(2.0 * np.pi * wall.radius / spacing)
         turns = 2.0 * np.pi * np.arange(count)[:, None] / count
