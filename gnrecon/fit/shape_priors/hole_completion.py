@@ -71,11 +71,17 @@ def complete_holes(
     exact : whether normals are reliable where points are sparse; estimated ones are not
     parameters : of the completion
     """
-    # A generator of its own, so that later draws are the same whether there are holes or not.
+    if len(points) < parameters.min_points:
+        return HoleCompletion.none()
+    # Generators of its own, so that later draws are the same whether there are holes or not.
     rng = np.random.default_rng(0)
+    scan = _HoleScan.of(points, normals, exact, rng, parameters)
+    # Asked first: holes are looked for in the whole box, which takes most of the time.
+    if not scan.is_machine_part(rng):
+        return HoleCompletion.none()
     # First, as the walls of bores show what is around other holes.
-    bores, total = _bore_walls(points, normals, exact, parameters), HoleCompletion.none()
-    known = bores.appended_to(points, normals)
+    bores, total = HoleCompletion.joined(scan.samples_in_bores()), HoleCompletion.none()
+    known, rng = bores.appended_to(points, normals), np.random.default_rng(0)
     for _ in range(parameters.passes):
         more = _one_pass(*total.appended_to(*known), exact, rng, parameters)
         finished = len(more) <= parameters.min_gain_share * len(total)
@@ -89,8 +95,6 @@ def _one_pass(
     points: Float, normals: Float, exact: bool, rng: np.random.Generator, parameters: HoleCompletionParameters
 ) -> HoleCompletion:
     """Return the samples of one pass; the parameters are those of `complete_holes`."""
-    if len(points) < parameters.min_points:
-        return HoleCompletion.none()
     scan = _HoleScan.of(points, normals, exact, rng, parameters)
     spacing = parameters.sample_spacing_radii * scan.density.radius * np.sqrt(len(scan.points) / len(points))
     holes = scan.holes()
@@ -99,16 +103,6 @@ def _one_pass(
     found = HoleCompletion.joined([scan.samples_across(cells, spacing, rng) for cells in holes])
     kept = ~in_bore_opening(found.points, found.normals, points, normals)
     return HoleCompletion(found.points[kept], found.normals[kept], found.holes)
-
-
-def _bore_walls(points: Float, normals: Float, exact: bool, parameters: HoleCompletionParameters) -> HoleCompletion:
-    """Return samples in the gaps of bores' walls; the parameters are those of `complete_holes`."""
-    if len(points) < parameters.min_points:
-        return HoleCompletion.none()
-    # Draws of their own: what is found in holes does not depend on bores.
-    rng = np.random.default_rng(0)
-    scan = _HoleScan.of(points, normals, exact, rng, parameters)
-    return HoleCompletion.joined(scan.samples_in_bores() if scan.is_machine_part(rng) else [])
 
 
 @dataclass(frozen=True)
