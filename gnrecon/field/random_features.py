@@ -48,6 +48,14 @@ class Features:
         """Return the same features in another precision."""
         return Features(self.frequencies.to(dtype), self.phases.to(dtype))
 
+    def precise_enough(self, trace: float, *, most_single_trace: float = 1e5) -> Features:
+        """Return the features in single precision where its rounding is far less than a prior's ones, or as they are.
+
+        `trace` is that of J^T J for features of variance one over the prior's: its largest eigenvalue is at most so
+        large.
+        """
+        return self.to(torch.float32) if trace < most_single_trace else self
+
     def first(self, count: int) -> Features:
         """Return the first of the features, at most so many."""
         return Features(self.frequencies[:count], self.phases[:count])

@@ -137,7 +137,9 @@ class CubeSpace:
 
     @cached_property
     def _seen_dipoles(self) -> tuple[Float, Float, Float]:
-        return self.dipoles.dipoles_for(self.center, self.reach)
+        """Dipoles, seen from the centre: distances to those near by keep their digits in single precision."""
+        places, moments, radii = self.dipoles.dipoles_for(self.center, self.reach)
+        return places - self.center, moments, radii
 
     def _volume(self, x: Float, clear_disks: float, clear: float) -> Volume:
         """Return the samples that are far enough from the data: by so many radii of its disks, plus a length."""
@@ -146,7 +148,8 @@ class CubeSpace:
         disks = self.disks[nearest]
         kept = distance > clear_disks * disks + clear
         x, distance, disks = x[kept], distance[kept], disks[kept]
-        winding = self.dipoles.sides.centred(winding_number(x, *self._seen_dipoles), distance)
+        winding = winding_number(x - self.center, *self._seen_dipoles, dtype=torch.float32)
+        winding = self.dipoles.sides.centred(winding, distance)
         # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         if self.signed_by is not None:

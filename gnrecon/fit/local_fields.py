@@ -126,7 +126,7 @@ def solve_cube(
     patch = residuals.patch(rows, space.center, space.far(), device)
     position, angle = hyperparameters.position, hyperparameters.angle
     if penalties is None:
-        features = _precise_enough(features, patch, length, hyperparameters, parameters)
+        features = _precise_enough(features, patch, length, hyperparameters)
     if hyperparameters.by_place and penalties is None:
         length = _likeliest_length(patch, features, length, (position, angle), parameters)
     system = PatchSystem(patch, features, length, hyperparameters.rms_factor * patch.rms)
@@ -136,15 +136,12 @@ def solve_cube(
     return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
 
 
-def _precise_enough(
-    features: Features, patch: Patch, length: float, hyperparameters: Hyperparameters, parameters: LocalFieldParameters
-) -> Features:
-    """Return the features in single precision where rounding is far less than the ones that the prior adds to J^T J."""
+def _precise_enough(features: Features, patch: Patch, length: float, hyperparameters: Hyperparameters) -> Features:
+    """Return the features in the precision that the noise of a cube's data asks for."""
     position, angle = patch.size / hyperparameters.position, patch.size / length / hyperparameters.angle
     # A row of J has mean squares of one for a value and for each of a normal's three components, for features of
-    # variance one; the largest eigenvalue is at most the trace.
-    largest = len(patch.value) * (position**2 + 3 * angle**2)
-    return features.to(torch.float32) if largest < parameters.most_single_eigenvalue else features
+    # variance one.
+    return features.precise_enough(len(patch.value) * (position**2 + 3 * angle**2))
 
 
 def _likeliest_length(

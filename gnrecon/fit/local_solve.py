@@ -102,7 +102,7 @@ class PatchSystem:
     """
 
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
-        self._scale = size * (2.0 / len(features)) ** 0.5
+        self._size, self._scale = size, size * (2.0 / len(features)) ** 0.5
         self._patch, self._features, self._length = patch, features, length
 
     @cached_property
@@ -113,15 +113,25 @@ class PatchSystem:
 
     @cached_property
     def _angles(self) -> tuple[Tensor, Tensor]:
-        """J^T J and J^T y of the gradients."""
+        """J^T J and J^T y of the gradients.
+
+        The rows of an axis are cosines C times the features' slopes S along it, and all axes have one noise: J^T J is
+        the Hadamard product of C^T C and S S^T, a third of the work of three products.
+        """
         wanted, slopes = self._patch.gradient, self._features.frequencies / self._length
-        cosines = ((rows, z.cos()) for rows, z in self._phases())
-        return self._sums((c * slopes[:, axis], wanted[rows, axis]) for rows, c in cosines for axis in range(3))
+        product, along = self._sums(((z.cos(), wanted[rows]) for rows, z in self._phases()), 3)
+        slopes = slopes.to(product)
+        return product.mul_(slopes @ slopes.T), (along * slopes).sum(dim=1)
+
+    @cached_property
+    def _free(self) -> Features:
+        """The features of the volume: its deviations are wide, so that single precision is mostly enough."""
+        return self._features.precise_enough(float((self._size / self._patch.deviation).square().sum()))
 
     @cached_property
     def _sines(self) -> Tensor:
         """The features at the samples of the volume."""
-        return self._features.phase(self._patch.volume, self._patch.center, self._length).sin()
+        return self._free.phase(self._patch.volume, self._patch.center, self._length).sin()
 
     @cached_property
     def _volume(self) -> tuple[Tensor, Tensor]:
@@ -135,10 +145,10 @@ class PatchSystem:
         for rows in slices(len(patch.value), LocalSolveParameters.chunk_points):
             yield rows, self._features.phase(patch.points[rows], patch.center, self._length)
 
-    def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-        """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y."""
+    def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]], *columns: int) -> tuple[Tensor, Tensor]:
+        """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y, of `columns`."""
         like, count = self._patch.value, len(self._features)
-        right = like.new_zeros(count)
+        right = like.new_zeros(count, *columns)
 
         def rows() -> Iterator[Tensor]:
             for chunk, wanted in chunks:
@@ -181,7 +191,7 @@ class PatchSystem:
         for _ in range(parameters.bound_passes):
             more = draw()
             points, _, *others = (torch.as_tensor(values).to(patch.value) for values in more.rows())
-            sines = torch.cat([sines, self._features.phase(points, patch.center, self._length).sin()])
+            sines = torch.cat([sines, self._free.phase(points, patch.center, self._length).sin()])
             lower, upper, zero, distance = (
                 torch.cat(pair) for pair in zip((lower, upper, zero, distance), others, strict=True)
             )

@@ -35,7 +35,6 @@ class LocalFieldParameters:
     length_features: int = 300  # most that the likelihood of a length is computed with
     length_step: float = 2.0**0.5  # between the lengths of which a cube's own data chooses
     most_length_steps: int = 2  # from the scan's length
-    most_single_eigenvalue: float = 1e5  # of J^T J over the prior's; single precision suffices below
     selection_time_share: float = 0.2  # of the local fit, until length and noise are chosen, for the progress bar
 
 
