@@ -136,10 +136,11 @@ class NetworkLadder:
     def _started(self, width: int) -> tuple[Siren, Solution]:
         """Return the best network of one width from random starts, after the first steps.
 
-        The best start takes as many again, as in successive halving (Jamieson and Talwalkar, *Non-stochastic Best Arm
-        Identification and Hyperparameter Optimization*, 2016).
+        The best start takes as many again, with more rows, as in successive halving (Jamieson and Talwalkar,
+        *Non-stochastic Best Arm Identification and Hyperparameter Optimization*, 2016).
         """
         field, steps = Siren((width,) * self.parameters.depth), self.parameters.first_steps
+        few = self.terms.with_rows(self.parameters.first_rows)
 
         def first_steps(start: NetworkLadder) -> Solution:
             terms = partial(start_terms, start.terms.scene, start.options, start.rng)
@@ -149,7 +150,8 @@ class NetworkLadder:
             # The score rises before it falls, as the damping finds its size: no patience ends these steps.
             return start._fitted(field, theta, steps, patience=steps)
 
-        starts = self._parts(network_starts(len(self.terms.scene.points), parameters=self.parameters))
+        count = network_starts(len(self.terms.scene.points), parameters=self.parameters)
+        starts = replace(self, terms=few)._parts(count)
         found = run_in_threads(first_steps, starts, self.options.device, lambda one: one.interrupted)
         self._take_histories(starts[: len(found)])
         best, last = min(found, key=lambda one: self.terms.score(field, one.theta)).theta, _last(found)
@@ -165,7 +167,7 @@ class NetworkLadder:
             def report(record: Record) -> None:
                 callback(replace(record, step=next(steps)))
 
-        return [replace(self, rng=rng, callback=report) for rng in self.rng.spawn(count)]
+        return [replace(self, terms=replace(self.terms), rng=rng, callback=report) for rng in self.rng.spawn(count)]
 
     def _take_histories(self, parts: Sequence[NetworkLadder]) -> None:
         """Append the histories of the parts, one after the other, though some ran side by side."""

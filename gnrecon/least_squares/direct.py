@@ -13,9 +13,10 @@ from gnrecon.least_squares.system import Equations, Linearisation, Metric, Step
 
 @dataclass(frozen=True)
 class NormalSystem(Linearisation):
-    """J^T J, in its lower triangle, which is left unchanged by `solve`."""
+    """J^T J, in its lower triangle, which is left unchanged by `solve`; `stored` is the precision of J."""
 
     product: Tensor
+    stored: torch.dtype = torch.float64
 
     def solve(self, damping: float, residual: Tensor | None = None) -> Step:
         """Return the exact step."""
@@ -23,10 +24,20 @@ class NormalSystem(Linearisation):
         obstacle = equations.obstacle(damping)
         if obstacle:
             return equations.failed(obstacle)
-        factor = self._factor(damping, lambda: damped_factor(self.product, damping * equations.metric))
+        factor = self._factor(damping, lambda: self._damped(damping))
         if factor is None:
             return equations.indefinite()
-        return equations.step(solve_factored(factor, -equations.gradient), damping)
+        solution = solve_factored(factor, -equations.gradient.to(factor)).to(equations.gradient)
+        return equations.step(solution, damping)
+
+    def _damped(self, damping: float) -> Tensor | None:
+        """Return the factor, in single precision where J^T J has been rounded to it and the damping hides that."""
+        diagonal = damping * self.equations.metric
+        if self.stored == torch.float32:
+            factor = damped_factor(self.product.float(), diagonal.float(), overwrite=True)
+            if factor is not None:
+                return factor
+        return damped_factor(self.product, diagonal)
 
 
 @dataclass(frozen=True)
@@ -39,7 +50,7 @@ class Cholesky:
 
     def linearise(self, jacobian: Jacobian, residual: Tensor, metric: Metric) -> NormalSystem:
         """Assemble J^T J."""
-        return NormalSystem(Equations.of(jacobian, residual, metric), jacobian.gram())
+        return NormalSystem(Equations.of(jacobian, residual, metric), jacobian.gram(), jacobian.stored)
 
     def describe(self) -> str:
         """Name the solver."""
