@@ -107,6 +107,8 @@ def select_hyperparameters(
     outliers : whether some were found. Those that remain would make spikes if the scan were fitted as clean, and the
         marginal likelihood is not robust to them.
     """
+    # Draws of its own, so that later ones do not depend on the number of patches.
+    rng = rng.spawn(1)[0]
     validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
     clean = None if outliers else validation.clean()
     if clean is not None:
@@ -195,8 +197,8 @@ class CrossValidation:
     held_out : mask of shape (N,), of the validation points
     device : a torch device
     known : noise of positions and normals, if it is known; then no other is tried
-    likelihood : which gives one more candidate of the noise for each length, and decides it in the end; None of
-        estimated normals, whose errors are correlated
+    likelihood : which gives the noise of each length; None of estimated normals, whose errors are correlated, and of
+        scans with outliers, to which it is not robust. Then candidates are tried.
     """
 
     residuals: FieldResiduals
@@ -226,15 +228,15 @@ class CrossValidation:
     ) -> CrossValidation:
         """Draw the patches, for cubes of so many features; see `select_hyperparameters` for the other parameters."""
         out = np.flatnonzero(held_out)
-        dense = len(residuals) > parameters.dense_points
-        patches = parameters.dense_patches if dense else parameters.patches
-        # A patch need not resolve more than a cube of few features does.
-        few = dense or cube_features <= parameters.dense_features
-        count = parameters.dense_features if few else parameters.features
+        covering = parameters.predictions * len(out) // parameters.patch_validation_points
+        patches = min(max(covering, parameters.least_patches), parameters.most_patches)
         chosen = rng.choice(len(residuals), min(patches, len(residuals)), replace=False)
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(parameters.patch_validation_points, len(out)) + 1))
         near = cKDTree(residuals.points[out]).query(residuals.points[chosen], ranks)[1]
+        # A patch need not resolve more than a cube does.
+        most = parameters.features if patches <= parameters.many_patches else parameters.fewer_features
+        count = min(cube_features, most)
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = residuals.points[chosen]
         likelihood = None if residuals.estimated else _marginal_likelihood(residuals, radius, rng.spawn(1)[0], device)
@@ -272,15 +274,12 @@ class CrossValidation:
         step = 1 if least(at + 1) < least(at) else -1
         while least(at + step) < least(at):
             at += step
-        if self.likelihood is not None:
-            # The share of ties is for noise that is correlated, which no likelihood decides.
-            alone = {number: of_length[:, -1:] for number, of_length in scores.items()}
-            number, _ = _smoothest(alone, parameters=replace(self.parameters, tie_share=0.0))
-            # Errors of dense scans are alike among neighbours, as those of estimated normals are.
-            by_place = len(self.residuals) <= self.parameters.sparse_points
-            return Hyperparameters(self._length(number), *self.noises(self._length(number))[-1], by_place)
-        number, noise = _smoothest(scores, parameters=self.parameters)
-        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise])
+        # The share of ties is for noise that is correlated, which no likelihood decides.
+        tie_share = self.parameters.tie_share if self.likelihood is None else 0.0
+        number, noise = _smoothest(scores, parameters=replace(self.parameters, tie_share=tie_share))
+        # Errors of dense scans are alike among neighbours, as those of estimated normals are.
+        by_place = self.likelihood is not None and len(self.residuals) <= self.parameters.sparse_points
+        return Hyperparameters(self._length(number), *self.noises(self._length(number))[noise], by_place)
 
     def _length(self, number: int) -> float:
         """Return a length scale, unit coordinates, by its number."""
@@ -295,7 +294,7 @@ class CrossValidation:
         return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
-        """Return the noises of positions and normals to try with a length, the most likely one last."""
+        """Return the noises of positions and normals to try with a length: one, where it is known or the likeliest."""
         if self.known is not None:
             return [self.known]
         if length not in self._noises:
@@ -303,8 +302,10 @@ class CrossValidation:
             least, most = 0.0, max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)
             if self.residuals.estimated and (shown := self.residuals.noise):
                 least, most = shown / self.parameters.most_noise_factor, shown * self.parameters.most_noise_factor
-            tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
-            tried += [] if self.likelihood is None else [self.likelihood.likeliest(length)]
+            if self.likelihood is None:
+                tried = [(position * self.radius, angle) for position, angle in _noise_candidates(self.parameters)]
+            else:
+                tried = [self.likelihood.likeliest(length)]
             self._noises[length] = [(min(max(position, least), most), angle) for position, angle in tried]
         return self._noises[length]
 

@@ -229,18 +229,19 @@ class ModelSelectionParameters:
     least_position_noise_disk_radii: float = 1e-3  # below, rounding would decide
     most_noise_factor: float = 2.0  # between the noise that is tried with estimated normals, and that of the survey
     first_length_index: int = 2  # of the length that is tried first
-    patches: int = 10
-    dense_patches: int = 20
+    # As many patches as predict each validation point so often, on average, between the least and the most.
+    predictions: int = 2
+    least_patches: int = 10
+    most_patches: int = 80
     patch_validation_points: int = 20  # that each patch predicts
-    # Points from which patches are more, of fewer features; those of smaller scans would share what they predict.
-    dense_points: int = 8000
     # Points up to which estimated normals are ignored, and the errors of points are taken for independent. Normals of
     # denser scans are means over little of the surface; and where many scans do not quite match, a field that winds
     # through all of them has the least distances and the largest evidence.
     sparse_points: int = 20_000
     most_patch_points: int = 2500  # more change no score, and time grows with the square of the length
     features: int = 700
-    dense_features: int = 300
+    many_patches: int = 20  # of more, each has fewer features
+    fewer_features: int = 300
     least_slope: float = 0.05  # of the field along the normal, in a distance |f| / slope
     margin_lengths: float = 1.5  # how far a patch's data reaches beyond what it predicts, in length scales
 
