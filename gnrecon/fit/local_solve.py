@@ -39,6 +39,7 @@ class Hyperparameters:
     angle : of the normals' noise, radians
     by_place : whether the length is that of the scan on the whole, from which each cube's own may differ
     rms_factor : prior standard deviation of a cube's correction, over the RMS of the residuals there
+    robust : whether points that contradict the others of their cube lose their weight
     """
 
     length: float
@@ -46,6 +47,7 @@ class Hyperparameters:
     angle: float
     by_place: bool = False
     rms_factor: float = LocalSolveParameters.correction_rms_factor
+    robust: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Patch:
     lower, upper : of shape (Q,), what c must be at least and at most at the samples
     zero : of shape (Q,), the c at which the corrected field vanishes there
     center : of shape (3,), origin of the features' coordinates
+    weights : of shape (N,), of the points, or None where all have a weight of one
     """
 
     points: Tensor
@@ -73,6 +76,7 @@ class Patch:
     zero: Tensor
     distance: Tensor
     center: Tensor
+    weights: Tensor | None = None
 
     @property
     def size(self) -> float:
@@ -109,7 +113,9 @@ class PatchSystem:
     def _positions(self) -> tuple[Tensor, Tensor]:
         """J^T J and J^T y of the values."""
         values = self._patch.value
-        return self._sums((z.sin(), values[rows]) for rows, z in self._phases())
+        return self._sums(
+            (self._weighted(z.sin(), rows), self._weighted(values[rows], rows)) for rows, z in self._phases()
+        )
 
     @cached_property
     def _angles(self) -> tuple[Tensor, Tensor]:
@@ -119,7 +125,8 @@ class PatchSystem:
         the Hadamard product of C^T C and S S^T, a third of the work of three products.
         """
         wanted, slopes = self._patch.gradient, self._features.frequencies / self._length
-        product, along = self._sums(((z.cos(), wanted[rows]) for rows, z in self._phases()), 3)
+        cosines = ((self._weighted(z.cos(), rows), self._weighted(wanted[rows], rows)) for rows, z in self._phases())
+        product, along = self._sums(cosines, 3)
         slopes = slopes.to(product)
         return product.mul_(slopes @ slopes.T), (along * slopes).sum(dim=1)
 
@@ -144,6 +151,13 @@ class PatchSystem:
         patch = self._patch
         for rows in slices(len(patch.value), LocalSolveParameters.chunk_points):
             yield rows, self._features.phase(patch.points[rows], patch.center, self._length)
+
+    def _weighted(self, values: Tensor, rows: slice) -> Tensor:
+        """Return values of some points times the roots of the points' weights."""
+        if self._patch.weights is None:
+            return values
+        roots = self._patch.weights[rows].sqrt().to(values)
+        return values * (roots if values.dim() == 1 else roots[:, None])
 
     def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]], *columns: int) -> tuple[Tensor, Tensor]:
         """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y, of `columns`."""
@@ -207,6 +221,33 @@ class PatchSystem:
             self._volume = product.add_(rows.T @ rows), right.add_(rows.T @ wanted.to(rows))
             amplitudes = self.solve(position, angle)
         return amplitudes
+
+    def robust_weights(
+        self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
+    ) -> Tensor:
+        """Return weights of the points, of shape (N,), below one where a point contradicts all others.
+
+        The misfit of a point to the correction that the others give is r / (1 - h), with its residual r and leverage
+        h: clean data pulls the surface to an outlier, so that r alone does not show it. Beyond `robust_deviations`
+        the weight falls with the square of the misfit, over the larger of the noise and what misfits have by their
+        median.
+        Source: Cook and Weisberg, *Residuals and Influence in Regression* (1982), for leave-one-out residuals; Holland
+        and Welsch, *Robust Regression Using Iteratively Reweighted Least-Squares* (1977), for the weights.
+        """
+        factor, right = self._factored(position, angle)
+        ones = torch.ones_like(self._patch.value)
+        if factor is None:
+            return ones
+        solution, weights = solve_factored(factor, right), self._patch.weights
+        parts = []
+        for rows, z in self._phases():
+            sines = self._scale * z.sin().to(factor)
+            leverage = torch.linalg.solve_triangular(factor, sines.T, upper=False).square().sum(dim=0) / position**2
+            rest = 1.0 - (leverage if weights is None else weights[rows] * leverage)
+            parts.append((self._patch.value[rows] - sines @ solution) / rest.clamp_min(parameters.least_rest))
+        misfit = torch.cat(parts).abs()
+        deviation = max(position, float(misfit.median()) / 0.6745)
+        return torch.minimum(ones, (parameters.robust_deviations * deviation / misfit.clamp_min(1e-300)).square())
 
     def log_evidence(self, position: float, angle: float) -> float:
         """Return the log marginal likelihood of the data, but for a term that no length changes.
@@ -287,7 +328,8 @@ def data_kernel(patch: Patch, features: Features, length: float, size: float) ->
 def patch_system(patch: Patch, features: Features, length: float, size: float) -> PatchSystem | LocalRowSystem:
     """Return the smaller one of the two systems that `solve` may use; parameters as those of `PatchSystem`."""
     rows = 4 * len(patch.points) + len(patch.volume)
-    return (LocalRowSystem if rows < len(features) else PatchSystem)(patch, features, length, size)
+    by_rows = rows < len(features) and patch.weights is None
+    return (LocalRowSystem if by_rows else PatchSystem)(patch, features, length, size)
 
 
 def _factor(

@@ -114,8 +114,10 @@ def select_hyperparameters(
     if clean is not None:
         return clean
     if residuals.estimated and len(residuals) <= validation.parameters.sparse_points:
-        return _by_positions(residuals, radius, rng, device)
-    return (replace(validation, likelihood=None) if outliers else validation).select()
+        chosen = _by_positions(residuals, radius, rng, device)
+    else:
+        chosen = (replace(validation, likelihood=None) if outliers else validation).select()
+    return replace(chosen, robust=outliers)
 
 
 def _by_positions(
@@ -246,7 +248,7 @@ class CrossValidation:
     def clean(self) -> Hyperparameters | None:
         """Return the hyperparameters of a clean scan, whose noise follows from its points, or None of any other.
 
-        The length scale is the shortest that no longer one beats by more than the standard error. Clean points justify
+        The length scale is the shortest that no longer one beats by two standard errors. Clean points justify
         the shortest; longer ones are better only where the points, or a cube's features, are too few for it.
         """
         left = self.residuals
@@ -286,12 +288,12 @@ class CrossValidation:
         return self.parameters.lengths_disk_radii[number] * self.radius
 
     def _clearly_better(self, number: int, than: int) -> bool:
-        """Return whether a length's score is better than another's by more than the standard error.
+        """Return whether a length's score is better than another's by more than some standard errors.
 
         Logarithms are compared: one patch where both lengths are far off would outweigh all others.
         """
         gain = np.log(self.scores(self._length(than))[:, 0]) - np.log(self.scores(self._length(number))[:, 0])
-        return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
+        return bool(gain.mean() > self.parameters.gain_standard_errors * gain.std() / np.sqrt(len(gain)))
 
     def noises(self, length: float) -> list[tuple[float, float]]:
         """Return the noises of positions and normals to try with a length: one, where it is known or the likeliest."""

@@ -168,6 +168,9 @@ class LocalSolveParameters:
     bound_passes: int = 8  # most active-set passes, each with more samples, while some are beyond half of their bound
     bound_deviation_share: float = 0.1  # their standard deviation then, as a share of the distance
     damping_attempts: int = 6  # each with ten times the damping
+    robust_deviations: float = 5.0  # of a misfit, beyond which a point loses its weight; by chance one in two million
+    robust_passes: int = 3  # most solves for weights
+    least_rest: float = 1e-6  # of one less a leverage, which rounding may make zero
     chunk_points: int = 16_384  # points whose features are held at once, so that memory does not grow with density
 
 
@@ -226,6 +229,7 @@ class ModelSelectionParameters:
     position_noises_disk_radii: tuple[float, ...] = (0.02, 0.1, 0.3, 0.8)  # candidates
     angle_noises_radians: tuple[float, ...] = (0.03, 0.1, 0.3)  # candidates
     tie_share: float = 0.025  # by which a score may exceed the best and yet count as equal
+    gain_standard_errors: float = 2.0  # by which a longer length must predict a clean scan better
     least_position_noise_disk_radii: float = 1e-3  # below, rounding would decide
     most_noise_factor: float = 2.0  # between the noise that is tried with estimated normals, and that of the survey
     first_length_index: int = 2  # of the length that is tried first

@@ -53,8 +53,15 @@ def plainly(patch: Patch, features: Features) -> tuple[Tensor, Tensor]:
     return J, r
 
 
+@pytest.fixture
+def double(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let free space have the precision of the data."""
+    monkeypatch.setattr(Features, "precise_enough", lambda self, _: self)
+
+
 @pytest.mark.parametrize("system", [PatchSystem, LocalRowSystem])
 @pytest.mark.seed(1503570714)
+@pytest.mark.usefixtures("double")
 def test_amplitudes_are_the_mode_of_bayesian_regression(
     system: type[PatchSystem | LocalRowSystem], patch: Patch, features: Features
 ) -> None:
@@ -67,6 +74,59 @@ def test_amplitudes_are_the_mode_of_bayesian_regression(
     expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) / prior**2, J.T @ r)
     found = system(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
+
+
+def test_free_space_is_rounded_where_that_changes_little(
+    patch: Patch, features: Features, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert features.precise_enough(1e4).phases.dtype == torch.float32
+    assert features.precise_enough(1e6) is features
+    rounded = PatchSystem(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
+    monkeypatch.setattr(Features, "precise_enough", lambda self, _: self)
+    exact = PatchSystem(patch, features, LENGTH, patch.size).solve(POSITION, ANGLE)
+    assert 0.0 < float((rounded - exact).norm()) < 1e-5 * float(exact.norm())
+
+
+@pytest.mark.usefixtures("double")
+def test_a_point_of_little_weight_counts_as_little(patch: Patch, features: Features, rng: np.random.Generator) -> None:
+    weights = torch.as_tensor(rng.uniform(0.0, 1.0, 20))
+    J, r = plainly(patch, features)
+    roots = torch.cat([weights, weights.repeat_interleave(3), torch.ones(8)]).sqrt()
+    J, r = J * roots[:, None], r * roots
+    expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) * len(features) / 2 / patch.size**2, J.T @ r)
+    found = patch_system(replace(patch, weights=weights), features, LENGTH, patch.size).solve(POSITION, ANGLE)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_a_point_loses_its_weight_by_how_far_it_is_from_what_the_others_give(
+    patch: Patch, features: Features, rng: np.random.Generator
+) -> None:
+    # Near each other, so that the others tell the value of a point.
+    patch = replace(patch, points=0.1 * patch.points)
+    value, gradient = rows(features, patch.points, patch.center)
+    amplitudes = torch.as_tensor(rng.standard_normal(len(features)))
+    noise = POSITION * torch.as_tensor(rng.standard_normal(20))
+    # Of the outliers one has a weight already.
+    given = torch.ones(20).double().index_fill(0, torch.tensor([11]), 0.3)
+    off = torch.zeros(20).double().index_fill(0, torch.tensor([4, 11]), 50 * POSITION)
+    free = rows(features, patch.volume, patch.center)[0] @ amplitudes
+    seen = {"value": value @ amplitudes + noise + off, "gradient": gradient @ amplitudes, "wanted": free}
+    patch = replace(patch, **seen, weights=given)
+    J, r = plainly(patch, features)
+    roots = torch.cat([given, given.repeat_interleave(3), torch.ones(8)]).sqrt()
+    prior = torch.eye(len(features)) * len(features) / 2 / patch.size**2
+    misfits = []
+    for row in range(20):
+        others = roots.clone().index_fill(0, torch.tensor([row]), 0.0)
+        rest, wanted = J * others[:, None], r * others
+        left_out = torch.linalg.solve(rest.T @ rest + prior, rest.T @ wanted)
+        misfits.append(float((patch.value[row] - value[row] @ left_out).abs()))
+    misfit = torch.tensor(misfits).double()
+    deviation = max(POSITION, float(misfit.median()) / 0.6745)
+    expected = (5.0 * deviation / misfit).square().clamp(max=1.0)
+    found = PatchSystem(patch, features, LENGTH, patch.size).robust_weights(POSITION, ANGLE)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-8)
+    assert set((found < 1.0).nonzero()[:, 0].tolist()) == {4, 11}
 
 
 def test_a_correction_is_brought_within_its_bounds(patch: Patch, features: Features) -> None:
