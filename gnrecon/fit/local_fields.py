@@ -21,7 +21,7 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import CubeSpace
-from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem
+from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem, precise_enough
 from gnrecon.fit.model_selection import FieldResiduals
 from gnrecon.fit.parameters import LocalFieldParameters, LocalSolveParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
@@ -126,7 +126,7 @@ def solve_cube(
     patch = residuals.patch(rows, space.center, space.far(), device)
     position, angle = hyperparameters.position, hyperparameters.angle
     if penalties is None:
-        features = _precise_enough(features, patch, length, hyperparameters)
+        features = precise_enough(features, patch, length, position, angle)
     if hyperparameters.robust:
         patch = _without_contradictions(patch, features, length, hyperparameters)
     if hyperparameters.by_place and penalties is None:
@@ -136,14 +136,6 @@ def solve_cube(
     if penalties is None:
         return length, system.solve_with_bounds(position, angle, draw)
     return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
-
-
-def _precise_enough(features: Features, patch: Patch, length: float, hyperparameters: Hyperparameters) -> Features:
-    """Return the features in the precision that the noise of a cube's data asks for."""
-    position, angle = patch.size / hyperparameters.position, patch.size / length / hyperparameters.angle
-    # A row of J has mean squares of one for a value and for each of a normal's three components, for features of
-    # variance one.
-    return features.precise_enough(len(patch.value) * (position**2 + 3 * angle**2))
 
 
 def _without_contradictions(

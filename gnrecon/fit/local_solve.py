@@ -292,12 +292,13 @@ class PatchSystem:
 class LocalRowSystem:
     """The same system in the space of its rows, for a patch of few points: K + 1 with K = s^2 J J^T.
 
-    The most probable amplitudes are s^2 J^T (s^2 J J^T + 1)^-1 r. Parameters are those of `PatchSystem`.
+    The most probable amplitudes are s^2 J^T (s^2 J J^T + 1)^-1 r. Parameters are those of `PatchSystem`, but the
+    features take the precision of the patch.
     Source: Rasmussen and Williams (2006), equation 2.12.
     """
 
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
-        variance = size**2 * 2.0 / len(features)
+        variance, features = size**2 * 2.0 / len(features), features.to(patch.value.dtype)
         sines, slopes = _data_rows(patch, features, length, slice(None))
         free, wanted = _volume_rows(patch, features, length)
         rows = torch.cat([sines, *slopes, free])
@@ -330,6 +331,14 @@ def patch_system(patch: Patch, features: Features, length: float, size: float) -
     rows = 4 * len(patch.points) + len(patch.volume)
     by_rows = rows < len(features) and patch.weights is None
     return (LocalRowSystem if by_rows else PatchSystem)(patch, features, length, size)
+
+
+def precise_enough(features: Features, patch: Patch, length: float, position: float, angle: float) -> Features:
+    """Return the features in the precision that a patch's noise asks for; parameters as those of `PatchSystem`."""
+    position, angle = patch.size / position, patch.size / length / angle
+    # A row of J has mean squares of one for a value and for each of a normal's three components, for features of
+    # variance one.
+    return features.precise_enough(len(patch.value) * (position**2 + 3 * angle**2))
 
 
 def _factor(

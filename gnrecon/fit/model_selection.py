@@ -24,7 +24,7 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import Volume
-from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system
+from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system, precise_enough
 from gnrecon.fit.marginal_likelihood import MarginalLikelihood, SurfaceLikelihood, clean_noise
 from gnrecon.fit.parameters import (
     MarginalLikelihoodParameters,
@@ -334,11 +334,12 @@ class CrossValidation:
             far = np.linalg.norm(self.residuals.points[rows] - center, axis=1)
             rows = rows[np.sort(np.argsort(far, kind="stable")[:most])]
         patch = self.residuals.patch(rows, center, Volume.none(), self.device)
-        system = patch_system(patch, self.features, length, patch.size)
+        noises = self.noises(length)
+        features = precise_enough(self.features, patch, length, *np.min(noises, axis=0))
+        system = patch_system(patch, features, length, patch.size)
         target = self.residuals.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.residuals.normals[predicted], device=self.device)
         # On a nearly exact scan, the limit by the residuals makes several noises equal.
-        noises = self.noises(length)
         found = {each: self._score(system.solve(*each), target, normals, length) for each in set(noises)}
         return [found[each] for each in noises]
 
