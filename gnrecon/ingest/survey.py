@@ -164,19 +164,30 @@ def is_single_sheet(
 
 
 def fill_a_volume(
-    points: Float, *, neighbours: int = 64, queries: int = 2000, points_per_neighbour: int = 16, least: float = 0.15
+    points: Float,
+    *,
+    neighbours: int = 64,
+    near_neighbours: int = 8,
+    queries: int = 2000,
+    points_per_neighbour: int = 16,
+    least: float = 0.15,
+    least_near_share: float = 0.3,
 ) -> bool:
     """Return whether points fill a volume instead of lying on its surface.
 
-    The surface variation of many neighbours is then 0.23 to 0.33; on noisy and doubled surfaces it is at most 0.1.
+    The surface variation of many neighbours is then 0.2 to 0.33, and that of the nearest ones at least 0.4 of it; on
+    noisy and doubled surfaces the former is at most 0.1. Between walls as close as those of a foam, where it is 0.2,
+    the nearest neighbours lie flat.
 
     Parameters
     ----------
     points : array of shape (N, 3), centred, distinct
     neighbours : of a point, itself included; so many that noise is thin against their extent
+    near_neighbours : the nearest of these
     queries : random points at which they are looked up
     points_per_neighbour : fewer points are not examined, because the neighbours would span the shape
-    least : surface variation in the median
+    least : surface variation of all neighbours, in the median
+    least_near_share : that of the nearest ones, as a share of it
     """
     if len(points) < points_per_neighbour * neighbours:
         return False
@@ -184,7 +195,9 @@ def fill_a_volume(
 
     some = np.random.default_rng(0).permutation(len(points))[:queries]
     near = cKDTree(points).query(points[some], neighbours)[1]
-    return float(np.median(surface_variation(points[near]))) > least
+    variation = float(np.median(surface_variation(points[near])))
+    of_nearest = float(np.median(surface_variation(points[near[:, :near_neighbours]])))
+    return variation > least and of_nearest > least_near_share * variation
 
 
 def outer_surface(

@@ -122,6 +122,18 @@ def test_surfaces_are_neither_lines_nor_volumes(rng: np.random.Generator) -> Non
         assert not fill_a_volume(points)
 
 
+def test_walls_close_to_each_other_fill_no_volume(rng: np.random.Generator) -> None:
+    x = rng.uniform(0.0, 8 * np.pi, (10_000, 3))
+    for _ in range(10):  # Newton steps onto a gyroid of four periods
+        y, z = np.roll(x, -1, axis=1), np.roll(x, -2, axis=1)
+        value, slope = (np.sin(x) * np.cos(y)).sum(axis=1), np.cos(x) * np.cos(y) - np.sin(z) * np.sin(x)
+        x = x - (value / (slope**2).sum(axis=1).clip(0.3))[:, None] * slope
+    assert np.abs((np.sin(x) * np.cos(np.roll(x, -1, axis=1))).sum(axis=1)).max() < 0.01
+    for noise in (0.0, 0.05):
+        assert not fill_a_volume(x - x.mean(axis=0) + noise * rng.standard_normal(x.shape))
+    assert fill_a_volume(rng.uniform(-1.0, 1.0, (10_000, 3)))
+
+
 def test_overlapping_strips_are_no_repeated_scan(rng: np.random.Generator) -> None:
     """Two surveys of one terrain that share a strip, in which one point in eight lies close to one of the other."""
     first, second = rng.uniform(0, 1, (2, 3000, 3)) * [1, 1, 0.01]

@@ -77,7 +77,8 @@ class SharpShape:
             averaging = BilateralFilter(p.averaging_width_radii, p.averaging_normal_scale)
             averaged = averaging.apply(points, normals)
             edges = EdgeCompletion(*averaged, parameters.edges)
-            if not _is_even_and_sharp(edges, p):
+            # Rough averaged points may still be snapped, but not those of a shape without edges.
+            if not _is_sharp(edges, p):
                 return None
             snapped = snap_to_primitives(points, normals, averaged, parameters.snapping)
             points, normals = averaged
