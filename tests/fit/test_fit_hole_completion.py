@@ -6,6 +6,7 @@ import made_shapes
 import numpy as np
 import pytest
 from made_shapes import bored_plate
+from scipy import ndimage
 
 from gnrecon.fit import FitOptions, fit
 from gnrecon.fit.shape_priors.bores import in_bore_opening
@@ -235,6 +236,17 @@ def test_the_side_of_a_can_goes_on() -> None:
 def test_whole_shapes_and_round_ones_have_nothing_to_go_on(scan: tuple[Float, Float]) -> None:
     across = complete_holes(*scan)
     assert len(across) == across.holes == 0
+
+
+def test_holes_are_not_looked_for_in_free_form_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    searches: list[int] = []
+    monkeypatch.setattr(ndimage, "label", lambda cells, **_: searches.append(1) or (0 * cells, 0))
+    points, normals = made_shapes.sphere(2000, 0, SIDE)
+    some = points[:, 2] < 0.4 * SIDE
+    assert not len(complete_holes(points[some], normals[some]))
+    assert not searches
+    complete_holes(*without(*cube(2000), [SIDE, SIDE, SIDE], 0.3))
+    assert searches
 
 
 def test_a_round_shape_with_one_flat_side_is_not_extended() -> None:

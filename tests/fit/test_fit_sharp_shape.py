@@ -108,6 +108,20 @@ def test_noisy_faces_are_averaged_first() -> None:
     assert found.snapped.primitives == 6
 
 
+def test_faces_are_found_where_normals_are_far_off() -> None:
+    scan = cube(1500, tilt=0.3)
+    averaged = EdgeCompletion(*AVERAGING.apply(scan.points, scan.normals))
+    # Averages are rough as well, which says nothing of the faces.
+    assert averaged.roughness > SharpShapeParameters.max_roughness_radii
+    found = SharpShape.of(scan)
+    assert found is not None
+    assert found.snapped is not None
+    assert found.snapped.on_primitive.mean() > 0.7
+    radius = Density(scan.points).radius
+    assert np.median(off_cube(found.snapped.points)) < 0.01 * radius
+    assert SharpShape.of(ball(1500, 0.01)) is None
+
+
 @pytest.mark.parametrize("samples", [ball(60), ball(1500), ball(1500, 0.01), rounded(3000, 0.3)])
 def test_smooth_shapes_have_no_edges(samples: Samples) -> None:
     assert SharpShape.of(samples) is None
