@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import CubeSpace
 from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem, precise_enough
 from gnrecon.fit.model_selection import FieldResiduals
-from gnrecon.fit.parameters import LocalFieldParameters, LocalSolveParameters
+from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.octree import DipoleTree
@@ -127,33 +127,15 @@ def solve_cube(
     position, angle = hyperparameters.position, hyperparameters.angle
     if penalties is None:
         features = precise_enough(features, patch, length, position, angle)
-    if hyperparameters.robust:
-        patch = _without_contradictions(patch, features, length, hyperparameters)
     if hyperparameters.by_place and penalties is None:
         length = _likeliest_length(patch, features, length, (position, angle), parameters)
     system = PatchSystem(patch, features, length, hyperparameters.rms_factor * patch.rms)
+    if hyperparameters.robust:
+        system = system.reweighted(position, angle)
     draw = partial(space.near, length, position)
     if penalties is None:
         return length, system.solve_with_bounds(position, angle, draw)
     return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
-
-
-def _without_contradictions(
-    patch: Patch,
-    features: Features,
-    length: float,
-    hyperparameters: Hyperparameters,
-    *,
-    parameters: LocalSolveParameters = LocalSolveParameters(),
-) -> Patch:
-    """Return the patch with less weight of points that contradict the others, by reweighted least squares."""
-    for _ in range(parameters.robust_passes):
-        system = PatchSystem(patch, features, length, hyperparameters.rms_factor * patch.rms)
-        weights = system.robust_weights(hyperparameters.position, hyperparameters.angle)
-        if not (weights < 1.0).any():
-            break
-        patch = replace(patch, weights=weights)
-    return patch
 
 
 def _likeliest_length(

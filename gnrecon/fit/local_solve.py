@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -221,6 +221,22 @@ class PatchSystem:
             self._volume = product.add_(rows.T @ rows), right.add_(rows.T @ wanted.to(rows))
             amplitudes = self.solve(position, angle)
         return amplitudes
+
+    def reweighted(
+        self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
+    ) -> PatchSystem:
+        """Return the system with less weight of points that contradict the others, or itself where none does.
+
+        By iteratively reweighted least squares, see `robust_weights`; `position` and `angle` are the noise.
+        """
+        system = self
+        for _ in range(parameters.robust_passes):
+            weights = system.robust_weights(position, angle)
+            if not (weights < 1.0).any():
+                break
+            patch = replace(self._patch, weights=weights)
+            system = PatchSystem(patch, self._features, self._length, self._size)
+        return system
 
     def robust_weights(
         self, position: float, angle: float, *, parameters: LocalSolveParameters = LocalSolveParameters()
