@@ -6,6 +6,7 @@ stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon
 
 from __future__ import annotations
 
+import gc
 import os
 import shlex
 import sys
@@ -76,6 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     with lenient_streams() as streams, polite_ends(process_ends=arguments is None):
         if is_capped():
             continue_in_child()
+        if arguments is None:
+            # Imports make many objects and no garbage, for which Python would look five hundred times.
+            gc.set_threshold(50_000)
         words = list(sys.argv[1:] if arguments is None else arguments)
         try:
             code = _run(words)

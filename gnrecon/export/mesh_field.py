@@ -120,7 +120,7 @@ def cells_for_faces(
     most_cells: int = 224,
     samples: int = 2000,
     chord_ratio: float = 0.07,
-    error_share: float = 0.2,
+    error_share: float = 0.4,
 ) -> int:
     """Return the cells that the faces need: more for a smooth shape without noise, fewer where noise hides the gain.
 
