@@ -195,10 +195,10 @@ class CoarseDistance:
         """Return the sign of the distance, of shape (Q,), at x, of shape (Q, 3)."""
         return sign_of_winding(self.winding_number(x))
 
-    def winding_number(self, x: Float, batch: int = 64) -> Float:
+    def winding_number(self, x: Float) -> Float:
         """Return w, of shape (Q,), at points x, of shape (Q, 3), such that 1/2 divides inside from outside."""
         # With so few sources, disks are large enough for single precision.
-        found = winding_number(x, self._sources, self._dipoles, self._radii, batch, torch.float32)
+        found = winding_number(x, self._sources, self._dipoles, self._radii, torch.float32)
         return self._level.centred(found, self._density.tree.query(x)[0]) if self._level.is_open else found
 
 
@@ -236,7 +236,14 @@ def is_sign_certain(winding: Float, *, margin: float = 0.25) -> Mask:
 
 
 def winding_number(
-    x: Float, sources: Float, dipoles: Float, radii: Float, batch: int = 64, dtype: torch.dtype = torch.float64
+    x: Float,
+    sources: Float,
+    dipoles: Float,
+    radii: Float,
+    dtype: torch.dtype = torch.float64,
+    *,
+    batch_terms: int = 1 << 18,
+    least_batch: int = 64,
 ) -> Float:
     """Return the winding number w, of shape (Q,), of dipoles at points x, of shape (Q, 3).
 
@@ -246,9 +253,10 @@ def winding_number(
     sources : array of shape (J, 3), positions of the dipoles
     dipoles : array of shape (J, 3), each a normal times its area, over 4 pi
     radii : array of shape (J,), of disks of these areas; within its disk a term is bounded
-    batch : points per matrix product; with 64 the terms fit into the processor's cache
     dtype : of the terms; single precision is several times faster, and accurate enough for radii above 1e-3 of the
         coordinates
+    batch_terms : of a matrix product, which fit into the processor's cache
+    least_batch : points of one
     """
     # sum_j d_j . (p_j - x) / |p_j - x|^3, with the squares expanded so that both factors are matrix products.
     ones = np.ones(len(x))
@@ -265,7 +273,7 @@ def winding_number(
         flux = (some[:, [0, 1, 2, 4]] @ to_flux).mul_(near).mul_(near).mul_(near)
         found[rows] = flux.sum(dim=1).numpy()
 
-    map_in_threads(fill, slices(len(x), batch))
+    map_in_threads(fill, slices(len(x), max(least_batch, batch_terms // max(len(sources), 1))))
     return found
 
 

@@ -16,6 +16,7 @@ Entry: `resample_primitives`.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from gnrecon.fit.shape_priors.face_sampling import FaceSampler, FaceSamples, crosses_face
@@ -166,8 +167,8 @@ def _two_sided(
     for _ in range(rounds):
         some = np.concatenate([kept, np.ones(len(rest), dtype=bool)])
         dipoles = directions[some] * (areas[some] / (4 * np.pi))[:, None]
-        winding = winding_number(samples, sources[some], dipoles, np.sqrt(areas[some] / np.pi))
-        kept &= np.abs(winding - 0.5) < max_winding_offset
+        winding = winding_number(samples[kept], sources[some], dipoles, np.sqrt(areas[some] / np.pi), torch.float32)
+        kept[kept] = np.abs(winding - 0.5) < max_winding_offset
     return kept
 
 
