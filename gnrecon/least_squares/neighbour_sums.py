@@ -85,7 +85,7 @@ class NeighbourSums:
             product = (
                 jacobian.gram() if runs == jacobian.rows else gram(jacobian.run_sums(lengths), len(metric), metric)
             )
-            return PreparedGram(product, metric)
+            return PreparedGram(product, metric, jacobian.stored)
         scale = metric.rsqrt()
         E = torch.cat([metric.new_zeros(0, len(metric)), *jacobian.run_sums(lengths)]).mul_(scale)
         return PreparedSums(E, gram([E.T], len(E), E), scale)

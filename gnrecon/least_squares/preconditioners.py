@@ -107,14 +107,20 @@ def definite_factor(product: Tensor, diagonal: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PreparedGram:
-    """An approximation of J^T J, of shape (p, p), its lower triangle valid, and D's diagonal."""
+    """An approximation of J^T J, of shape (p, p), its lower triangle valid, D's diagonal, and the precision of J."""
 
     product: Tensor
     metric: Tensor
+    stored: torch.dtype = torch.float64
 
     def at(self, damping: float) -> Apply:
-        """Return r -> (product + damping D)^-1 r."""
-        factor = definite_factor(self.product, damping * self.metric)
+        """Return r -> (product + damping D)^-1 r, in single precision where J has it and the damping hides that."""
+        diagonal = damping * self.metric
+        if self.stored == torch.float32:
+            rounded = damped_factor(self.product.float(), diagonal.float(), overwrite=True)
+            if rounded is not None:
+                return lambda r: solve_factored(rounded, r.to(rounded)).to(r)
+        factor = definite_factor(self.product, diagonal)
         return lambda r: solve_factored(factor, r)
 
 
@@ -131,7 +137,8 @@ class SampledGram:
                 gram((chunk.to(metric) for chunk in jacobian.dense()), jacobian.columns, metric), metric
             )
         drawn, scales = draw_rows(jacobian, self.rows, generator)
-        return PreparedGram(gram(_scaled(jacobian.sample(drawn), scales), jacobian.columns, metric), metric)
+        product = gram(_scaled(jacobian.sample(drawn), scales), jacobian.columns, metric)
+        return PreparedGram(product, metric, jacobian.stored)
 
     def describe(self) -> str:
         """Name it."""

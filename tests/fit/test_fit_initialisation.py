@@ -14,6 +14,7 @@ from gnrecon.field import Siren
 from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.fit.initialisation import LastLayer, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
+from gnrecon.fit.parameters import ObjectiveParameters
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
 
@@ -91,6 +92,24 @@ def test_terms_without_points_have_no_equations() -> None:
     whole = LastLayer.of(field, terms, theta)
     assert torch.equal(whole.plus(empty).product, whole.product)
     assert torch.equal(LastLayer.of(field, [*terms, none], theta).gradient, whole.gradient)
+
+
+@pytest.mark.parametrize("term", range(3), ids=["values", "normals", "distances"])
+def test_a_wide_layers_equations_are_those_of_its_rows(term: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, terms, theta = draw((20,))
+    weights = torch.linspace(0.5, 2.0, len(terms[term]), dtype=torch.float64)
+    chosen = [replace(terms[term], weight=weights)]
+    found = LastLayer.of(field, chosen, theta)
+    # In several chunks as in one.
+    monkeypatch.setattr(ObjectiveParameters, "chunk_points", 7)
+    chunks = LastLayer.of(field, chosen, theta)
+    monkeypatch.setattr("gnrecon.fit.initialisation._ONE_LAYER_SUMS", {})
+    rows = LastLayer.of(field, chosen, theta)
+    # Sines at coarse distances are rounded.
+    near = {"rtol": 0.0, "atol": 1e-5 if term == 2 else 1e-12}
+    for equations in (found, chunks):
+        torch.testing.assert_close(equations.product.tril(), rows.product.tril(), **near)
+        torch.testing.assert_close(equations.gradient, rows.gradient, **near)
 
 
 def test_values_that_are_not_finite_end_with_a_sentence() -> None:

@@ -23,6 +23,7 @@ from gnrecon.least_squares import (
     SampledGram,
     Sketch,
     conjugate_gradients,
+    preconditioners,
 )
 from gnrecon.least_squares.krylov import Apply, KrylovResult
 from gnrecon.least_squares.neighbour_sums import PreparedSums, run_lengths
@@ -159,6 +160,27 @@ def test_sampled_rows_that_are_stored_in_float32_are_multiplied_in_float64() -> 
     P = as_matrix(at(SampledGram(1000), jacobian, torch.ones(J.shape[1], dtype=F64), 1e-10), J.shape[1])
     # Six rows leave a null space, in which P^-1 is 1 / damping; float32 products would put 1e-7 |J|^2 there.
     assert float(torch.linalg.eigvalsh(0.5 * (P + P.T))[-1]) == pytest.approx(1e10, rel=1e-2)
+
+
+def test_rounded_rows_have_a_rounded_factor_where_the_damping_hides_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A singular matrix, to which single precision adds nothing below 1e-7.
+    product, D = torch.ones(2, 2, dtype=F64), torch.ones(2, dtype=F64)
+    r = torch.tensor([1.0, 0.5], dtype=F64)
+    asked = []
+    factor = preconditioners.damped_factor
+
+    def counted(product: Tensor, diagonal: Tensor, overwrite: bool = False) -> Tensor | None:
+        asked.append(product.dtype)
+        return factor(product, diagonal, overwrite)
+
+    monkeypatch.setattr(preconditioners, "damped_factor", counted)
+    prepared = preconditioners.PreparedGram(product, D, torch.float32)
+    for damping, precisions in ((0.1, [torch.float32]), (1e-12, [torch.float32, torch.float64])):
+        asked.clear()
+        found = prepared.at(damping)(r)
+        assert asked == precisions
+        assert found.dtype == F64
+        torch.testing.assert_close(product @ found + damping * found, r, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("preconditioner", [SampledGram(300), Sketch(15.0)], ids=lambda p: type(p).__name__)
