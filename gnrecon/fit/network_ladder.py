@@ -148,9 +148,7 @@ class NetworkLadder:
                 field, start.terms.scene, terms, start.rng, InitialisationParameters.hidden_weight_share
             )
             # The score rises before it falls, as the damping finds its size: no patience ends these steps.
-            return start._fitted(
-                field, theta, steps, patience=steps, rows_per_column=self.parameters.first_rows_per_column
-            )
+            return start._fitted(field, theta, steps, patience=steps)
 
         count = network_starts(len(self.terms.scene.points), parameters=self.parameters)
         starts = replace(self, terms=few)._parts(count)
@@ -182,9 +180,7 @@ class NetworkLadder:
         counts = {width: Siren((width,) * self.parameters.depth).layout.count for width in wider}
         return [first, *(width for width, count in counts.items() if points <= count <= 4 * points)]
 
-    def _fitted(
-        self, field: Siren, theta: Tensor, steps: int, *, patience: int | None = None, rows_per_column: float = np.inf
-    ) -> Solution:
+    def _fitted(self, field: Siren, theta: Tensor, steps: int, *, patience: int | None = None) -> Solution:
         """Take at most so many steps of Gauss-Newton; return the parameters of the least score."""
         noise = self.terms.noise(field, theta)
         residual = 0.0
@@ -215,7 +211,7 @@ class NetworkLadder:
 
         patience = self.parameters.patience_steps if patience is None else patience
         stop = StopRule(steps, tolerance=self.parameters.least_gain, patience=steps + 1, held_out_patience=patience)
-        return self._optimiser(rows_per_column=rows_per_column).run(problem_at, theta, stop, record, score)
+        return self._optimiser().run(problem_at, theta, stop, record, score)
 
     def _refitted(self, field: Siren, theta: Tensor, scene: Scene) -> tuple[Siren, Tensor]:
         """Return a network after some steps on other points."""
@@ -232,10 +228,9 @@ class NetworkLadder:
             raise KeyboardInterrupt
         return field, solution.theta
 
-    def _optimiser(self, length: float = 1.0, rows_per_column: float = np.inf) -> GaussNewton:
+    def _optimiser(self, length: float = 1.0) -> GaussNewton:
         damping = self.parameters.damping
-        search = GainRatioDamping(damping, metric=layer_scaled, geodesic=True, length=length)
-        return GaussNewton(search, Cholesky(rows_per_column))
+        return GaussNewton(GainRatioDamping(damping, metric=layer_scaled, geodesic=True, length=length), Cholesky())
 
 
 def _last(solutions: Sequence[Solution]) -> Solution:

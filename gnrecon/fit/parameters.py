@@ -117,7 +117,6 @@ class NetworkLadderParameters:
     first_steps: int = 15  # Gauss-Newton steps of each, and most further ones of the best
     # Most points of these steps, which find the shape as a whole: half as many again as the network has parameters.
     first_rows: int = 1000
-    first_rows_per_column: float = 3.0  # of which J^T J is made in these steps, at most
     steps: int = 15  # of each further width
     patience_steps: int = 8  # without a better score
     least_gain: float = 0.01  # share of the score whose loss ends the steps

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import torch
@@ -47,25 +46,11 @@ class Cholesky:
 
     It squares the condition number of J, so that in float64 dampings below about 1e-14 of J^T J's largest eigenvalue
     are lost in rounding; see `QR`.
-
-    Parameters
-    ----------
-    rows_per_column : J^T J is made of no more rows than that, evenly chosen, times the ratio of their numbers; by
-        default of all. The gradient has all rows. While damped steps are far from the minimum, their direction
-        depends little on it. Source: Byrd, Chin, Neveitt and Nocedal, *On the Use of Stochastic Hessian Information in
-        Optimization Methods for Machine Learning* (2011).
     """
-
-    rows_per_column: float = math.inf
 
     def linearise(self, jacobian: Jacobian, residual: Tensor, metric: Metric) -> NormalSystem:
         """Assemble J^T J."""
-        equations = Equations.of(jacobian, residual, metric)
-        one_in = int(jacobian.rows / (self.rows_per_column * max(jacobian.columns, 1)))
-        if one_in < 2:
-            return NormalSystem(equations, jacobian.gram(), jacobian.stored)
-        rows = torch.arange(0, jacobian.rows, one_in, device=jacobian.device)
-        return NormalSystem(equations, jacobian.sample(rows).gram() * float(one_in), jacobian.stored)
+        return NormalSystem(Equations.of(jacobian, residual, metric), jacobian.gram(), jacobian.stored)
 
     def describe(self) -> str:
         """Name the solver."""

@@ -14,7 +14,6 @@ from torch import Tensor
 from gnrecon.least_squares import (
     SOLVERS,
     Averaged,
-    Cholesky,
     DenseJacobian,
     Jacobian,
     LayeredJacobian,
@@ -279,26 +278,3 @@ def test_the_averaged_matrix_is_the_mean_of_the_steps() -> None:
     torch.testing.assert_close(damped @ step, -(matrices[3].T @ residual))
     other = DenseJacobian(torch.eye(3, dtype=torch.float64))
     torch.testing.assert_close(solver.linearise(other, residual[:3], identity).product, torch.eye(3).double())
-
-
-@pytest.mark.parametrize("rows_per_column", [8.0, 32.0])
-def test_some_of_many_rows_give_a_step_of_nearly_the_same_decrease(rows_per_column: float) -> None:
-    generator = torch.Generator().manual_seed(3)
-    J, r = randn(generator, 2000, 20), randn(generator, 2000)
-    r += 3.0 * J.sum(1)
-    whole = Cholesky().linearise(DenseJacobian(J), r, layer_scaled).solve(1e-3)
-    step = Cholesky(rows_per_column).linearise(DenseJacobian(J), r, layer_scaled).solve(1e-3)
-    assert not torch.equal(step.direction, whole.direction)
-
-    def decrease(s: Tensor) -> float:
-        return 0.5 * float(r @ r - (r + J @ s) @ (r + J @ s))
-
-    # The relative error of J^T J is about the root of columns over rows, and what the decrease loses is its square.
-    assert decrease(step.direction) > (1 - 3 / rows_per_column) * decrease(whole.direction)
-
-
-def test_few_rows_are_all_used() -> None:
-    generator = torch.Generator().manual_seed(3)
-    jacobian, r = DenseJacobian(randn(generator, 39, 20)), randn(generator, 39)
-    steps = [Cholesky(per).linearise(jacobian, r, layer_scaled).solve(0.1).direction for per in (1.0, math.inf)]
-    assert torch.equal(*steps)
