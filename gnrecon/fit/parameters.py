@@ -112,7 +112,7 @@ class NetworkLadderParameters:
     """The widths of the global network, and its steps (`fit.global_network`)."""
 
     depth: int = 3  # hidden layers
-    widths: tuple[int, ...] = (16, 20)  # the others where points are few, see `NetworkLadder`
+    widths: tuple[int, ...] = (16, 24)  # the others where points are few, see `NetworkLadder`
     starts: int = 3  # of the first width, of which the best is fitted further, and widened
     first_steps: int = 15  # Gauss-Newton steps of each, and most further ones of the best
     # Most points of these steps, which find the shape as a whole: half as many again as the network has parameters.

@@ -152,7 +152,14 @@ def test_parts_with_bores_are_scanned_from_outside(name: str, genus: int) -> Non
 def test_groups_and_names_choose_cases_once() -> None:
     assert list(chosen_cases(["noisy", "plate", "noisy"], GROUPS)) == ["plate", *GROUPS["noisy"]]
     assert list(chosen_cases(["clean", "noisy", "sparse"], GROUPS)) == list(GROUPS["analytic"])
-    assert [len(GROUPS[name]) for name in ("srb", "vipss", "organic", "open", "bores")] == [6, 2, 18, 6, 10]
+    assert [len(GROUPS[name]) for name in ("srb", "vipss", "organic", "open", "bores", "damaged")] == [
+        6,
+        2,
+        18,
+        6,
+        10,
+        6,
+    ]
     assert set(chosen_cases(GROUPS, GROUPS)) == set(CASES)
     assert set(hard_cases()).isdisjoint(GROUPS["clean"])
     with pytest.raises(UsageError, match="no case 'teapot'"):
