@@ -27,7 +27,7 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, distance_weight
-from gnrecon.fit.parameters import InitialisationParameters, ObjectiveParameters
+from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.least_squares.direct import damped_factor, solve_factored
@@ -261,10 +261,10 @@ def _add_normals(field: Siren, term: ObjectiveTerm, theta: Tensor, product: Tens
         gradient[:units] += ((cosines.T @ (scale * residual)) * slopes).sum(1)
 
 
-def _weighted(term: ObjectiveTerm, like: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Yield a term's rows, chunk by chunk, and the root of each one's weight, of shape (m, 1)."""
+def _weighted(term: ObjectiveTerm, like: Tensor, *, chunk_points: int = 2048) -> Iterator[tuple[slice, Tensor]]:
+    """Yield a term's rows, chunk by chunk, which bounds the memory, and the root of each one's weight, (m, 1)."""
     scale = torch.as_tensor(term.weight).to(like).expand(len(term)).div(len(term)).sqrt()[:, None]
-    for rows in slices(len(term), ObjectiveParameters.chunk_points):
+    for rows in slices(len(term), chunk_points):
         yield rows, scale[rows]
 
 

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gnrecon.field import Siren
 from gnrecon.field.field_parameters import FieldParameters
+from gnrecon.fit import initialisation
 from gnrecon.fit.initialisation import LastLayer, Spectrum, random_features, solve_last_layer
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
-from gnrecon.fit.parameters import ObjectiveParameters
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
 
@@ -101,9 +101,9 @@ def test_a_wide_layers_equations_are_those_of_its_rows(term: int, monkeypatch: p
     chosen = [replace(terms[term], weight=weights)]
     found = LastLayer.of(field, chosen, theta)
     # In several chunks as in one.
-    monkeypatch.setattr(ObjectiveParameters, "chunk_points", 7)
+    monkeypatch.setitem(initialisation._weighted.__kwdefaults__, "chunk_points", 7)
     chunks = LastLayer.of(field, chosen, theta)
-    monkeypatch.setattr("gnrecon.fit.initialisation._ONE_LAYER_SUMS", {})
+    monkeypatch.setattr(initialisation, "_ONE_LAYER_SUMS", {})
     rows = LastLayer.of(field, chosen, theta)
     # Sines at coarse distances are rounded.
     near = {"rtol": 0.0, "atol": 1e-5 if term == 2 else 1e-12}
