@@ -27,17 +27,13 @@ class NormalSystem(Linearisation):
         factor = self._factor(damping, lambda: self._damped(damping))
         if factor is None:
             return equations.indefinite()
-        solution = solve_factored(factor, -equations.gradient.to(factor)).to(equations.gradient)
-        return equations.step(solution, damping)
+        return equations.step(solve_factored(factor, -equations.gradient), damping)
 
     def _damped(self, damping: float) -> Tensor | None:
         """Return the factor, in single precision where J^T J has been rounded to it and the damping hides that."""
         diagonal = damping * self.equations.metric
-        if self.stored == torch.float32:
-            factor = damped_factor(self.product.float(), diagonal.float(), overwrite=True)
-            if factor is not None:
-                return factor
-        return damped_factor(self.product, diagonal)
+        factor = rounded_factor(self.product, diagonal, self.stored)
+        return damped_factor(self.product, diagonal) if factor is None else factor
 
 
 @dataclass(frozen=True)
@@ -68,12 +64,17 @@ def damped_factor(product: Tensor, diagonal: Tensor, overwrite: bool = False) ->
     return None if int(failed) or not bool(torch.isfinite(factor.diagonal()).all()) else factor
 
 
+def rounded_factor(product: Tensor, diagonal: Tensor, stored: torch.dtype) -> Tensor | None:
+    """Return that factor in single precision, or None where J is not `stored` so or the damping does not hide it."""
+    return damped_factor(product.float(), diagonal.float(), overwrite=True) if stored == torch.float32 else None
+
+
 def solve_factored(factor: Tensor, right: Tensor) -> Tensor:
-    """Return (L L^T)^-1 b for b of shape (p,)."""
+    """Return (L L^T)^-1 b for b of shape (p,), computed in the precision of the factor."""
     # Two triangular solves: torch.cholesky_solve is about twenty times slower for one right-hand side.
-    half = torch.linalg.solve_triangular(factor, right[:, None], upper=False)
+    half = torch.linalg.solve_triangular(factor, right.to(factor)[:, None], upper=False)
     solution: Tensor = torch.linalg.solve_triangular(factor.T, half, upper=True)
-    return solution[:, 0]
+    return solution[:, 0].to(right)
 
 
 # Least squares by QR, without squaring the condition number.

@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from gnrecon.least_squares.direct import damped_factor, solve_factored
+from gnrecon.least_squares.direct import damped_factor, rounded_factor, solve_factored
 from gnrecon.least_squares.jacobian import Jacobian
 from gnrecon.least_squares.krylov import Apply
 from gnrecon.least_squares.layer_products import gram
@@ -116,11 +116,8 @@ class PreparedGram:
     def at(self, damping: float) -> Apply:
         """Return r -> (product + damping D)^-1 r, in single precision where J has it and the damping hides that."""
         diagonal = damping * self.metric
-        if self.stored == torch.float32:
-            rounded = damped_factor(self.product.float(), diagonal.float(), overwrite=True)
-            if rounded is not None:
-                return lambda r: solve_factored(rounded, r.to(rounded)).to(r)
-        factor = definite_factor(self.product, diagonal)
+        rounded = rounded_factor(self.product, diagonal, self.stored)
+        factor = definite_factor(self.product, diagonal) if rounded is None else rounded
         return lambda r: solve_factored(factor, r)
 
 

@@ -23,6 +23,7 @@ from gnrecon.least_squares import (
     SampledGram,
     Sketch,
     conjugate_gradients,
+    direct,
     preconditioners,
 )
 from gnrecon.least_squares.krylov import Apply, KrylovResult
@@ -173,7 +174,8 @@ def test_rounded_rows_have_a_rounded_factor_where_the_damping_hides_that(monkeyp
         asked.append(product.dtype)
         return factor(product, diagonal, overwrite)
 
-    monkeypatch.setattr(preconditioners, "damped_factor", counted)
+    for module in (direct, preconditioners):
+        monkeypatch.setattr(module, "damped_factor", counted)
     prepared = preconditioners.PreparedGram(product, D, torch.float32)
     for damping, precisions in ((0.1, [torch.float32]), (1e-12, [torch.float32, torch.float64])):
         asked.clear()

@@ -168,15 +168,6 @@ def _groups() -> dict[str, dict[str, Case]]:
         "sphere, hole": AnalyticScan("sphere", 1000, hole=0.5),
         "block, hole": AnalyticScan("block", 3000, hole=0.3),
     }
-    # Of shapes that holes and outliers were not in when what deals with them was built.
-    damaged: dict[str, Case] = {
-        "gear, hole": AnalyticScan("gear", 5000, hole=0.3),
-        "stand, hole": AnalyticScan("stand", 3000, hole=0.3),
-        "housing, hole": AnalyticScan("housing", 5000, hole=0.3),
-        "block, outliers 5%": AnalyticScan("block", 3000, noise=0.0025, outliers=0.05),
-        "stand, outliers 5%": AnalyticScan("stand", 3000, noise=0.0025, outliers=0.05),
-        "gyroid, outliers 5%": AnalyticScan("gyroid", 5000, noise=0.0025, outliers=0.05),
-    }
     samples: dict[str, Case] = {
         "bracket_dense": SampleScan("bracket_dense.ply", "bracket_reference.ply", genus=8),
         "bracket_sparse": SampleScan("bracket_sparse.ply", "bracket_reference.ply", genus=8),
@@ -192,11 +183,23 @@ def _groups() -> dict[str, dict[str, Case]]:
         "organic": _organic(),
         "open": _open(),
         "bores": _bores(),
-        "damaged": damaged,
+        "damaged": _damaged(),
         "analytic": clean | noisy | sparse,
         "clean": clean,
         "noisy": noisy,
         "sparse": sparse,
+    }
+
+
+def _damaged() -> dict[str, Case]:
+    """Return scans with holes and outliers of shapes that what deals with these was not built for."""
+    return {
+        "gear, hole": AnalyticScan("gear", 5000, hole=0.3),
+        "stand, hole": AnalyticScan("stand", 3000, hole=0.3),
+        "housing, hole": AnalyticScan("housing", 5000, hole=0.3),
+        "block, outliers 5%": AnalyticScan("block", 3000, noise=0.0025, outliers=0.05),
+        "stand, outliers 5%": AnalyticScan("stand", 3000, noise=0.0025, outliers=0.05),
+        "gyroid, outliers 5%": AnalyticScan("gyroid", 5000, noise=0.0025, outliers=0.05),
     }
 
 
