@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, distance_weight
@@ -31,7 +32,7 @@ from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.least_squares.direct import damped_factor, solve_factored
-from gnrecon.least_squares.layer_products import gram
+from gnrecon.least_squares.layer_products import gram_and_product
 from gnrecon.residuals.constraints import Residual, interface, normal_vector, signed_distance
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import FitError
@@ -194,13 +195,13 @@ class LastLayer:
             (closed if is_closed else others).append(term)
         problem = _last_layer_problem(field, others, theta)
         free = problem.free()
-        product, gradient = free.new_zeros(len(free), len(free)), torch.zeros_like(free)
+        sums = cls(field, theta, free.new_zeros(len(free), len(free)), torch.zeros_like(free))
         if problem.terms:
             jacobian, residual = problem.linearise(free)
-            product, gradient = jacobian.gram(), jacobian.tmv(residual)
+            sums = cls(field, theta, jacobian.gram(), jacobian.tmv(residual))
         for term in closed:
-            _ONE_LAYER_SUMS[term.residual](field, term, theta, product, gradient)
-        return cls(field, theta, product, gradient)
+            sums = sums.plus(cls(field, theta, *_ONE_LAYER_SUMS[term.residual](field, term, theta)))
+        return sums
 
     def plus(self, other: LastLayer, weight: float = 1.0) -> LastLayer:
         """Return the equations of both, the other's with a weight."""
@@ -231,47 +232,53 @@ class LastLayer:
 # S S^T, a third of the work.
 
 
-def _add_values(field: Siren, term: ObjectiveTerm, theta: Tensor, product: Tensor, gradient: Tensor) -> None:
-    """Add J^T J and J^T r of values to sums, of shapes (q, q) and (q,)."""
+def _value_sums(field: Siren, term: ObjectiveTerm, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Return J^T J, its lower triangle valid, and J^T r of values."""
     (slopes, phases), (outer, constant) = field.layout.layers(theta)
     # Coarse distances are far less exact than sines in single precision, which take a third of the time. The products
     # of rounded sines are not rounded: those of rounded products would not be positive definite.
     stored = torch.float32 if term.residual is signed_distance else theta.dtype
-    for rows, scale in _weighted(term, theta):
-        x = term.points[rows].to(stored)
-        features = torch.addmm(phases.to(stored), x, slopes.T.to(stored)).sin_().to(theta.dtype)
-        features = torch.cat([features, features.new_ones(len(features), 1)], 1)
-        value = features @ torch.cat([outer[0], constant])
-        residual = value if term.target is None else value - term.target[rows]
-        features *= scale
-        product += gram([features], len(gradient), theta)
-        gradient += features.T @ (scale[:, 0] * residual)
+
+    def chunks() -> Iterator[tuple[Tensor, Tensor]]:
+        for rows, scale in _weighted(term, theta):
+            x = term.points[rows].to(stored)
+            features = torch.addmm(phases.to(stored), x, slopes.T.to(stored)).sin_().to(theta.dtype)
+            features = torch.cat([features, features.new_ones(len(features), 1)], 1)
+            value = features @ torch.cat([outer[0], constant])
+            residual = value if term.target is None else value - term.target[rows]
+            yield features.mul_(scale), scale[:, 0] * residual
+
+    return gram_and_product(chunks(), len(slopes) + 1, theta)
 
 
-def _add_normals(field: Siren, term: ObjectiveTerm, theta: Tensor, product: Tensor, gradient: Tensor) -> None:
-    """Add J^T J and J^T r of normals to sums, of shapes (q, q) and (q,)."""
+def _normal_sums(field: Siren, term: ObjectiveTerm, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Return J^T J, its lower triangle valid, and J^T r of normals."""
     (slopes, phases), (outer, _) = field.layout.layers(theta)
-    assert term.target is not None
-    units = len(slopes)
-    for rows, scale in _weighted(term, theta):
-        cosines = torch.addmm(phases, term.points[rows], slopes.T).cos_()
-        residual = (cosines * outer) @ slopes - term.target[rows]
-        cosines *= scale
-        product[:units, :units] += gram([cosines], units, theta).mul_(slopes @ slopes.T)
-        gradient[:units] += ((cosines.T @ (scale * residual)) * slopes).sum(1)
+    target = term.target
+    assert target is not None
+
+    def chunks() -> Iterator[tuple[Tensor, Tensor]]:
+        for rows, scale in _weighted(term, theta):
+            cosines = torch.addmm(phases, term.points[rows], slopes.T).cos_()
+            residual = (cosines * outer) @ slopes - target[rows]
+            yield cosines.mul_(scale), scale * residual
+
+    product, along = gram_and_product(chunks(), len(slopes), theta, 3)
+    # The constant has no slope.
+    return pad(product.mul_(slopes @ slopes.T), (0, 1, 0, 1)), pad((along * slopes).sum(1), (0, 1))
 
 
 def _weighted(term: ObjectiveTerm, like: Tensor, *, chunk_points: int = 2048) -> Iterator[tuple[slice, Tensor]]:
-    """Yield a term's rows, chunk by chunk, which bounds the memory, and the root of each one's weight, (m, 1)."""
+    """Yield a term's rows, chunk by chunk, which bounds the memory, and the roots of the weights, of shape (m, 1)."""
     scale = torch.as_tensor(term.weight).to(like).expand(len(term)).div(len(term)).sqrt()[:, None]
     for rows in slices(len(term), chunk_points):
         yield rows, scale[rows]
 
 
-_ONE_LAYER_SUMS: dict[Residual, Callable[[Siren, ObjectiveTerm, Tensor, Tensor, Tensor], None]] = {
-    interface: _add_values,
-    signed_distance: _add_values,
-    normal_vector: _add_normals,
+_ONE_LAYER_SUMS: dict[Residual, Callable[[Siren, ObjectiveTerm, Tensor], tuple[Tensor, Tensor]]] = {
+    interface: _value_sums,
+    signed_distance: _value_sums,
+    normal_vector: _normal_sums,
 }
 
 

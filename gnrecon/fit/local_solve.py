@@ -24,7 +24,7 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.free_space import Volume
 from gnrecon.fit.parameters import LocalSolveParameters
 from gnrecon.least_squares.direct import damped_factor, solve_factored
-from gnrecon.least_squares.layer_products import gram
+from gnrecon.least_squares.layer_products import gram_and_product
 from gnrecon.runtime.chunks import slices
 
 
@@ -161,15 +161,7 @@ class PatchSystem:
 
     def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]], *columns: int) -> tuple[Tensor, Tensor]:
         """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y, of `columns`."""
-        like, count = self._patch.value, len(self._features)
-        right = like.new_zeros(count, *columns)
-
-        def rows() -> Iterator[Tensor]:
-            for chunk, wanted in chunks:
-                right.add_(chunk.T @ wanted.to(chunk))
-                yield chunk
-
-        return gram(rows(), count, like), right
+        return gram_and_product(chunks, len(self._features), self._patch.value, *columns)
 
     def solve(self, position: float, angle: float) -> Tensor:
         """Return amplitudes, of shape (m,), for standard deviations of the noise of positions and normals.

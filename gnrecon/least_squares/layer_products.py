@@ -14,7 +14,7 @@ p).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -221,6 +221,20 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         # Threads share the blocks and no sum, so that the result is the same for any number of them.
         map_in_threads(partial(_add_block, product, rows), blocks, like.device)
     return product
+
+
+def gram_and_product(
+    chunks: Iterable[tuple[Tensor, Tensor]], size: int, like: Tensor, *columns: int
+) -> tuple[Tensor, Tensor]:
+    """Return J^T J, as `gram` does, and J^T y, of shape (size, *columns), of chunks of J's rows with those of y."""
+    right = like.new_zeros(size, *columns)
+
+    def rows() -> Iterator[Tensor]:
+        for chunk, wanted in chunks:
+            right.add_(chunk.T @ wanted.to(chunk))
+            yield chunk
+
+    return gram(rows(), size, like), right
 
 
 def _add_block(product: Tensor, rows: Tensor, block: slice) -> None:
