@@ -8,6 +8,10 @@ repository=$(dirname -- "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")")
 venv=$repository/.venv
 log=$venv/set-up.log
 
+# Compiled modules may always be kept here. Where this variable is set, as in many containers, every start would compile
+# a thousand modules of torch and others again, for as long as it takes to load them.
+unset PYTHONDONTWRITEBYTECODE
+
 say() { printf 'gnrecon: %s\n' "$*" >&2; }
 
 fail() {
