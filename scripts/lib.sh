@@ -103,8 +103,8 @@ make_environment() {
     [ -x "$venv/bin/python" ] || "$python" -m venv -- "$venv" >>"$log" 2>&1 ||
         fail_with_log "No virtual environment could be made"
     # From the repository's folder, where pip looks for the files in its arguments. A release that would have to be
-    # compiled, as fpsample's newest, gives way to an older one that is ready. Python compiles what it imports by itself;
-    # to compile all modules of all packages here would take as long as to unpack them.
+    # compiled, as fpsample's newest, gives way to an older one that is ready. Python compiles what it imports by itself,
+    # and keeps it; to compile all modules of all packages here would take as long as to unpack them.
     (
         cd -- "$repository"
         "$venv/bin/python" -m pip install --no-input --disable-pip-version-check --progress-bar off \
