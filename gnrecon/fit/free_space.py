@@ -7,6 +7,7 @@ a narrow crease, pull the correction so far beyond the surface that a wart grows
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -92,8 +93,7 @@ class CubeSpace:
     ----------
     center, reach : of the cube, reach being half of its edge, unit coordinates
     box : where the field is fitted
-    points : of the cube and its margin, of shape (N, 3)
-    tree, disks : of these and of all around them: a k-d tree, and the radius of the disk of each of its points
+    tree, disks : of all points: a k-d tree, and the radius of the disk of each of its points
     dipoles : of all points
     network, theta : the global field in unit coordinates
     rng : draws the samples
@@ -104,7 +104,6 @@ class CubeSpace:
     center: Float
     reach: float
     box: Box
-    points: Float
     tree: Any
     disks: Float
     dipoles: DipoleTree
@@ -119,19 +118,24 @@ class CubeSpace:
         x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (self.parameters.volume_samples, 3))
         return self._volume(x, self.parameters.clearance_disk_radii, 0.0)
 
-    def near(self, spread: float, noise: float) -> Volume:
-        """Return samples about the data at which the sign is certain.
+    def near(self, length: float, noise: float) -> Volume:
+        """Return samples all over the space about the data where the sign is certain, one in each cell of a lattice.
+
+        Samples drawn at random would miss most warts, which are no larger than the length of the features.
 
         Parameters
         ----------
-        spread : standard deviation of the samples from a point: the length over which the correction fades
+        length : of the correction's features, over which it fades
         noise : standard deviation of the points' positions
         """
-        limits, count = self.parameters, self.parameters.near_samples
-        some = self.points[self.rng.integers(len(self.points), size=count)]
-        x = some + spread * self.rng.standard_normal((count, 3))
-        x = x[(np.abs(x - self.center) < self.reach).all(axis=1)]
-        found = self._volume(x, limits.near_clearance_disk_radii, limits.near_clearance_noises * noise)
+        limits = self.parameters
+        count = math.ceil(2 * self.reach / (limits.near_step_lengths * length))
+        cells = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
+        x = self.center + self.reach * (2.0 * (cells + self.rng.random(cells.shape)) / count - 1.0)
+        most = limits.near_reach_lengths * length
+        x = x[self.tree.query(x, distance_upper_bound=most)[0] < most]
+        clear = limits.near_clearance_noises * noise
+        found = self._volume(x, limits.near_clearance_disk_radii, clear, margin=limits.near_sign_margin)
         bound = np.isfinite(found.lower) | np.isfinite(found.upper)
         return Volume(*(rows[bound] for rows in found.rows()))
 
@@ -141,8 +145,11 @@ class CubeSpace:
         places, moments, radii = self.dipoles.dipoles_for(self.center, self.reach)
         return places - self.center, moments, radii
 
-    def _volume(self, x: Float, clear_disks: float, clear: float) -> Volume:
-        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length."""
+    def _volume(self, x: Float, clear_disks: float, clear: float, **certain: float) -> Volume:
+        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length.
+
+        Keywords say how sure the winding number must be, as those of `is_sign_certain`.
+        """
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
         distance, nearest = self.tree.query(x)
         disks = self.disks[nearest]
@@ -155,4 +162,5 @@ class CubeSpace:
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
         value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, value, signed, is_sign_certain(winding), distance, parameters=self.parameters)
+        sure = is_sign_certain(winding, **certain)
+        return Volume.around(x, value, signed, sure, distance, parameters=self.parameters)
