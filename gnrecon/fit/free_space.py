@@ -135,7 +135,7 @@ class CubeSpace:
         most = limits.near_reach_lengths * length
         x = x[self.tree.query(x, distance_upper_bound=most)[0] < most]
         clear = limits.near_clearance_noises * noise
-        found = self._volume(x, limits.near_clearance_disk_radii, clear, margin=limits.near_sign_margin)
+        found = self._volume(x, limits.near_clearance_disk_radii, clear)
         bound = np.isfinite(found.lower) | np.isfinite(found.upper)
         return Volume(*(rows[bound] for rows in found.rows()))
 
@@ -145,11 +145,8 @@ class CubeSpace:
         places, moments, radii = self.dipoles.dipoles_for(self.center, self.reach)
         return places - self.center, moments, radii
 
-    def _volume(self, x: Float, clear_disks: float, clear: float, **certain: float) -> Volume:
-        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length.
-
-        Keywords say how sure the winding number must be, as those of `is_sign_certain`.
-        """
+    def _volume(self, x: Float, clear_disks: float, clear: float) -> Volume:
+        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length."""
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
         distance, nearest = self.tree.query(x)
         disks = self.disks[nearest]
@@ -162,5 +159,4 @@ class CubeSpace:
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
         value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        sure = is_sign_certain(winding, **certain)
-        return Volume.around(x, value, signed, sure, distance, parameters=self.parameters)
+        return Volume.around(x, value, signed, is_sign_certain(winding), distance, parameters=self.parameters)

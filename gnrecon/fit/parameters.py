@@ -46,7 +46,6 @@ class FreeSpaceParameters:
     clearance_disk_radii: float = 3.5  # their least distance from the data: nearer, the coarse distance is none
     near_step_lengths: float = 1 / 3  # of the lattice about the data on which wrong signs are looked for
     near_reach_lengths: float = 1.5  # from the data to its farthest samples; beyond, a correction has faded
-    near_sign_margin: float = 0.2  # of the winding number from 1/2 there: less than far off, as no hole is meant
     near_clearance_disk_radii: float = 1.0  # their least distance; nearer, points do not tell the side
     near_clearance_noises: float = 3.0  # and so many standard deviations of the points' noise more
     least_field_share: float = 0.7  # of the coarse distance: a field between this
