@@ -7,7 +7,6 @@ a narrow crease, pull the correction so far beyond the surface that a wart grows
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -93,7 +92,8 @@ class CubeSpace:
     ----------
     center, reach : of the cube, reach being half of its edge, unit coordinates
     box : where the field is fitted
-    tree, disks : of all points: a k-d tree, and the radius of the disk of each of its points
+    points : of the cube and its margin, of shape (N, 3)
+    tree, disks : of these and of all around them: a k-d tree, and the radius of the disk of each of its points
     dipoles : of all points
     network, theta : the global field in unit coordinates
     rng : draws the samples
@@ -104,6 +104,7 @@ class CubeSpace:
     center: Float
     reach: float
     box: Box
+    points: Float
     tree: Any
     disks: Float
     dipoles: DipoleTree
@@ -118,24 +119,19 @@ class CubeSpace:
         x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (self.parameters.volume_samples, 3))
         return self._volume(x, self.parameters.clearance_disk_radii, 0.0)
 
-    def near(self, length: float, noise: float) -> Volume:
-        """Return samples all over the space about the data where the sign is certain, one in each cell of a lattice.
-
-        Samples drawn at random would miss most warts, which are no larger than the length of the features.
+    def near(self, spread: float, noise: float) -> Volume:
+        """Return samples about the data at which the sign is certain.
 
         Parameters
         ----------
-        length : of the correction's features, over which it fades
+        spread : standard deviation of the samples from a point: the length over which the correction fades
         noise : standard deviation of the points' positions
         """
-        limits = self.parameters
-        count = math.ceil(2 * self.reach / (limits.near_step_lengths * length))
-        cells = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
-        x = self.center + self.reach * (2.0 * (cells + self.rng.random(cells.shape)) / count - 1.0)
-        most = limits.near_reach_lengths * length
-        x = x[self.tree.query(x, distance_upper_bound=most)[0] < most]
-        clear = limits.near_clearance_noises * noise
-        found = self._volume(x, limits.near_clearance_disk_radii, clear)
+        limits, count = self.parameters, self.parameters.near_samples
+        some = self.points[self.rng.integers(len(self.points), size=count)]
+        x = some + spread * self.rng.standard_normal((count, 3))
+        x = x[(np.abs(x - self.center) < self.reach).all(axis=1)]
+        found = self._volume(x, limits.near_clearance_disk_radii, limits.near_clearance_noises * noise)
         bound = np.isfinite(found.lower) | np.isfinite(found.upper)
         return Volume(*(rows[bound] for rows in found.rows()))
 

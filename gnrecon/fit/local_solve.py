@@ -178,42 +178,40 @@ class PatchSystem:
         self,
         position: float,
         angle: float,
-        near: Volume | None = None,
+        draw: Callable[[], Volume] = Volume.none,
         *,
         parameters: LocalSolveParameters = LocalSolveParameters(),
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
         A one-sided penalty by an active set: where the corrected field is below half of its bound, or has the wrong
-        sign, a row with the bound as target is added, heavier in each pass. The other rows stay in the system.
+        sign, a row with the bound as target is added. The other rows stay in the system.
 
         Parameters
         ----------
         position, angle : standard deviations of the noise
-        near : more samples, of which the bounds alone are used
+        draw : returns more samples for each pass, of which the bounds alone are used
         """
         amplitudes, patch = self.solve(position, angle), self._patch
         sines, lower, upper, zero, distance = self._sines, patch.lower, patch.upper, patch.zero, patch.distance
-        if near is not None:
-            points, _, *others = (torch.as_tensor(values).to(patch.value) for values in near.rows())
+        for _ in range(parameters.bound_passes):
+            more = draw()
+            points, _, *others = (torch.as_tensor(values).to(patch.value) for values in more.rows())
             sines = torch.cat([sines, self._free.phase(points, patch.center, self._length).sin()])
             lower, upper, zero, distance = (
                 torch.cat(pair) for pair in zip((lower, upper, zero, distance), others, strict=True)
             )
-        share = parameters.bound_deviation_share
-        for _ in range(parameters.bound_passes):
             value = (sines @ amplitudes.to(sines)).to(lower)
             low, high = value < (lower + zero) / 2, value > (upper + zero) / 2
             beyond = low | high
             if not beyond.any():
                 break
-            deviation = share * distance[beyond]
+            deviation = parameters.bound_deviation_share * distance[beyond]
             rows = sines[beyond] / deviation[:, None].to(sines)
             wanted = torch.where(low, lower, upper)[beyond] / deviation
             product, right = self._volume
             self._volume = product.add_(rows.T @ rows), right.add_(rows.T @ wanted.to(rows))
             amplitudes = self.solve(position, angle)
-            share *= parameters.bound_tightening
         return amplitudes
 
     def reweighted(
