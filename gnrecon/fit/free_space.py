@@ -7,8 +7,9 @@ a narrow crease, pull the correction so far beyond the surface that a wart grows
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -92,8 +93,7 @@ class CubeSpace:
     ----------
     center, reach : of the cube, reach being half of its edge, unit coordinates
     box : where the field is fitted
-    points : of the cube and its margin, of shape (N, 3)
-    tree, disks : of these and of all around them: a k-d tree, and the radius of the disk of each of its points
+    tree, disks : of all points: a k-d tree, and the radius of the disk of each of its points
     dipoles : of all points
     network, theta : the global field in unit coordinates
     rng : draws the samples
@@ -104,7 +104,6 @@ class CubeSpace:
     center: Float
     reach: float
     box: Box
-    points: Float
     tree: Any
     disks: Float
     dipoles: DipoleTree
@@ -119,21 +118,22 @@ class CubeSpace:
         x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (self.parameters.volume_samples, 3))
         return self._volume(x, self.parameters.clearance_disk_radii, 0.0)
 
-    def near(self, spread: float, noise: float) -> Volume:
-        """Return samples about the data at which the sign is certain.
+    def near(self, length: float, noise: float) -> Volume:
+        """Return samples all over the space about the data where the sign is certain, one in each cell of a lattice.
+
+        Samples drawn at random would miss most warts, which are no larger than the length of the features.
 
         Parameters
         ----------
-        spread : standard deviation of the samples from a point: the length over which the correction fades
+        length : of the correction's features, over which it fades
         noise : standard deviation of the points' positions
         """
-        limits, count = self.parameters, self.parameters.near_samples
-        some = self.points[self.rng.integers(len(self.points), size=count)]
-        x = some + spread * self.rng.standard_normal((count, 3))
-        x = x[(np.abs(x - self.center) < self.reach).all(axis=1)]
-        found = self._volume(x, limits.near_clearance_disk_radii, limits.near_clearance_noises * noise)
-        bound = np.isfinite(found.lower) | np.isfinite(found.upper)
-        return Volume(*(rows[bound] for rows in found.rows()))
+        limits = self.parameters
+        count = math.ceil(2 * self.reach / (limits.near_step_lengths * length))
+        cells = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
+        x = self.center + self.reach * (2.0 * (cells + self.rng.random(cells.shape)) / count - 1.0)
+        clear, most = limits.near_clearance_noises * noise, limits.near_reach_lengths * length
+        return self._volume(x, limits.near_clearance_disk_radii, clear, most)
 
     @cached_property
     def _seen_dipoles(self) -> tuple[Float, Float, Float]:
@@ -141,18 +141,32 @@ class CubeSpace:
         places, moments, radii = self.dipoles.dipoles_for(self.center, self.reach)
         return places - self.center, moments, radii
 
-    def _volume(self, x: Float, clear_disks: float, clear: float) -> Volume:
-        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length."""
+    def _volume(self, x: Float, clear_disks: float, clear: float, most: float | None = None) -> Volume:
+        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length.
+
+        With `most`, the largest distance, those alone of which the sign is certain; bounds are all that is known there.
+        """
+        near = most is not None
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
-        distance, nearest = self.tree.query(x)
-        disks = self.disks[nearest]
+        distance, nearest = self.tree.query(x, distance_upper_bound=most if near else np.inf)
+        # A place with no point within that distance has a row beyond the last.
+        found = np.isfinite(distance)
+        x, distance, disks = x[found], distance[found], self.disks[nearest[found]]
         kept = distance > clear_disks * disks + clear
         x, distance, disks = x[kept], distance[kept], disks[kept]
         winding = winding_number(x - self.center, *self._seen_dipoles, dtype=torch.float32)
         winding = self.dipoles.sides.centred(winding, distance)
+        certain = is_sign_certain(winding)
+        if near:
+            x, distance, disks, winding = (values[certain] for values in (x, distance, disks, winding))
+            certain = certain[certain]
         # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
-        value = self.network.value(self.theta, torch.as_tensor(x).to(self.theta)).double().cpu().numpy()
-        return Volume.around(x, value, signed, is_sign_certain(winding), distance, parameters=self.parameters)
+        # A bound is wide, so that single precision is enough for the field.
+        theta = self.theta.float() if near else self.theta
+        value = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
+        share = self.parameters.near_bound_share if near else self.parameters.sign_bound_share
+        parameters = replace(self.parameters, sign_bound_share=share)
+        return Volume.around(x, value, signed, certain, distance, parameters=parameters)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -132,10 +131,10 @@ def solve_cube(
     system = PatchSystem(patch, features, length, hyperparameters.rms_factor * patch.rms)
     if hyperparameters.robust:
         system = system.reweighted(position, angle)
-    draw = partial(space.near, length, position)
+    near = space.near(length, position)
     if penalties is None:
-        return length, system.solve_with_bounds(position, angle, draw)
-    return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, draw)
+        return length, system.solve_with_bounds(position, angle, near)
+    return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, near)
 
 
 def _likeliest_length(
@@ -211,7 +210,7 @@ class _Cubes:
                 return None
             disks, stretch = density.disks[rows], limits.most_length_stretch
             length = cube_length(hyperparameters, disks, density.radius, most_length_stretch=stretch)
-            space = self._space(keys[number], center, rows)
+            space = self._space(keys[number], center)
             cube = self.residuals, rows, length, space, self.features, hyperparameters, self.device
             return solve_cube(*cube, self.penalties, parameters=limits)
 
@@ -225,14 +224,13 @@ class _Cubes:
         noise = hyperparameters.position, hyperparameters.angle
         return Detail(self.partition, keys[kept], np.array(lengths), self.features, torch.stack(amplitudes), *noise)
 
-    def _space(self, key: Int, center: Float, rows: Int) -> CubeSpace:
-        """Return the space of a cube, the points of which have these rows."""
+    def _space(self, key: Int, center: Float) -> CubeSpace:
+        """Return the space of a cube."""
         sdf, density = self.sdf, self.residuals.density
         return CubeSpace(
             center,
             self.partition.reach,
             sdf.box,
-            self.residuals.points[rows],
             density.tree,
             density.disks,
             self.dipoles,

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
@@ -178,40 +179,46 @@ class PatchSystem:
         self,
         position: float,
         angle: float,
-        draw: Callable[[], Volume] = Volume.none,
+        near: Volume | None = None,
         *,
         parameters: LocalSolveParameters = LocalSolveParameters(),
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
         A one-sided penalty by an active set: where the corrected field is below half of its bound, or has the wrong
-        sign, a row with the bound as target is added. The other rows stay in the system.
+        sign, a row with the bound as target is added, heavier in each pass. The other rows stay in the system. Samples
+        within a length of each other say the same, as the features hardly vary there, and weigh as one together: else
+        the many of a gap in the data would outweigh its points, or the few of a wart would not suffice.
 
         Parameters
         ----------
         position, angle : standard deviations of the noise
-        draw : returns more samples for each pass, of which the bounds alone are used
+        near : more samples, of which the bounds alone are used
         """
         amplitudes, patch = self.solve(position, angle), self._patch
-        sines, lower, upper, zero, distance = self._sines, patch.lower, patch.upper, patch.zero, patch.distance
-        for _ in range(parameters.bound_passes):
-            more = draw()
-            points, _, *others = (torch.as_tensor(values).to(patch.value) for values in more.rows())
+        places, sines = patch.volume, self._sines
+        lower, upper, zero, distance = patch.lower, patch.upper, patch.zero, patch.distance
+        if near is not None:
+            points, _, *others = (torch.as_tensor(values).to(patch.value) for values in near.rows())
+            places = torch.cat([places, points])
             sines = torch.cat([sines, self._free.phase(points, patch.center, self._length).sin()])
             lower, upper, zero, distance = (
                 torch.cat(pair) for pair in zip((lower, upper, zero, distance), others, strict=True)
             )
+        share = parameters.bound_deviation_share
+        for _ in range(parameters.bound_passes):
             value = (sines @ amplitudes.to(sines)).to(lower)
             low, high = value < (lower + zero) / 2, value > (upper + zero) / 2
             beyond = low | high
             if not beyond.any():
                 break
-            deviation = parameters.bound_deviation_share * distance[beyond]
+            deviation = share * distance[beyond] * _crowd(places[beyond], self._length).sqrt()
             rows = sines[beyond] / deviation[:, None].to(sines)
             wanted = torch.where(low, lower, upper)[beyond] / deviation
             product, right = self._volume
             self._volume = product.add_(rows.T @ rows), right.add_(rows.T @ wanted.to(rows))
             amplitudes = self.solve(position, angle)
+            share *= parameters.bound_tightening
         return amplitudes
 
     def reweighted(
@@ -347,6 +354,12 @@ def precise_enough(features: Features, patch: Patch, length: float, position: fl
     # A row of J has mean squares of one for a value and for each of a normal's three components, for features of
     # variance one.
     return features.precise_enough(len(patch.value) * (position**2 + 3 * angle**2))
+
+
+def _crowd(points: Tensor, reach: float) -> Tensor:
+    """Return how many of the points, of shape (N, 3), lie within reach of each, with itself; of shape (N,)."""
+    tree = cKDTree(points.cpu().numpy())
+    return torch.as_tensor(tree.query_ball_point(tree.data, reach, return_length=True)).to(points)
 
 
 def _factor(

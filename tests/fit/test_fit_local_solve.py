@@ -166,25 +166,34 @@ def test_a_sample_at_half_of_its_bound_is_left_alone(patch: Patch, features: Fea
         assert bool((system.solve_with_bounds(POSITION, ANGLE) != before).any()) == moved
 
 
-def test_samples_that_are_drawn_keep_their_bounds_too(patch: Patch, features: Features) -> None:
+def test_samples_near_the_data_keep_their_bounds_too(patch: Patch, features: Features) -> None:
     free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
     system, loose = PatchSystem(free, features, LENGTH, patch.size), (1.0, 10.0)
-    generator, drawn = np.random.default_rng(0), []
-
-    def draw() -> Volume:
-        """Samples at which the corrected field must be at least 1 and is 0 where the correction is 0.5."""
-        drawn.append(generator.standard_normal((30, 3)))
-        ones = np.ones(30)
-        return Volume(drawn[-1], ones, ones, np.inf * ones, 0.5 * ones, ones)
+    # Samples at which the corrected field must be at least 1 and is 0 where the correction is 0.5.
+    points, ones = np.random.default_rng(0).standard_normal((30, 3)), np.ones(30)
+    near = Volume(points, ones, ones, np.inf * ones, 0.5 * ones, ones)
 
     def wrong(amplitudes: Tensor) -> int:
-        x = torch.as_tensor(np.concatenate(drawn))
-        return int((rows(features, x, patch.center)[0] @ amplitudes < 0.5).sum())
+        return int((rows(features, torch.as_tensor(points), patch.center)[0] @ amplitudes < 0.5).sum())
 
-    found = system.solve_with_bounds(*loose, draw)
-    assert 1 < len(drawn) <= LocalSolveParameters.bound_passes
-    # No sum of so few sines keeps all of them.
-    assert wrong(PatchSystem(free, features, LENGTH, patch.size).solve(*loose)) > 100 > 2 * wrong(found)
+    before, after = wrong(system.solve(*loose)), wrong(system.solve_with_bounds(*loose, near))
+    assert before > 10
+    assert after == 0
+
+
+def test_samples_that_stay_beyond_their_bounds_weigh_more_from_pass_to_pass(patch: Patch, features: Features) -> None:
+    free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
+    ones = np.ones(4)
+    near = Volume(patch.points[:4].numpy(), ones, ones, np.inf * ones, 0.5 * ones, ones)
+
+    def misfit(**changed: float) -> float:
+        """How far the correction is from the bounds where the data contradicts them."""
+        parameters = replace(LocalSolveParameters(), **changed)  # type: ignore[arg-type]
+        system = PatchSystem(free, features, LENGTH, patch.size)
+        found = system.solve_with_bounds(1e-3, ANGLE, near, parameters=parameters)
+        return float((rows(features, patch.points[:4], patch.center)[0] @ found - 1.0).norm())
+
+    assert misfit() < misfit(bound_tightening=1.0) < misfit(bound_passes=1)
 
 
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:

@@ -127,7 +127,7 @@ class BlockSolver:
         if len(rows) < LocalFieldParameters.least_points:
             return None
         length = cube_length(self.hyperparameters, self.disks[rows], self.radius)
-        space = self._space(key, center, rows, nearby)
+        space = self._space(key, center, nearby)
         cube = self.residuals, rows, length, space, self.features, self.hyperparameters, self.device
         length, amplitudes = solve_cube(*cube)
         return length, amplitudes.cpu().numpy()
@@ -142,14 +142,13 @@ class BlockSolver:
         at = at[self.cells[at] == codes]
         return ranges(self.first[at], self.first[at + 1])
 
-    def _space(self, key: Int, center: Float, rows: Int, nearby: Int) -> CubeSpace:
-        """Return the space of a cube, the points of which have these rows, with others nearby."""
+    def _space(self, key: Int, center: Float, nearby: Int) -> CubeSpace:
+        """Return the space of a cube, near which the points have these rows."""
         points = self.residuals.points
         return CubeSpace(
             center,
             self.partition.reach,
             self.box,
-            points[rows],
             cKDTree(points[nearby]),
             self.disks[nearby],
             self.dipoles,

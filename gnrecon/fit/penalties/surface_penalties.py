@@ -11,7 +11,7 @@ certain, a one-sided residual (`FreeSpace`) keeps it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -163,21 +163,21 @@ class SurfacePenalties:
         reach: float,
         hyperparameters: Hyperparameters,
         system: PatchSystem,
-        draw: Callable[[], Volume] = Volume.none,
+        near: Volume | None = None,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
     ) -> Tensor:
         """Return the amplitudes of a cube, of shape (m,), of half an edge `reach`; see `PatchSystem` for the rest."""
-        amplitudes = system.solve_with_bounds(hyperparameters.position, hyperparameters.angle, draw)
+        amplitudes = system.solve_with_bounds(hyperparameters.position, hyperparameters.angle, near)
         equations = system.equations(hyperparameters.position, hyperparameters.angle)
         rows = np.asarray((np.abs(self.surface.points - center) < reach).all(axis=1))
         scale = (len(self.density.points) / len(self.surface)) ** 0.5 / hyperparameters.position
         terms = self.terms(rows, scale, amplitudes)
         if equations is None or not terms:
             return amplitudes
-        near = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
+        around = np.asarray((np.abs(self.free.points - center) < reach).all(axis=1))
         terms += self.free.terms(
-            near, self.free_space_values, len(self.density.points) ** 0.5 / hyperparameters.position, amplitudes
+            around, self.free_space_values, len(self.density.points) ** 0.5 / hyperparameters.position, amplitudes
         )
         whole, known = as_sines(self.sdf)
 
