@@ -196,6 +196,24 @@ def test_samples_that_stay_beyond_their_bounds_weigh_more_from_pass_to_pass(patc
     assert misfit() < misfit(bound_tightening=1.0) < misfit(bound_passes=1)
 
 
+@pytest.mark.usefixtures("double")
+def test_samples_that_say_the_same_weigh_as_one(patch: Patch, features: Features) -> None:
+    free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
+    near = patch.points[:1].numpy()
+    apart = near + np.array([1.1 * LENGTH, 0.0, 0.0])
+
+    def found(*places: np.ndarray) -> Tensor:
+        points, ones = np.concatenate(places), np.ones(len(places))
+        samples = Volume(points, ones, 5 * ones, np.inf * ones, 5 * ones, ones)
+        once = replace(LocalSolveParameters(), bound_passes=1)
+        return PatchSystem(free, features, LENGTH, patch.size).solve_with_bounds(1e-3, ANGLE, samples, parameters=once)
+
+    torch.testing.assert_close(found(*10 * [near]), found(near), rtol=1e-6, atol=1e-9)
+    both, crowded = found(near, apart), found(*10 * [near], apart)
+    torch.testing.assert_close(crowded, both, rtol=1e-6, atol=1e-9)
+    assert (both - found(near)).norm() > 0.01 * both.norm()
+
+
 def test_more_noise_means_less_of_it_is_followed(patch: Patch, features: Features) -> None:
     system = PatchSystem(patch, features, LENGTH, patch.size)
     misfits = []
