@@ -132,7 +132,8 @@ class CubeSpace:
         count = math.ceil(2 * self.reach / (limits.near_step_lengths * length))
         cells = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
         x = self.center + self.reach * (2.0 * (cells + self.rng.random(cells.shape)) / count - 1.0)
-        clear, most = limits.near_clearance_noises * noise, limits.near_reach_lengths * length
+        clear = limits.near_clearance_noises * noise
+        most = limits.near_reach_lengths * length + clear
         return self._volume(x, limits.near_clearance_disk_radii, clear, most)
 
     @cached_property

@@ -185,30 +185,31 @@ class PatchSystem:
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
-        A one-sided penalty by an active set: where the corrected field is below half of its bound, or has the wrong
-        sign, a row with the bound as target is added, heavier in each pass. The other rows stay in the system. Samples
+        A one-sided penalty by an active set: where the corrected field has the wrong sign, or far from the data less
+        than half of its bound, a row with the bound as target is added, heavier in each pass. The others stay. Samples
         within a length of each other say the same, as the features hardly vary there, and weigh as one together: else
         the many of a gap in the data would outweigh its points, or the few of a wart would not suffice.
 
         Parameters
         ----------
         position, angle : standard deviations of the noise
-        near : more samples, of which the bounds alone are used
+        near : samples near the data, of which the bounds alone are used
         """
         amplitudes, patch = self.solve(position, angle), self._patch
-        places, sines = patch.volume, self._sines
-        lower, upper, zero, distance = patch.lower, patch.upper, patch.zero, patch.distance
+        places, sines, distance = patch.volume, self._sines, patch.distance
+        lower, upper = patch.lower, patch.upper
+        least, most = (lower + patch.zero) / 2, (upper + patch.zero) / 2
         if near is not None:
-            points, _, *others = (torch.as_tensor(values).to(patch.value) for values in near.rows())
-            places = torch.cat([places, points])
+            points, _, low, high, zero, off = (torch.as_tensor(values).to(patch.value) for values in near.rows())
+            places, distance = torch.cat([places, points]), torch.cat([distance, off])
             sines = torch.cat([sines, self._free.phase(points, patch.center, self._length).sin()])
-            lower, upper, zero, distance = (
-                torch.cat(pair) for pair in zip((lower, upper, zero, distance), others, strict=True)
-            )
+            lower, upper = torch.cat([lower, low]), torch.cat([upper, high])
+            least = torch.cat([least, torch.where(low.isfinite(), zero, low)])
+            most = torch.cat([most, torch.where(high.isfinite(), zero, high)])
         share = parameters.bound_deviation_share
         for _ in range(parameters.bound_passes):
             value = (sines @ amplitudes.to(sines)).to(lower)
-            low, high = value < (lower + zero) / 2, value > (upper + zero) / 2
+            low, high = value < least, value > most
             beyond = low | high
             if not beyond.any():
                 break

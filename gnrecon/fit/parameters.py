@@ -45,7 +45,7 @@ class FreeSpaceParameters:
     volume_samples: int = 400  # of a whole cube
     clearance_disk_radii: float = 3.5  # their least distance from the data: nearer, the coarse distance is none
     near_step_lengths: float = 1 / 3  # of the lattice about the data on which wrong signs are looked for
-    near_reach_lengths: float = 1.5  # from the data to its farthest samples; beyond, a correction has faded
+    near_reach_lengths: float = 1.5  # from the noisy data to its farthest samples; beyond, corrections have faded
     near_clearance_disk_radii: float = 1.0  # their least distance; nearer, points do not tell the side
     near_clearance_noises: float = 3.0  # and so many standard deviations of the points' noise more
     near_bound_share: float = 0.25  # of the distance to the nearest point, that the field must keep there
@@ -167,7 +167,7 @@ class LocalSolveParameters:
 
     correction_rms_factor: float = 3.0  # prior standard deviation of the correction, over the residuals' RMS
     volume_deviation_share: float = 0.5  # standard deviation in free space, as a share of the distance from the data
-    bound_passes: int = 5  # most active-set passes, while some samples are beyond half of their bound
+    bound_passes: int = 5  # most active-set passes, while the sign is wrong at some samples
     bound_deviation_share: float = 0.05  # first standard deviation of one that is alone, as a share of the distance
     bound_tightening: float = 0.65  # of that deviation from pass to pass, for samples that stay beyond
     damping_attempts: int = 6  # each with ten times the damping

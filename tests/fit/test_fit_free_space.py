@@ -62,4 +62,7 @@ def test_samples_near_the_data_keep_clear_of_its_noise(space: CubeSpace) -> None
     distance, nearest = space.tree.query(near.points)
     clear = limits.near_clearance_disk_radii * space.disks[nearest] + limits.near_clearance_noises * noise
     assert (distance > clear).all()
-    assert len(near.points) < len(space.near(0.07, 0.0).points)
+    exact = space.near(0.07, 0.0)
+    # The zone moves outwards as a whole: however noisy the data is, it is no narrower.
+    assert space.tree.query(exact.points)[0].max() < limits.near_reach_lengths * 0.07 < distance.max()
+    assert len(near.points) > 0.8 * len(exact.points)

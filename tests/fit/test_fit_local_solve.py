@@ -181,6 +181,16 @@ def test_samples_near_the_data_keep_their_bounds_too(patch: Patch, features: Fea
     assert after == 0
 
 
+def test_near_the_data_a_right_sign_is_enough(patch: Patch, features: Features) -> None:
+    free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
+    system, points, ones = PatchSystem(free, features, LENGTH, patch.size), patch.points[:4].numpy(), np.ones(4)
+    before = system.solve(POSITION, ANGLE)
+    value = (rows(features, patch.points[:4], patch.center)[0] @ before).numpy()
+    for zero, moved in ((value - 0.01, False), (value + 0.01, True)):
+        near = Volume(points, ones, zero + 1.0, np.inf * ones, zero, ones)
+        assert bool((system.solve_with_bounds(POSITION, ANGLE, near) != before).any()) == moved
+
+
 def test_samples_that_stay_beyond_their_bounds_weigh_more_from_pass_to_pass(patch: Patch, features: Features) -> None:
     free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
     ones = np.ones(4)
