@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -51,6 +51,7 @@ class Volume:
         signed: Float,
         certain: Mask,
         distance: Float,
+        bound_share: float = FreeSpaceParameters.sign_bound_share,
         *,
         parameters: FreeSpaceParameters = FreeSpaceParameters(),
     ) -> Volume:
@@ -66,11 +67,12 @@ class Volume:
         own, signed : arrays of shape (Q,), the field, and the coarse distance
         certain : mask of shape (Q,), where the sign of that is certain
         distance : array of shape (Q,), of the data
+        bound_share : of the coarse distance, that the field must keep where the sign is certain
         """
         near, far = parameters.least_field_share * signed, parameters.most_field_share * signed
         agreed = certain | (own * signed > 0)
         wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
-        bound = parameters.sign_bound_share * signed - own
+        bound = bound_share * signed - own
         lower = np.where(certain & (signed > 0), bound, -np.inf)
         upper = np.where(certain & (signed < 0), bound, np.inf)
         return cls(points, wanted, lower, upper, -own, distance)
@@ -85,6 +87,15 @@ class Volume:
         return self.points, self.wanted, self.lower, self.upper, self.zero, self.distance
 
 
+class _Samples(NamedTuple):
+    """Places, of shape (Q, 3), with the distance of the nearest point, its disk's radius and the winding number."""
+
+    places: Float
+    distance: Float
+    disks: Float
+    winding: Float
+
+
 @dataclass(frozen=True)
 class CubeSpace:
     """The space of one cube, of which samples are drawn.
@@ -93,7 +104,7 @@ class CubeSpace:
     ----------
     center, reach : of the cube, reach being half of its edge, unit coordinates
     box : where the field is fitted
-    tree, disks : of all points: a k-d tree, and the radius of the disk of each of its points
+    tree, disks : of the points in and around the cube, or of all: a k-d tree, and the radius of the disk of each
     dipoles : of all points
     network, theta : the global field in unit coordinates
     rng : draws the samples
@@ -115,8 +126,9 @@ class CubeSpace:
 
     def far(self) -> Volume:
         """Return samples of the whole cube that lie clear of the data."""
-        x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (self.parameters.volume_samples, 3))
-        return self._volume(x, self.parameters.clearance_disk_radii, 0.0)
+        limits = self.parameters
+        x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (limits.volume_samples, 3))
+        return self._volume(self._clear(x, limits.clearance_disk_radii, 0.0), self.theta, limits.sign_bound_share)
 
     def near(self, length: float, noise: float) -> Volume:
         """Return samples all over the space about the data where the sign is certain, one in each cell of a lattice.
@@ -133,8 +145,10 @@ class CubeSpace:
         cells = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
         x = self.center + self.reach * (2.0 * (cells + self.rng.random(cells.shape)) / count - 1.0)
         clear = limits.near_clearance_noises * noise
-        most = limits.near_reach_lengths * length + clear
-        return self._volume(x, limits.near_clearance_disk_radii, clear, most)
+        samples = self._clear(x, limits.near_clearance_disk_radii, clear, limits.near_reach_lengths * length + clear)
+        certain = _Samples(*(values[is_sign_certain(samples.winding)] for values in samples))
+        # Bounds are wide, so that single precision is enough for the field.
+        return self._volume(certain, self.theta.float(), limits.near_bound_share)
 
     @cached_property
     def _seen_dipoles(self) -> tuple[Float, Float, Float]:
@@ -142,32 +156,28 @@ class CubeSpace:
         places, moments, radii = self.dipoles.dipoles_for(self.center, self.reach)
         return places - self.center, moments, radii
 
-    def _volume(self, x: Float, clear_disks: float, clear: float, most: float | None = None) -> Volume:
-        """Return the samples that are far enough from the data: by so many radii of its disks, plus a length.
+    def _clear(self, x: Float, clear_disks: float, clear: float, most: float = np.inf) -> _Samples:
+        """Return the places, of shape (Q, 3), that are far enough from the data, and nearer to it than `most`.
 
-        With `most`, the largest distance, those alone of which the sign is certain; bounds are all that is known there.
+        Far enough is so many radii of the data's disks, plus a length.
         """
-        near = most is not None
         x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
-        distance, nearest = self.tree.query(x, distance_upper_bound=most if near else np.inf)
+        distance, nearest = self.tree.query(x, distance_upper_bound=most)
         # A place with no point within that distance has a row beyond the last.
         found = np.isfinite(distance)
         x, distance, disks = x[found], distance[found], self.disks[nearest[found]]
         kept = distance > clear_disks * disks + clear
         x, distance, disks = x[kept], distance[kept], disks[kept]
         winding = winding_number(x - self.center, *self._seen_dipoles, dtype=torch.float32)
-        winding = self.dipoles.sides.centred(winding, distance)
-        certain = is_sign_certain(winding)
-        if near:
-            x, distance, disks, winding = (values[certain] for values in (x, distance, disks, winding))
-            certain = certain[certain]
+        return _Samples(x, distance, disks, self.dipoles.sides.centred(winding, distance))
+
+    def _volume(self, samples: _Samples, theta: Tensor, bound_share: float) -> Volume:
+        """Return what is known at the samples; `theta` of the global field has the precision that is needed."""
+        x, distance, disks, winding = samples
         # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
-        # A bound is wide, so that single precision is enough for the field.
-        theta = self.theta.float() if near else self.theta
         value = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
-        share = self.parameters.near_bound_share if near else self.parameters.sign_bound_share
-        parameters = replace(self.parameters, sign_bound_share=share)
-        return Volume.around(x, value, signed, certain, distance, parameters=parameters)
+        certain = is_sign_certain(winding)
+        return Volume.around(x, value, signed, certain, distance, bound_share, parameters=self.parameters)

@@ -48,7 +48,7 @@ class FreeSpaceParameters:
     near_reach_lengths: float = 1.5  # from the noisy data to its farthest samples; beyond, corrections have faded
     near_clearance_disk_radii: float = 1.0  # their least distance; nearer, points do not tell the side
     near_clearance_noises: float = 3.0  # and so many standard deviations of the points' noise more
-    near_bound_share: float = 0.25  # of the distance to the nearest point, that the field must keep there
+    near_bound_share: float = 0.25  # of the coarse distance, that the field gets where its sign is wrong there
     least_field_share: float = 0.7  # of the coarse distance: a field between this
     most_field_share: float = 1.5  # and this share of it needs no correction
     sign_bound_share: float = 0.5  # of the coarse distance, that the field must keep where the sign is certain
@@ -167,7 +167,7 @@ class LocalSolveParameters:
 
     correction_rms_factor: float = 3.0  # prior standard deviation of the correction, over the residuals' RMS
     volume_deviation_share: float = 0.5  # standard deviation in free space, as a share of the distance from the data
-    bound_passes: int = 5  # most active-set passes, while the sign is wrong at some samples
+    bound_passes: int = 5  # most active-set passes, while samples have the wrong sign, or too little far away
     bound_deviation_share: float = 0.05  # first standard deviation of one that is alone, as a share of the distance
     bound_tightening: float = 0.65  # of that deviation from pass to pass, for samples that stay beyond
     damping_attempts: int = 6  # each with ten times the damping
