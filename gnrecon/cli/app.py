@@ -87,6 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             code = _fail(*failure(KeyboardInterrupt()), words)
         ignore_interrupts()
         code = streams.exit_code(code)
+    if arguments is None:
+        # Python would look for garbage among all objects of the libraries, several times, before it ends.
+        gc.freeze()
     sys.exit(code)
 
 
