@@ -200,6 +200,6 @@ def network_starts(points: int, *, parameters: NetworkLadderParameters = Network
 
 def network_steps(points: int, *, parameters: NetworkLadderParameters = NetworkLadderParameters()) -> int:
     """Return the most steps of all global networks of so many seen points."""
-    starts = network_starts(points, parameters=parameters)
-    each = (starts + 1) * parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
+    lost = (network_starts(points, parameters=parameters) - 1) * parameters.trial_steps
+    each = lost + 2 * parameters.first_steps + (len(parameters.widths) - 1) * parameters.steps
     return network_count(points, parameters=parameters) * each

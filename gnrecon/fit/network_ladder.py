@@ -136,11 +136,14 @@ class NetworkLadder:
     def _started(self, width: int) -> tuple[Siren, Solution]:
         """Return the best network of one width from random starts, after the first steps.
 
-        The best start takes as many again, with more rows, as in successive halving (Jamieson and Talwalkar,
-        *Non-stochastic Best Arm Identification and Hyperparameter Optimization*, 2016).
+        The start that is ahead after some of them takes the rest, and then as many again, with more rows, as in
+        successive halving (Jamieson and Talwalkar, *Non-stochastic Best Arm Identification and Hyperparameter
+        Optimization*, 2016).
         """
         field, steps = Siren((width,) * self.parameters.depth), self.parameters.first_steps
         few = self.terms.with_rows(self.parameters.first_rows)
+        count = network_starts(len(self.terms.scene.points), parameters=self.parameters)
+        tried = steps if count == 1 else self.parameters.trial_steps
 
         def first_steps(start: NetworkLadder) -> Solution:
             terms = partial(start_terms, start.terms.scene, start.options, start.rng)
@@ -148,14 +151,16 @@ class NetworkLadder:
                 field, start.terms.scene, terms, start.rng, InitialisationParameters.hidden_weight_share
             )
             # The score rises before it falls, as the damping finds its size: no patience ends these steps.
-            return start._fitted(field, theta, steps, patience=steps)
+            return start._fitted(field, theta, tried, patience=tried)
 
-        count = network_starts(len(self.terms.scene.points), parameters=self.parameters)
         starts = replace(self, terms=few)._parts(count)
         found = run_in_threads(first_steps, starts, self.options.device, lambda one: one.interrupted)
         self._take_histories(starts[: len(found)])
-        best, last = min(found, key=lambda one: self.terms.score(field, one.theta)).theta, _last(found)
-        return field, replace(last, theta=best) if last.interrupted else self._fitted(field, best, steps)
+        best, last = min(found, key=lambda one: self.terms.score(field, one.theta)), _last(found)
+        if tried < steps and not last.interrupted:
+            damping = best.history[-1].damping if best.history else None
+            last = best = self._fitted(field, best.theta, steps - tried, terms=few, patience=steps, damping=damping)
+        return field, replace(last, theta=best.theta) if last.interrupted else self._fitted(field, best.theta, steps)
 
     def _parts(self, count: int) -> list[NetworkLadder]:
         """Return ladders of so many networks or starts, each with random numbers and a history of its own."""
@@ -180,27 +185,46 @@ class NetworkLadder:
         counts = {width: Siren((width,) * self.parameters.depth).layout.count for width in wider}
         return [first, *(width for width, count in counts.items() if points <= count <= 4 * points)]
 
-    def _fitted(self, field: Siren, theta: Tensor, steps: int, *, patience: int | None = None) -> Solution:
-        """Take at most so many steps of Gauss-Newton; return the parameters of the least score."""
-        noise = self.terms.noise(field, theta)
+    def _fitted(
+        self,
+        field: Siren,
+        theta: Tensor,
+        steps: int,
+        *,
+        terms: NetworkTerms | None = None,
+        patience: int | None = None,
+        damping: float | None = None,
+    ) -> Solution:
+        """Take at most so many steps of Gauss-Newton; return the parameters of the least score.
+
+        Parameters
+        ----------
+        field, theta : network and its parameters, of shape (p,)
+        steps : the most
+        terms : what it is fitted to, by default all of it
+        patience : steps without a better score
+        damping : of the first step, in a run that continues another one
+        """
+        terms = terms or self.terms
+        noise = terms.noise(field, theta)
         residual = 0.0
 
         def problem_at(number: int, theta: Tensor) -> FieldProblem:
             nonlocal noise
             del number
             end_if_asked()
-            found = self.terms.noise(field, theta)
+            found = terms.noise(field, theta)
             # Deviations follow the field at half the rate at which they rise, so that one bad step has little effect.
             noise = Deviations(
                 (min(noise.values, found.values) + found.values) / 2,
                 (min(noise.normals, found.normals) + found.normals) / 2,
             )
-            return self.terms.problem(field, theta, noise, self.rng)
+            return terms.problem(field, theta, noise, self.rng)
 
         def score(theta: Tensor) -> float:
             nonlocal residual
-            residual = self.terms.eikonal_rms(field, theta)
-            return self.terms.score(field, theta)
+            residual = terms.eikonal_rms(field, theta)
+            return terms.score(field, theta)
 
         def record(found: Record) -> None:
             step, seconds = len(self.history) + 1, perf_counter() - self.began
@@ -211,7 +235,7 @@ class NetworkLadder:
 
         patience = self.parameters.patience_steps if patience is None else patience
         stop = StopRule(steps, tolerance=self.parameters.least_gain, patience=steps + 1, held_out_patience=patience)
-        return self._optimiser().run(problem_at, theta, stop, record, score)
+        return self._optimiser(damping=damping).run(problem_at, theta, stop, record, score)
 
     def _refitted(self, field: Siren, theta: Tensor, scene: Scene) -> tuple[Siren, Tensor]:
         """Return a network after some steps on other points."""
@@ -228,9 +252,9 @@ class NetworkLadder:
             raise KeyboardInterrupt
         return field, solution.theta
 
-    def _optimiser(self, length: float = 1.0) -> GaussNewton:
-        damping = self.parameters.damping
-        return GaussNewton(GainRatioDamping(damping, metric=layer_scaled, geodesic=True, length=length), Cholesky())
+    def _optimiser(self, length: float = 1.0, damping: float | None = None) -> GaussNewton:
+        search = GainRatioDamping(self.parameters.damping, metric=layer_scaled, geodesic=True, length=length)
+        return GaussNewton(search, Cholesky(), damping)
 
 
 def _last(solutions: Sequence[Solution]) -> Solution:
