@@ -179,6 +179,22 @@ def test_obj_keeps_one_vertex_where_normals_differ(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.normals[0], np.array([1, 0, 1]) / np.sqrt(2))
 
 
+@pytest.mark.parametrize("corner", ["{}", "{}/1", "{0}//{0}", "{0}/1/{0}"])
+def test_obj_faces_do_not_depend_on_how_corners_are_written(tmp_path: Path, corner: str) -> None:
+    vertices = "".join(f"v {x} {y} 0\nvn 0 {x} 1\n" for x in range(3) for y in range(2))
+    faces = [[1, 2, 3], [2, 4, 3], [3, 4, 5], [4, 6, 5]]
+    lines = ["\tf " + "  ".join(corner.format(vertex) for vertex in face) + " # face" for face in faces]
+    mesh = read_mesh(save(tmp_path, "a.obj", vertices + "vt 0 0\n" + "\n".join(lines)))
+    np.testing.assert_array_equal(mesh.faces, np.array(faces) - 1)
+    assert (mesh.normals is None) == (corner in ("{}", "{}/1"))
+
+
+def test_obj_line_of_six_corners_is_one_polygon(tmp_path: Path) -> None:
+    vertices = "".join(f"v {np.cos(k)} {np.sin(k)} 0\n" for k in range(6))
+    mesh = read_mesh(save(tmp_path, "a.obj", vertices + "f 1 2 3 4 5 6\n"))
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+
+
 def test_obj_points_carry_colours(tmp_path: Path) -> None:
     cloud = read_cloud(save(tmp_path, "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\n"))
     np.testing.assert_array_equal(cloud.attributes["colors"], [[1, 0, 0], [0, 1, 0]])
