@@ -32,7 +32,9 @@ def read_obj(path: Path) -> Contents:
     polygons = [rest for word, rest in lines if word == "f"]
     if (triangles := _plain_triangles(polygons, len(points), len(normals))) is not None:
         corners_of, normals_of = triangles
-        given = None if normals_of is None else _normals_at(corners_of.ravel(), normals_of.ravel(), normals, len(points))
+        given = (
+            None if normals_of is None else _normals_at(corners_of.ravel(), normals_of.ravel(), normals, len(points))
+        )
         return Contents(points, given, corners_of, colors, _unread(lines) + lost)
     faces = [rest.split() for rest in polygons]
     # Corners are v, v/t, v//n or v/t/n.
