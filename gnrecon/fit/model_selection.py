@@ -265,16 +265,21 @@ class CrossValidation:
         """Return the hyperparameters that predict best, with the likeliest noise where it is known."""
         scores: dict[int, Float] = {}
 
-        def least(number: int) -> float:
-            """Return the least score of a length, over the noises."""
-            if not 0 <= number < len(self.parameters.lengths_disk_radii):
-                return np.inf
+        def best(number: int) -> Float:
+            """Return the scores of a length's best noise, of shape (patches,)."""
             scores[number] = self.scores(self._length(number))
-            return float(scores[number].mean(axis=0).min())
+            return scores[number][:, int(scores[number].mean(axis=0).argmin())]
+
+        def is_better(number: int, than: int, standard_errors: float) -> bool:
+            if not 0 <= number < len(self.parameters.lengths_disk_radii):
+                return False
+            gain = best(than) - best(number)
+            return bool(gain.mean() > standard_errors * gain.std() / np.sqrt(len(gain)))
 
         at = self.parameters.first_length_index
-        step = 1 if least(at + 1) < least(at) else -1
-        while least(at + step) < least(at):
+        step = 1 if is_better(at + 1, at, 0.0) else -1
+        # Where no length predicts better than the one before but by chance, the search is at its end.
+        while is_better(at + step, at, self.parameters.search_standard_errors):
             at += step
         # The share of ties is for noise that is correlated, which no likelihood decides.
         tie_share = self.parameters.tie_share if self.likelihood is None else 0.0
