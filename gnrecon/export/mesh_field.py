@@ -17,7 +17,6 @@ import numpy as np
 
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
 from gnrecon.export.export_parameters import ExportParameters
-from gnrecon.export.project import sdf_and_gradient
 from gnrecon.export.remeshing.refine import RefineOptions
 from gnrecon.export.resolution import (
     Fineness,
@@ -234,9 +233,11 @@ def mesh_field(
         mesh, fast, cells, dropped = _extract_until_accurate(field, options, data, box, advance, parameters)
     # The first Newton step brings nearly all vertices so near to the zero level that it is no matter next to the faces.
     with stages("project"):
-        rough = None if fast is field else fast
         tolerance = parameters.resolution.projection_tolerance
-        mesh = project(mesh, field, steps=2, rough=rough, tolerance=tolerance, advance=advance)
+        # Half an edge is about a third of a cell.
+        exact = field if data is None or _rounding(field, fast, data, cells) > tolerance / 4 else fast
+        rough = None if fast is exact else fast
+        mesh = project(mesh, exact, steps=2, rough=rough, tolerance=tolerance, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []
     if options.refine.anything:
@@ -247,7 +248,7 @@ def mesh_field(
         cut: list[str] = []
         if data is not None and not options.keep_handles:
             mesh, cut = remove_handles(mesh, data, parameters=parameters.handles, known_sound=True)
-        fineness = measure_fineness(mesh, field, cells, box, parameters=parameters.resolution)
+        fineness = measure_fineness(mesh, exact, cells, box, parameters=parameters.resolution)
     sentences = _resolution_sentences(fineness, options, parameters.resolution.most_refined_cells)
     return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *sentences])
 
@@ -316,9 +317,16 @@ def _single_precision_field(
     """
     some = data[:: max(1, len(data) // samples)]
     single = field.single()
-    value, gradient = sdf_and_gradient(field, some)
-    single_value, single_gradient = sdf_and_gradient(single, some)
-    cell = np.ptp(field.bounds, axis=0).max() / resolution
-    shift = np.abs(single_value - value).max() / cell
+    gradient, single_gradient = field.gradient(some), single.gradient(some)
     gradient_error = (np.linalg.norm(single_gradient - gradient, axis=1) / np.linalg.norm(gradient, axis=1)).max()
+    shift = _rounding(field, single, some, resolution)
     return single if shift < most_shift_cells and gradient_error < most_gradient_error else field
+
+
+def _rounding(
+    field: MeshedField, single: SignedDistance, data: Float, resolution: int, *, samples: int = 2000
+) -> float:
+    """Return the largest difference of both fields' values at some points, in cells; the error of single precision."""
+    some = data[:: max(1, len(data) // samples)]
+    cell = np.ptp(field.bounds, axis=0).max() / resolution
+    return float(np.abs(single.sdf(some) - field.sdf(some)).max() / cell)

@@ -161,7 +161,7 @@ class NetworkTerms:
 
     def problem(self, field: Siren, theta: Tensor, noise: Deviations, rng: np.random.Generator) -> FieldProblem:
         """Draw the rows of one step."""
-        terms = [*self._data(field, theta, noise, rng), self._free_space(field, theta, rng), *self._eikonal(rng)]
+        terms = [*self._data(field, theta, noise, rng), self._free_space(field, theta, rng), self._eikonal(rng)]
         return FieldProblem(field, terms, theta, precision=torch.float32)
 
     @property
@@ -221,18 +221,16 @@ class NetworkTerms:
         weight = len(rows) / (self.parameters.free_space_deviation_share * distance).square()
         return ObjectiveTerm("free space", value_range, self.volume[rows], ends, weight)
 
-    def _eikonal(self, rng: np.random.Generator) -> tuple[ObjectiveTerm, ObjectiveTerm]:
+    def _eikonal(self, rng: np.random.Generator) -> ObjectiveTerm:
         """Return eikonal rows near the surface and in the box."""
         scene, limits = self.scene, self.parameters
         count = max(min(len(scene.points), limits.data_rows) // 2, 1)
         near = sample_near_surface(scene.samples.points, limits.near_spacings * scene.coarse.spacing, count, rng)
         box = scene.box.sample(max(count // 2, 1), rng)
-        deviations = limits.near_eikonal_deviation, limits.far_eikonal_deviation
-        near_term, far_term = (
-            ObjectiveTerm(name, eikonal, scene.tensor(x), None, len(x) / deviation**2)
-            for name, x, deviation in zip(("eikonal near the surface", "eikonal"), (near, box), deviations, strict=True)
-        )
-        return near_term, far_term
+        x = scene.tensor(np.concatenate([near, box]))
+        deviations = x.new_tensor([limits.near_eikonal_deviation, limits.far_eikonal_deviation])
+        weights = len(x) / deviations.square().repeat_interleave(torch.tensor([len(near), len(box)]).to(x.device))
+        return ObjectiveTerm("eikonal", eikonal, x, None, weights)
 
     def _part(self, count: int, most: int, rng: np.random.Generator) -> Tensor:
         """Return at most `most` of so many rows, in order."""

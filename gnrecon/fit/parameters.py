@@ -116,7 +116,7 @@ class NetworkLadderParameters:
     depth: int = 3  # hidden layers
     widths: tuple[int, ...] = (16, 24)  # the others where points are few, see `NetworkLadder`
     starts: int = 3  # of the first width, of which the best is fitted further, and widened
-    trial_steps: int = 8  # Gauss-Newton steps of each; the one ahead by then is the best of 15 steps, or nearly so
+    trial_steps: int = 9  # Gauss-Newton steps of each; the one ahead by then is the best of 15 steps, or nearly so
     first_steps: int = 15  # of the best in all, or of a single start; and then most further ones
     # Most points of these steps, which find the shape as a whole: half as many again as the network has parameters.
     first_rows: int = 1000

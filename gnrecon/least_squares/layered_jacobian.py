@@ -217,6 +217,8 @@ def _without_zero_rows(block: Block, *, most_nonzero: float = 0.9) -> Block:
     filled = torch.zeros(len(block[0]), dtype=torch.bool, device=block[0].left.device)
     for layer in block:
         filled |= layer.left.any(1)
+        if filled.all():
+            return block
         for right, tangents in layer.pairs:
             filled |= right.any(1) & tangents.any(1)
     rows = filled.nonzero()[:, 0]

@@ -37,8 +37,10 @@ class Misfit:
         """Measure the residuals at evenly spaced rows of `samples`, at most `most_points`: more change no figure."""
         rows = slice(None, None, -(-len(samples) // most_points))
         points, normals = samples.frame.to_world(samples.points[rows]), samples.normals[rows]
-        cosines = np.einsum("ij,ij->i", sdf.normals(points), normals)
-        return cls(sdf.sdf(points), np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+        distances, gradient = sdf.sdf_and_gradient(points)
+        lengths = np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(np.float64).tiny)
+        cosines = np.einsum("ij,ij->i", gradient, normals) / lengths
+        return cls(distances, np.degrees(np.arccos(np.clip(cosines, -1, 1))))
 
     def describe(self) -> str:
         """Return a sentence with the distances, in file units, and the angles."""

@@ -75,9 +75,9 @@ class BilateralFilter:
 
     def _weights(self, points: Float, normals: Float, rows: slice, near: Int, widths: Float) -> Float:
         """Return the neighbours' weights, of shape (rows, k), whose sums are one."""
-        distance = np.linalg.norm(points[near] - points[rows, None], axis=2) / widths
-        difference = np.linalg.norm(normals[near] - normals[rows, None], axis=2) / self.normal_scale
-        weights = np.exp(-(distance**2) - difference**2)
+        apart = _squares(points, rows, near) / widths**2
+        apart += _squares(normals, rows, near) / self.normal_scale**2
+        weights = np.exp(-apart)
         shares: Float = weights / weights.sum(axis=1, keepdims=True)
         return shares
 
@@ -105,8 +105,18 @@ class BilateralFilter:
         return moved
 
 
+def _squares(x: Float, rows: slice, near: Int) -> Float:
+    """Return the squared distances of each neighbour from some rows of x, of shape (rows, k)."""
+    # Axis by axis, here and below, as sums over an array's short last axis take several times as long.
+    squares = np.zeros(near.shape)
+    for along in x.T:
+        squares += (along[near] - along[rows, None]) ** 2
+    return squares
+
+
 def _heights(points: Float, normals: Float, rows: slice, near: Int) -> Float:
     """Return how high each neighbour is over some rows of the points, of shape (rows, k), by both normals."""
-    between = (normals[near] + normals[rows, None]) / 2
-    heights: Float = np.einsum("ikd,ikd->ik", points[near] - points[rows, None], between)
-    return heights
+    heights = np.zeros(near.shape)
+    for x, n in zip(points.T, normals.T, strict=True):
+        heights += (x[near] - x[rows, None]) * (n[near] + n[rows, None])
+    return heights / 2
