@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 
 from gnrecon.field.networks import Siren
 from gnrecon.fit import FitOptions, fit
+from gnrecon.fit.fit_options import network_steps
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.global_network import Deviations, NetworkTerms, Prediction
 from gnrecon.fit.initialisation import random_network
@@ -186,10 +188,34 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     assert made == [(4,) * 3] * 4, "1,321 parameters are more than the 1,200 rows of 300 points"
     made.clear()
     NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, parameters=parameters).fit()
-    assert made == [(4,) * 3] * 4 + [(24,) * 3, (32,) * 3], "one network has three starts, and the best goes on"
+    expected = [(4,) * 3] * 5 + [(24,) * 3, (32,) * 3]
+    assert made == expected, "one network has three starts, and the best goes on with few rows and then with all"
     made.clear()
     NetworkLadder(terms_of(capsule(1700, 0), rng), FitOptions(), rng, parameters=parameters).fit()
-    assert made == [(4,) * 3] * 4 + [(32,) * 3], "1,321 parameters are fewer than the 1,416 points"
+    assert made == [(4,) * 3] * 5 + [(32,) * 3], "1,321 parameters are fewer than the 1,416 points"
+
+
+def test_all_starts_but_the_best_end_early(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+    original, taken = NetworkLadder._fitted, []
+
+    def recorded(self: NetworkLadder, field: Siren, theta: torch.Tensor, steps: int, **how: Any) -> Solution:
+        solution = original(self, field, theta, steps, **how)
+        taken.append((steps, (how.get("terms") or self.terms).parameters.data_rows, how.get("damping"), solution))
+        return solution
+
+    monkeypatch.setattr(NetworkLadder, "_fitted", recorded)
+    parameters = NetworkLadderParameters(widths=(6,), trial_steps=3, first_steps=5, first_rows=300, points_per_member=1)
+    ladder = NetworkLadder(terms_of(capsule(900, 0), rng), FitOptions(), rng, parameters=parameters)
+    field, solution, _ = ladder.fit()
+    assert [steps for steps, *_ in taken] == [3, 3, 3, 2, 5]
+    assert [rows for _, rows, _, _ in taken[:4]] == [300] * 4
+    assert taken[4][1] > 300
+    # The start of the least score goes on, with the damping that it had.
+    best = min((one[3] for one in taken[:3]), key=lambda one: ladder.terms.score(field, one.theta))
+    assert [damping for *_, damping, _ in taken] == [None] * 3 + [best.history[-1].damping, None]
+    assert len(solution.history) == sum(len(one[3].history) for one in taken)
+    assert [record.step for record in solution.history] == list(range(1, len(solution.history) + 1))
+    assert network_steps(900, parameters=parameters) == 16
 
 
 def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(
@@ -291,4 +317,5 @@ def test_the_best_of_the_starts_is_the_network(monkeypatch: pytest.MonkeyPatch, 
     assert least == 1.0
     assert solution.theta is starts[1]
     assert not torch.equal(starts[0], starts[1])
-    assert starts[3:] == [starts[1]], "it alone goes on"
+    assert len(starts) == 5, "few rows, then all"
+    assert all(start is starts[1] for start in starts[3:]), "it alone goes on"

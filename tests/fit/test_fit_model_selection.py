@@ -51,3 +51,32 @@ def test_patches_predict_each_validation_point_twice(count: int, patches: int, f
     assert all(held_out[rows].all() for rows in validation.predicted)
     # With the likeliest noise no other is tried.
     assert len(validation.noises(0.4)) == 1
+
+
+@pytest.mark.parametrize(
+    ("means", "tried"),
+    [
+        ({2.8: 1.2, 4.0: 1.0, 5.6: 0.9, 8.0: 0.8, 11.3: 0.81, 16.0: 0.5}, {4.0, 5.6, 8.0, 11.3}),
+        ({2.8: 1.2, 4.0: 1.0, 5.6: 0.9, 8.0: 0.8999, 11.3: 0.5}, {4.0, 5.6, 8.0}),
+        ({2.0: 0.7, 2.8: 0.8, 4.0: 1.0, 5.6: 1.1}, {5.6, 4.0, 2.8, 2.0}),
+    ],
+)
+def test_the_search_ends_where_the_next_length_is_better_by_chance_alone(
+    monkeypatch: pytest.MonkeyPatch, means: dict[float, float], tried: set[float]
+) -> None:
+    rng = np.random.default_rng(0)
+    points, normals = made_shapes.sphere(1000, rng, 0.8)
+    residuals = FieldResiduals(points, normals, np.full(1000, 0.01), normals)
+    validation = CrossValidation.draw(residuals, np.arange(1000) % 6 == 0, 1.0, rng, "cpu")
+    asked: set[float] = set()
+
+    def scores(self: CrossValidation, length: float) -> np.ndarray:
+        del self
+        asked.add(length)
+        # Patch by patch, a difference of two lengths is at least a thousandth off its mean.
+        return means[length] + 0.01 * np.sin(length * np.arange(16))[:, None]
+
+    monkeypatch.setattr(CrossValidation, "scores", scores)
+    monkeypatch.setattr(CrossValidation, "noises", lambda *_: [(0.01, 0.1)])
+    validation.select()
+    assert asked == tried
