@@ -90,6 +90,8 @@ class Files:
             raise UsageError(f"The preview is a PNG picture, so it cannot be called {self.preview}.")
         if self.model is not None and self.model.suffix.lower() != ".gnr":
             raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
+        if self.report is not None and self.report.suffix.lower() in (".html", ".htm"):
+            raise UsageError(f"The report is JSON, so it cannot be called {self.report}; --html writes a page.")
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
         inputs, targets = self.inputs_and_targets()

@@ -52,6 +52,7 @@ MISTAKES = [
     ("scan.ply -o old.obj", OUTPUT, "old.obj exists already; choose another name or allow overwriting (--overwrite)."),
     ("scan.ply -o scan.ply --overwrite", USAGE, "scan.ply is named twice; an input or another output is never"),
     ("scan.ply -o mesh.obj --preview picture.jpg", USAGE, "a PNG picture, so it cannot be called picture.jpg."),
+    ("scan.ply -o mesh.obj --report page.html", USAGE, "JSON, so it cannot be called page.html; --html writes a page."),
     ("scan.ply -o mesh.obj --save model.ply", USAGE, "saved as a .gnr file, so it cannot be called model.ply."),
     # An option's name
     ("scan.ply -o mesh.obj --fractoin 0.2", USAGE, "No such option: --fractoin; perhaps you mean '--fraction'."),
