@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import threadpoolctl
 import torch
 
 from gnrecon.field.networks import Siren
@@ -288,3 +289,20 @@ def test_a_process_that_fails_ends_the_fit(
     monkeypatch.setattr(workers, "_affordable_processes", lambda: 2)
     with pytest.raises(error, match=sentence):
         workers.solve_blocks(WorkFolder(tmp_path), [0, 1, 2], 2, "cpu", ignore_progress)
+
+
+def test_a_worker_computes_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more, those of several workers would wait for each other, several times as long as they work."""
+    found: list[int] = []
+
+    def count(*_: object) -> None:
+        pools = threadpoolctl.threadpool_info()
+        found.extend(
+            [torch.get_num_threads(), *(one["num_threads"] for one in pools if one["internal_api"] == "openblas")]
+        )
+
+    monkeypatch.setattr(workers, "solve_block", count)
+    with threadpoolctl.threadpool_limits(2):
+        workers.solve_on_worker("folder", 0)
+    assert len(found) > 1
+    assert set(found) == {1}

@@ -11,6 +11,7 @@ import signal
 import sys
 
 from gnrecon.fit.blocks.block import solve_block
+from gnrecon.runtime.parallel import fixed_sums
 
 DONE = "done"
 """Answer of a worker that has solved a block."""
@@ -18,12 +19,9 @@ DONE = "done"
 
 def main(folder: str) -> None:
     """Solve the requested blocks with one thread, so that processes do not compete for cores."""
-    import torch
-
     # Ctrl-C reaches the whole process group: the parent decides what ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    with os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8") as answers:
+    with fixed_sums(1), os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8") as answers:
         # Output of libraries must not be taken for an answer.
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         for line in sys.stdin:

@@ -23,7 +23,7 @@ from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.blocks.worker import DONE
 from gnrecon.runtime.dask_scheduler import dask_client, require_distributed
 from gnrecon.runtime.errors import FitError, MemoryLimitError
-from gnrecon.runtime.parallel import torch_threads
+from gnrecon.runtime.parallel import fixed_sums, torch_threads
 from gnrecon.runtime.progress import ProgressCallback
 
 Process = subprocess.Popen[str]
@@ -91,7 +91,8 @@ def _started(folder: Path, count: int) -> Iterator[list[Process]]:
     # The same package as here, from wherever it was imported, and one thread also in other libraries than torch.
     package = str(Path(str(gnrecon.__file__)).parents[1])
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)} | one_thread
     command = [sys.executable, "-m", "gnrecon.fit.blocks.worker", str(folder)]
     pipe, workers = subprocess.PIPE, list[Process]()
     try:
@@ -180,5 +181,5 @@ def solve_on_cluster(
 
 def solve_on_worker(folder: str, block: int) -> None:
     """Solve a block on a worker, with one thread: sums of several threads differ in their last digits."""
-    with torch_threads(1):
+    with fixed_sums(1):
         solve_block(folder, block)
