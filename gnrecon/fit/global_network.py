@@ -106,6 +106,8 @@ class NetworkTerms:
         """Draw the samples of free space; without validation points, the points that are seen take their place."""
         if len(points) < parameters.least_validation_points:
             points, normals = scene.samples.points, scene.samples.normals
+        rows = slice(None, None, -(-len(points) // parameters.most_validation_points))
+        points, normals = points[rows], normals[rows]
         x, distance = _certain(scene, scene.places(parameters.pool_samples, rng))
         count = parameters.eikonal_measured
         near = sample_near_surface(scene.samples.points, parameters.near_spacings * scene.coarse.spacing, count, rng)

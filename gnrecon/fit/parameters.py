@@ -105,6 +105,7 @@ class NetworkTermParameters:
     least_estimated_deviation: float = 0.3  # radians, of estimated normals; on the benchmark's scans 0.13 to 0.37
     least_slope: float = 0.3  # of the field along a normal, in a distance |f| / slope
     least_validation_points: int = 10  # with fewer, the seen points are scored
+    most_validation_points: int = 5000  # whose score has a standard error of a percent or two
     wrong_sign_score: float = 100.0  # disk radii for a field that is wrong in all of free space: sheets cost most
     eikonal_measured: int = 2000  # places at which the history's eikonal residual is measured
 
