@@ -195,6 +195,15 @@ def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     assert made == [(4,) * 3] * 5 + [(32,) * 3], "1,321 parameters are fewer than the 1,416 points"
 
 
+def test_a_score_has_a_bounded_number_of_validation_points(rng: np.random.Generator) -> None:
+    samples = capsule(900, 0)
+    scene, parameters = terms_of(samples, rng).scene, NetworkTermParameters(most_validation_points=100)
+    terms = NetworkTerms.draw(scene, samples.points, samples.normals, rng, parameters=parameters)
+    # Spread over all of them, with their own normals.
+    np.testing.assert_array_equal(terms.points.numpy(), samples.points[::9])
+    np.testing.assert_array_equal(terms.normals.numpy(), samples.normals[::9])
+
+
 def test_all_starts_but_the_best_end_early(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     original, taken = NetworkLadder._fitted, []
 
