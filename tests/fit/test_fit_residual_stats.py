@@ -18,11 +18,8 @@ FRAME = Frame(np.array([100.0, -20.0, 5.0]), 4.0)
 class Plane:
     """The signed distance z - 5 in file units."""
 
-    def sdf(self, points: np.ndarray) -> np.ndarray:
-        return points[:, 2] - 5.0
-
-    def normals(self, points: np.ndarray) -> np.ndarray:
-        return np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    def sdf_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return points[:, 2] - 5.0, np.broadcast_to([0.0, 0.0, 1.0], points.shape)
 
 
 def samples(heights: np.ndarray, degrees: np.ndarray) -> Samples:
