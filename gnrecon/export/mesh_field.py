@@ -234,9 +234,11 @@ def mesh_field(
     # The first Newton step brings nearly all vertices so near to the zero level that it is no matter next to the faces.
     with stages("project"):
         tolerance = parameters.resolution.projection_tolerance
-        # Half an edge is about a third of a cell.
-        exact = field if data is None or _rounding(field, fast, data, cells) > tolerance / 4 else fast
-        rough = None if fast is exact else fast
+        rough = None if fast is field else fast
+        # Rounding far below the tolerance is no matter, either; half an edge is about a third of a cell.
+        exact: SignedDistance = field
+        if rough is not None and data is not None and _rounding(field, rough, data, cells) <= tolerance / 4:
+            exact, rough = rough, None
         mesh = project(mesh, exact, steps=2, rough=rough, tolerance=tolerance, advance=advance)
     _log.info("Extracted %d vertices and %d faces with %d cells.", len(mesh.vertices), len(mesh.faces), cells)
     refined: list[str] = []

@@ -155,6 +155,11 @@ def _marginal_likelihood(
     return MarginalLikelihood.of(patches, radius, rng, device, parameters=parameters)
 
 
+def _is_gain(gain: Float, standard_errors: float) -> bool:
+    """Return whether the mean of gains, of shape (patches,), is more than so many of its standard errors."""
+    return bool(gain.mean() > standard_errors * gain.std() / np.sqrt(len(gain)))
+
+
 def _noise_candidates(parameters: ModelSelectionParameters) -> list[tuple[float, float]]:
     """Return the pairs of position noise, in disk radii, and angle noise, in radians, that are tried."""
     return list(itertools.product(parameters.position_noises_disk_radii, parameters.angle_noises_radians))
@@ -273,8 +278,7 @@ class CrossValidation:
         def is_better(number: int, than: int, standard_errors: float) -> bool:
             if not 0 <= number < len(self.parameters.lengths_disk_radii):
                 return False
-            gain = best(than) - best(number)
-            return bool(gain.mean() > standard_errors * gain.std() / np.sqrt(len(gain)))
+            return _is_gain(best(than) - best(number), standard_errors)
 
         at = self.parameters.first_length_index
         step = 1 if is_better(at + 1, at, 0.0) else -1
@@ -298,7 +302,7 @@ class CrossValidation:
         Logarithms are compared: one patch where both lengths are far off would outweigh all others.
         """
         gain = np.log(self.scores(self._length(than))[:, 0]) - np.log(self.scores(self._length(number))[:, 0])
-        return bool(gain.mean() > self.parameters.gain_standard_errors * gain.std() / np.sqrt(len(gain)))
+        return _is_gain(gain, self.parameters.gain_standard_errors)
 
     def noises(self, length: float) -> list[tuple[float, float]]:
         """Return the noises of positions and normals to try with a length: one, where it is known or the likeliest."""

@@ -88,11 +88,10 @@ def _started(folder: Path, count: int) -> Iterator[list[Process]]:
     """Start processes, and kill those that are left at the end."""
     import gnrecon
 
-    # The same package as here, from wherever it was imported, and one thread also in other libraries than torch.
+    # The same package as here, from wherever it was imported; the worker limits torch and OpenBLAS itself.
     package = str(Path(str(gnrecon.__file__)).parents[1])
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
-    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)} | one_thread
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "gnrecon.fit.blocks.worker", str(folder)]
     pipe, workers = subprocess.PIPE, list[Process]()
     try:
