@@ -1,7 +1,7 @@
 """Watertight meshes from point clouds by neural signed distance fields.
 
-By default, fixed sine features are fitted by linear least squares; `reconstruct` with ``widths`` fits a network by
-Gauss-Newton.
+By default, Gauss-Newton fits a sine network as the smooth global field, unless a linear field of sine features predicts
+the scan as well, and linear least squares add local fields. `reconstruct` with ``widths`` fits one network alone.
 
 >>> import gnrecon
 >>> result = gnrecon.reconstruct("scan.ply")        # doctest: +SKIP

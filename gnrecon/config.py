@@ -2,8 +2,8 @@
 
 A configuration has options by the names of `gnrecon.option_table.OptionTable`, or as the command line spells them
 (``edge_length`` or ``edge-length``); ``reference``, a file to measure the mesh against; and ``timeout`` and ``memory``,
-limits for each scan of a batch, which a single run ignores. Tables named ``[scans."PATTERN"]`` apply to scans whose
-path ends with the pattern, such as ``[scans."left/*.ply"]``. What comes later wins:
+limits for each scan of a batch, of which a single run takes the memory. Tables named ``[scans."PATTERN"]`` apply to
+scans whose path ends with the pattern, such as ``[scans."left/*.ply"]``. What comes later wins:
 
 1. the defaults,
 2. the configuration,

@@ -206,7 +206,7 @@ class OptionTable:
         Panel.MESH,
         "Cells along the longest side of the box.",
         limits="at least 16",
-        unset="128 to 1,024, from the points' spacing",
+        unset="64 to 1,024, from the points' spacing and noise; 256 of a saved field",
     )
     edge_length: float | None = _row(
         None,
@@ -225,8 +225,8 @@ class OptionTable:
     trim: float | str | None = _row(
         None,
         Panel.MESH,
-        "Cut off what is farther than this from all points, in file units or, as 3s, in spacings; the mesh is then "
-        "open.",
+        "Cut off what is farther than this from all points that face the same way, in file units or, as 3s, in "
+        "spacings; the mesh is then open.",
         limits="above 0",
         metavar="LENGTH",
     )
@@ -322,7 +322,7 @@ class OptionTable:
         Panel.FIT,
         "Linear solver of Gauss-Newton's steps: auto (by rows, parameters, memory and device), cholesky, qr, "
         "row-space, cg-sampled, cg-neighbours, cg-kronecker, cg-nystrom, cg-block-jacobi, cg-jacobi, gmres or "
-        "sketched.",
+        "sketched; of one network alone, as the default fit has its own.",
         choices=(
             "auto",
             "cholesky",
@@ -342,7 +342,7 @@ class OptionTable:
         "auto",
         Panel.FIT,
         "Step control of Gauss-Newton: damping (by gain ratio), geodesic (the same, with geodesic acceleration), line "
-        "(log-spaced step lengths) or auto.",
+        "(log-spaced step lengths) or auto; of one network alone, as the default fit has its own.",
         choices=("auto", "damping", "geodesic", "line"),
     )
     seed: int = _row(0, Panel.FIT, "Seed of all random choices.", limits="at least 0")

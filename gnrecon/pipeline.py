@@ -93,7 +93,7 @@ class Reconstruction:
     Parameters
     ----------
     mesh : Mesh
-        Closed, oriented 2-manifold in file units; with borders where it was trimmed.
+        Oriented 2-manifold in file units: closed, or with borders where it was trimmed or the scan is a sheet.
     sdf : NeuralSDF
     report : dict
         Options, versions, stages, counts, fit history, mesh facts and metrics as plain values, ready for JSON;
@@ -182,7 +182,7 @@ def reconstruct(
     progress: Progress | None = None,
     **options: Any,
 ) -> Reconstruction:
-    """Reconstruct a closed surface from a scan.
+    """Reconstruct a surface from a scan: closed, or open where the scan is a single sheet.
 
     Parameters
     ----------

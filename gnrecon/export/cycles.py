@@ -42,7 +42,7 @@ class Loop:
     vertices : integer array of shape (L,)
         In order.
     length : float
-    word : int
+    signature : int
         Its homology class: loops are independent where no exclusive or of some of their signatures is zero.
     """
 

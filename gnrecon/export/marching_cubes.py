@@ -97,7 +97,7 @@ class ChunkMesh:
     ----------
     names : integer array of shape (V,)
         Of the vertices: the same in every chunk that has them.
-    places : array of shape (V, 3), lattice coordinates
+    positions : array of shape (V, 3), lattice coordinates
     faces : integer array of shape (F, 3)
         Rows of the above.
     """

@@ -40,7 +40,7 @@ class NeuralSDF:
     options : of the fit, as plain values
     support : points that the field was fitted to, of shape (N, 3), unit coordinates; where there were many, some of
         them; None where they are not known
-    detail : what is added to the network near the data of a dense scan, unit coordinates
+    detail : the local fields of the default fit, added near the data, unit coordinates
     """
 
     field: Siren

@@ -79,6 +79,9 @@ def fit(
             f"{len(convex) - len(given)} samples."
         )
         fitted = replace(fitted, status=status)
+    if options.adaptive and (options.solver, options.search) != (FitOptions.solver, FitOptions.search):
+        unused = "The solver and the search of the options are those of one network alone, and were not used."
+        fitted = replace(fitted, status=f"{fitted.status} {unused}")
     support = _support(given) if sdf.support is None else np.concatenate([_support(given), sdf.support])
     return replace(sdf, support=support), fitted
 

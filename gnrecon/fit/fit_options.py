@@ -39,8 +39,9 @@ class FitOptions:
     steps : int, optional
         Steps after the start of one network; by default, of Gauss-Newton, 4 for one wide layer and 1,000 points or
         more, none for fewer points, 120 for several layers; 2,000 of Adam, and 40 of L-BFGS, each of 20 iterations.
-        Given without widths, or with another optimiser or normal residual, one wide layer is fitted: of three units a
-        point from 1,000 to 2,000, and of one for four points from there to 3,000.
+        Given without widths, or with another optimiser or normal residual, one wide layer is fitted: with
+        three units per point, at least 1,000 and at most 2,000, or beyond 8,000 points with one unit for four points,
+        at most 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
         Features of each local field: 300, 600 or 1,000. In draft quality, the global field is linear.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings

@@ -16,7 +16,7 @@ from gnrecon.fit.shape_priors.prior_parameters import BallFitParameters, ShapePr
 class TwoLevelParameters:
     """The default fit: a global field and local corrections (`fit.two_level`)."""
 
-    global_field_points: int = 5000  # most points that the global field is fitted to; its 1,000 units resolve no more
+    global_field_points: int = 5000  # most that the global field is fitted to: few units resolve no more
     validation_one_in: int = 6  # one point in so many is a validation point
     most_validation_points: int = 2000  # where the local fields are not solved by blocks; more change no choice
     # Up to which the network takes its last steps on all points: with more, local fields make up for those left out.
@@ -112,7 +112,7 @@ class NetworkTermParameters:
 
 @dataclass(frozen=True)
 class NetworkLadderParameters:
-    """The widths of the global network, and its steps (`fit.global_network`)."""
+    """The widths of the global network, and its steps (`fit.network_ladder`)."""
 
     depth: int = 3  # hidden layers
     widths: tuple[int, ...] = (16, 24)  # the others where points are few, see `NetworkLadder`
@@ -302,7 +302,7 @@ class SingleNetworkParameters:
 
 @dataclass(frozen=True)
 class PenaltyFitParameters:
-    """Curvature penalties on the fitted surface (`fit.regularisers`, `fit.surface_penalties`)."""
+    """Curvature penalties on the fitted surface (`fit.penalties.regularisers`, `fit.penalties.surface_penalties`)."""
 
     minimal_weight: float = 1e-2  # default of `fill`
     developable_weight: float = 1e-3  # default of `prior`
@@ -331,7 +331,7 @@ class PenaltyFitParameters:
 
 @dataclass(frozen=True)
 class LaplaceParameters:
-    """The Laplace approximation of a fit (`fit.laplace_approximation`)."""
+    """The Laplace approximation of a fit (`fit.posterior.laplace_approximation`)."""
 
     prior_deviation_radii: float = 10.0  # by which each layer's prior moves f; the fit's own ridge is as weak
     noise_passes: int = 6
@@ -346,7 +346,7 @@ class LaplaceParameters:
 
 @dataclass(frozen=True)
 class UncertaintyParameters:
-    """Standard deviation of the surface and its calibration (`fit.uncertainty`)."""
+    """Standard deviation of the surface and its calibration (`fit.posterior.uncertainty`)."""
 
     most_points: int = 20_000  # of the data; thinned at random, so that sigma is rather too large
     batch_points: int = 8192

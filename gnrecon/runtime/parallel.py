@@ -16,11 +16,14 @@ from contextvars import ContextVar
 from functools import cached_property
 from queue import Empty, SimpleQueue
 from threading import Event, Lock
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 
@@ -83,15 +86,19 @@ class _OneBlasThread:
     def __init__(self) -> None:
         self._lock, self._blocks, self._limit = Lock(), 0, ExitStack()
 
+    @cached_property
+    def _libraries(self) -> ThreadpoolController:
+        """The OpenBLAS of numpy and scipy; to look for them takes as long as a small product."""
+        import scipy.linalg  # noqa: F401 - scipy brings an OpenBLAS of its own, which must be loaded to be limited
+        from threadpoolctl import ThreadpoolController
+
+        # The MKL of torch is not among them: `torch_threads` limits it, in the calling thread alone.
+        return ThreadpoolController().select(internal_api="openblas")
+
     def __enter__(self) -> None:
         with self._lock:
             if self._blocks == 0:
-                import scipy.linalg  # noqa: F401 - scipy brings an OpenBLAS of its own, which must be loaded to be limited
-                from threadpoolctl import ThreadpoolController
-
-                # The MKL of torch is not among them: `torch_threads` limits it, in the calling thread alone.
-                libraries = ThreadpoolController().select(internal_api="openblas")
-                self._limit.enter_context(libraries.limit(limits=1))
+                self._limit.enter_context(self._libraries.limit(limits=1))
             self._blocks += 1
 
     def __exit__(self, *_: object) -> None:
@@ -141,7 +148,8 @@ def map_in_threads(
 ) -> list[Result]:
     """Return ``work(item)`` for all items, in their order, computed in `worker_count` threads.
 
-    Each call has one torch thread, so the results do not depend on the number of threads.
+    Each call has one thread of torch and of OpenBLAS, so the results do not depend on the number of threads, and no
+    two calls wait for each other's threads.
 
     Parameters
     ----------
@@ -159,14 +167,15 @@ def map_in_threads(
         return [report(work(item), number) for number, item in enumerate(items, 1)]
     kept = _workers.get()
     workers = kept or _Workers(worker_count())
-    futures = [workers.pool.submit(work, item) for item in items]
-    try:
-        return [report(future.result(), number) for number, future in enumerate(futures, 1)]
-    finally:
-        # None runs on when one has failed.
-        wait([future for future in futures if not future.cancel()])
-        if workers is not kept:
-            workers.close()
+    with _one_blas_thread:
+        futures = [workers.pool.submit(work, item) for item in items]
+        try:
+            return [report(future.result(), number) for number, future in enumerate(futures, 1)]
+        finally:
+            # None runs on when one has failed.
+            wait([future for future in futures if not future.cancel()])
+            if workers is not kept:
+                workers.close()
 
 
 class _Runs:

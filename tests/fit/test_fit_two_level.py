@@ -239,6 +239,12 @@ def test_what_one_network_must_do_is_left_to_one() -> None:
         assert not FitOptions(**other).adaptive  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("given", "said"), [({}, False), ({"solver": "qr"}, True), ({"search": "line"}, True)])
+def test_options_of_one_network_that_were_not_used_are_named(given: dict[str, str], said: bool) -> None:
+    _, solution = fit(torus(60, np.random.default_rng(0)), FitOptions(quality="draft", **given))  # type: ignore[arg-type]
+    assert ("were not used" in solution.status) == said
+
+
 def test_an_interrupt_leaves_the_global_field(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*args: object, **options: object) -> None:
         del args, options

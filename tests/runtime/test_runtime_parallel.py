@@ -168,6 +168,16 @@ def test_pieces_of_work_keep_their_order_and_have_one_thread_each() -> None:
     assert told == [0.2, 0.4, 0.6, 0.8, 1.0]
 
 
+def test_pieces_have_one_thread_of_openblas_each_outside_of_fixed_sums_too() -> None:
+    before, threads = blas_threads(), torch.get_num_threads()
+    set_threads(2)
+    try:
+        assert map_in_threads(lambda _: blas_threads(), range(4)) == [{1}] * 4
+    finally:
+        set_threads(threads)
+    assert blas_threads() == before
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_the_first_piece_that_fails_ends_the_work(count: int) -> None:
     begun: list[int] = []
