@@ -1,16 +1,18 @@
 """Estimates the time and memory of a run from a model that was fitted to measured runs.
 
-Processor seconds of one thread, measured for clouds of 500 to 35,000 points, three qualities and three resolutions:
+Processor seconds, fitted to runs with one thread of scans of 500 to 100,000 points, rippled balls, machine parts,
+organic shapes and range scans, in three qualities and at three resolutions:
 
-    fit    6.8 s (points / 500)^0.545 (0.72 + 0.28 (features / 600)^2)
-    mesh   50 s (cells / 256)^2 (0.51 + 0.49 features / 600)
-    start  3 s, and 1 s for each 100,000 points that are read
+    start  2.5 s, and 1 s for each 40,000 points that are read
+    fit    7 s (points / 500)^0.33 (0.4 for the network, except in draft quality, + 0.51 + 0.09 (features / 600)^2)
+    mesh   6.5 s (cells / 256)^2.9 (0.7 + 0.3 features / 600)
 
-Two idle cores take half of the sum. Measured against estimated: 24 s against 34 at 2,009 points, 54 against 41 at
-7,189, 42 against 44 at 10,044, and 76 against 84 at 85,127. Shapes differ, so that an estimate is right to within a
-factor of about 1.5 on such a machine. The peak of resident memory was 0.55 to 0.75 GB in the fit of
-a few hundred points, 1.06 to 1.37 GB from 5,000 points on, and 0.5 GB + 0.89 GB (cells / 512)^2 in the mesh, less in a
-long and thin box; the points themselves matter only from millions on.
+A resolution of the user's own is taken as it is, while noise may lower the usual one: so the power is above two. Two
+idle cores take 0.7 of the sum. Nine of ten runs were within a factor of 1.8 of what is expected on one machine: smooth
+shapes take half as long as others with as many points. One machine took 1.5 times as long as another, and the
+constants lie between them. The peak of resident memory was 0.45 to 1 GB in the fit, and in the mesh 0.4 GB and 1.1 to
+2.1 GB (cells / 512)^2, less in a long and thin box; the points themselves matter only from millions on.
+`./scripts/bench estimate` compares runs with what is expected of them.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ class Estimate:
 
     Parameters
     ----------
-    seconds : on two idle cores, to within a factor of about 1.5
+    seconds : on two idle cores, mostly to within a factor of two
     memory_mb : peak of resident memory, in MB of 10^6 bytes
     fit_seconds, mesh_seconds : those of the fit, and of the mesh
     """
@@ -72,8 +74,9 @@ def estimate(
         return None
     cells, detail = options.mesh().cells(bounds), fit.features / model.detail_features
     starting = model.start_seconds + read / model.read_points_per_second
-    fitting = model.fit_seconds * (points / model.fit_points) ** model.fit_exponent * (0.72 + 0.28 * detail**2)
-    meshing = model.mesh_seconds * (cells / model.mesh_cells) ** 2 * (0.51 + 0.49 * detail)
+    parts_of_fit = model.network_share * fit.fits_network + (1.0 - model.network_share) * (0.85 + 0.15 * detail**2)
+    fitting = model.fit_seconds * (points / model.fit_points) ** model.fit_exponent * parts_of_fit
+    meshing = model.mesh_seconds * (cells / model.mesh_cells) ** model.mesh_exponent * (0.7 + 0.3 * detail)
     seconds = model.two_core_share * (starting + fitting + meshing)
     mesh_memory = mesh_memory_mb(cells, bounds, model=model)
     fit_memory = model.fit_memory_mb + model.dense_fit_memory_mb * min(1.0, points / model.dense_fit_points)

@@ -9,23 +9,25 @@ from dataclasses import dataclass
 class CostModel:
     """Model of what a default run takes, fitted to measured runs; see `gnrecon.report.estimate` for the formula.
 
-    Times are processor seconds of one thread, of clouds of 500 to 35,000 points at three qualities and resolutions.
+    Times are processor seconds of one thread, of scans of 500 to 100,000 points at three qualities and resolutions.
     """
 
-    start_seconds: float = 3.0  # measured: imports and the first stages of a small scan
-    read_points_per_second: float = 100_000.0  # measured: reading and cleaning
-    fit_seconds: float = 6.8  # measured: fit of `fit_points` with `detail_features`
+    start_seconds: float = 2.5  # measured: imports and the first stages of a small scan
+    read_points_per_second: float = 40_000.0  # measured: reading and cleaning
+    fit_seconds: float = 7.0  # measured: fit of `fit_points` with `detail_features` and a network
     fit_points: int = 500  # the smallest cloud measured
-    fit_exponent: float = 0.545  # slope of log time over log points in the measurements
-    mesh_seconds: float = 50.0  # measured: mesh of `mesh_cells` with `detail_features`
-    mesh_cells: int = 256  # the default resolution
+    fit_exponent: float = 0.33  # slope of log time over log points in the measurements
+    network_share: float = 0.4  # of the fit, which draft quality saves
+    mesh_seconds: float = 6.5  # measured: mesh of `mesh_cells` with `detail_features`
+    mesh_cells: int = 256  # the usual resolution of 10,000 points and more
+    mesh_exponent: float = 2.9  # slope of log time over log cells, where noise may lower the usual resolution
     detail_features: int = 600  # features per cube with --quality normal
-    two_core_share: float = 0.5  # share of the processor seconds that pass on two idle cores; more cores help little
-    fit_memory_mb: float = 700.0  # measured: fits of a few hundred points, with one thread or two
-    dense_fit_memory_mb: float = 700.0  # measured: what a fit of `dense_fit_points` or more takes more, at most
-    dense_fit_points: int = 5000  # the size of that measurement; larger scans are fitted in pieces
-    mesh_memory_mb: float = 505.0  # measured: mesh of few cells
-    mesh_cells_memory_mb: float = 886.0  # measured: what a mesh of `mesh_memory_cells` takes more
+    two_core_share: float = 0.7  # share of the processor seconds that pass on two idle cores; more cores help little
+    fit_memory_mb: float = 550.0  # measured: fits of a few hundred points, with two threads
+    dense_fit_memory_mb: float = 350.0  # measured: what a fit of `dense_fit_points` or more takes more, at most
+    dense_fit_points: int = 20_000  # the size of that measurement; larger scans are fitted in pieces
+    mesh_memory_mb: float = 430.0  # measured: mesh of few cells
+    mesh_cells_memory_mb: float = 1700.0  # measured: what a mesh of `mesh_memory_cells` takes more
     mesh_memory_cells: int = 512  # the resolution of that measurement
     last_layer_matrices: int = 4  # equations of the data and of the volume, their sum, and its factor
     read_point_bytes: float = 600.0  # measured: each point that is read

@@ -24,6 +24,7 @@ BENCHMARKS = {
     "ablation": Benchmark("accuracy.ablation", "the default fit without one of its parts at a time"),
     "uncertainty": Benchmark("uncertainty", "sigma compared with the true error, on known shapes"),
     "speed": Benchmark("speed", "whole commands on growing scans, compared with screened Poisson: time and memory"),
+    "estimate": Benchmark("estimates", "what `gnrecon info` expects of a run, compared with what it takes"),
     "engine": Benchmark("engine.measurements", "Gauss-Newton compared with a plain version of the paper's algorithm"),
     "learn": Benchmark("shape_learning", "shape learning by three optimisers, and one step's time"),
     "transport": Benchmark("transport_terms", "the effect of the terms of moving surfaces that the paper neglects"),
