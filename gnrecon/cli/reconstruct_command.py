@@ -129,8 +129,11 @@ def reconstruct_command(
     )
     if dry_run:
         from gnrecon.cli.scan_info import info
+        from gnrecon.runtime.logs import require_log
 
         files.check()
+        if log is not None:
+            require_log(log, [path for paths in files.inputs_and_targets() for path in paths])
         raise SystemExit(info(scans, chosen, format))
     if limit_mb is not None:
         continue_in_child(limit_mb)

@@ -19,7 +19,7 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame
-from gnrecon.geometry.signed_distance import Box
+from gnrecon.geometry.signed_distance import Box, continued, continued_values
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import InputError
 from gnrecon.runtime.files import atomic_write
@@ -90,7 +90,10 @@ class NeuralSDF:
 
     @property
     def bounds(self) -> Float:
-        """Lower and upper corner of the box within which the field may be trusted, of shape (2, 3), file units."""
+        """Lower and upper corner of the box in which the field was fitted, of shape (2, 3), file units.
+
+        All of the surface is within. Outside, a distance is that to the box and, from there, to the surface.
+        """
         return self.frame.to_world(np.stack([self.box.lower, self.box.upper]))
 
     @property
@@ -100,7 +103,7 @@ class NeuralSDF:
 
     def sdf(self, points: npt.ArrayLike) -> Float:
         """Return signed distances, of shape (N,), at `points`, of shape (N, 3), all in file units."""
-        x = self._unit(points)
+        x, beyond = self.box.nearest(self._unit(points))
         # Written in place: results kept apart would lie between the batches' large arrays, and hold their memory.
         values = np.empty(len(x))
 
@@ -110,7 +113,7 @@ class NeuralSDF:
         self._each_batch(fill, len(x))
         if self.detail is not None:
             values += self.detail.value(x)
-        return self.frame.scale * values
+        return self.frame.scale * continued_values(values, beyond)
 
     def sdf_around(self, centers: npt.ArrayLike, offsets: npt.ArrayLike) -> Float:
         """Return signed distances, of shape (N, K), at K offsets from each of N centres, all in file units.
@@ -133,7 +136,13 @@ class NeuralSDF:
         self._each_batch(fill, len(x))
         if self.detail is not None:
             values += self.detail.value_around(x, apart)
-        return self.frame.scale * values
+        values *= self.frame.scale
+        # Only centres near the box's faces have offsets that may be outside.
+        reach = np.abs(apart).max(axis=0, initial=0.0)
+        rows = np.flatnonzero(~((x - reach >= self.box.lower) & (x + reach <= self.box.upper)).all(axis=1))
+        places = self.frame.to_world((x[rows, None] + apart).reshape(-1, 3))
+        values[rows] = self.sdf(places).reshape(-1, len(apart))
+        return values
 
     def gradient(self, points: npt.ArrayLike) -> Float:
         """Return the gradient of the distance, of shape (N, 3), at `points`, of shape (N, 3); it has no unit."""
@@ -141,7 +150,8 @@ class NeuralSDF:
 
     def sdf_and_gradient(self, points: npt.ArrayLike) -> tuple[Float, Float]:
         """Return distances and gradients at once, as `sdf` and `gradient` do, at `points`, of shape (N, 3)."""
-        x = self._unit(points)
+        unit = self._unit(points)
+        x, beyond = self.box.nearest(unit)
         # The frame's scale enters value and coordinate alike and cancels in the gradient.
         values, gradients = np.empty(len(x)), np.empty((len(x), 3))
 
@@ -153,12 +163,13 @@ class NeuralSDF:
         if self.detail is not None:
             more = self.detail.value_and_gradient(x)
             values, gradients = values + more[0], gradients + more[1]
+        values, gradients = continued(values, gradients, unit - x, beyond)
         return self.frame.scale * values, gradients
 
     def hessian(self, points: npt.ArrayLike) -> Float:
         """Return second derivatives of the distance, of shape (N, 3, 3), per file unit, at `points`, of shape (N, 3).
 
-        They are evaluated in double precision, whatever the field's own.
+        They are evaluated in double precision, whatever the field's own, and hold within `bounds` alone.
         """
         x = self._unit(points)
         theta = self.theta.to(torch.float64)

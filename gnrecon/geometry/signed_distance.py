@@ -37,9 +37,39 @@ class Box:
         """Return the bounding box of `points`, of shape (N, 3), widened by `margin` on each side."""
         return cls(points.min(axis=0) - margin, points.max(axis=0) + margin)
 
+    def nearest(self, points: Float) -> tuple[Float, Float]:
+        """Return the nearest points of the box, of shape (N, 3), and the distances to them, of shape (N,).
+
+        Where a point is not a number, so is its distance, and its nearest point is a corner.
+        """
+        known = np.where(np.isnan(points).any(axis=1, keepdims=True), self.lower, points)
+        near = np.clip(known, self.lower, self.upper)
+        return near, np.linalg.norm(points - near, axis=1)
+
     def sample(self, count: int, rng: np.random.Generator) -> Float:
         """Return uniform points, of shape (count, 3)."""
         return rng.uniform(self.lower, self.upper, (count, 3))
+
+
+def continued_values(values: Float, beyond: Float) -> Float:
+    """Return distances outside of a box that holds the whole surface.
+
+    Parameters
+    ----------
+    values : array of shape (N,), at the nearest points of the box
+    beyond : array of shape (N,), distances to these
+    """
+    return np.where(beyond == 0.0, values, np.maximum(values, 0.0) + beyond)
+
+
+def continued(values: Float, gradients: Float, away: Float, beyond: Float) -> tuple[Float, Float]:
+    """Return `continued_values` and their gradients; `gradients` and `away`, the way there, have the shape (N, 3)."""
+    out = ~(beyond == 0.0)
+    if out.any():
+        # The nearest point of the box moves with a point along the axes along which the point is within.
+        along = np.where((values > 0.0)[:, None] & (away == 0.0), gradients, 0.0)
+        gradients = np.where(out[:, None], along + away / np.where(out, beyond, 1.0)[:, None], gradients)
+    return continued_values(values, beyond), gradients
 
 
 def kd_tree_order(points: Float, *, leaf_points: int = 4) -> Int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -78,7 +79,7 @@ def logged(console: Console | None, file: Path | None, others: Sequence[Path] = 
     Raises
     ------
     UsageError
-        When `file` is one of the others.
+        When `file` is one of the others, or holds anything but a log.
     OutputError
         When it cannot be written.
     """
@@ -113,9 +114,27 @@ def unprinted_log(name: str) -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
+def require_log(file: Path, others: Sequence[Path]) -> None:
+    """Refuse a file to which a log must not be appended.
+
+    Raises
+    ------
+    UsageError
+        When it is one of the others, or holds anything but a log.
+    OutputError
+        When it cannot be read.
+    """
     if any(same_file(file, other) for other in others):
         raise UsageError(f"{file} is named twice; a log is appended to a file of its own.")
+    try:
+        if file.is_file() and not _is_log(file):
+            raise UsageError(f"{file} exists and is no log of gnrecon; name another file for the log.")
+    except OSError as error:
+        raise OutputError(f"The log {file} cannot be written: {error.strerror or error}.") from error
+
+
+def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
+    require_log(file, others)
     try:
         if file.is_fifo():
             os.close(os.open(file, os.O_WRONLY | os.O_NONBLOCK))  # fails where nobody reads, instead of waiting for it
@@ -125,6 +144,13 @@ def _file_handler(file: Path, others: Sequence[Path]) -> logging.Handler:
     handler.setLevel(logging.DEBUG)
     handler.setFormatter(_OneLineFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler
+
+
+def _is_log(file: Path, *, most_bytes: int = 200) -> bool:
+    """Whether a file is empty, or begins as a line of a log does: with a time, a level and the name of a logger."""
+    with file.open("rb") as opened:
+        start = opened.read(most_bytes)
+    return not start or re.match(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d+ [A-Z]+ gnrecon", start) is not None
 
 
 @contextmanager

@@ -104,7 +104,7 @@ def test_as_many_jobs_as_cores_and_memory_allow(tmp_path: Path, monkeypatch: pyt
     assert fitting_jobs([a_job(tmp_path)] * 20, threads=16) == 1
     assert fitting_jobs([a_job(tmp_path)] * 3, threads=1) == 3
     assert fitting_jobs([a_job(tmp_path, limit=30_000.0)] * 20, threads=1) == 3
-    assert fitting_jobs([a_job(tmp_path), a_job(tmp_path, resolution=1500)] * 20, threads=1) == 6
+    assert fitting_jobs([a_job(tmp_path), a_job(tmp_path, resolution=1480)] * 20, threads=1) == 6
     monkeypatch.setattr(executors, "available_memory_mb", lambda: 100.0)
     assert fitting_jobs([a_job(tmp_path)] * 20, threads=1) == 1
 

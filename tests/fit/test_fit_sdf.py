@@ -21,7 +21,7 @@ from gnrecon.runtime.errors import InputError, OutputError
 
 UNIT = Frame(np.zeros(3), 1.0)
 UTM = Frame(np.array([431_234.567, 5_412_345.678, 312.1]), 23.7)
-BOX = Box(np.array([-1.1, -0.9, -1.0]), np.array([1.0, 1.1, 0.8]))
+BOX = Box(np.array([-1.1, -1.2, -1.3]), np.array([1.2, 1.1, 1.1]))
 
 
 def random_field(widths: tuple[int, ...] = (9, 7), frame: Frame = UTM, dtype: torch.dtype = torch.float64) -> NeuralSDF:
@@ -66,6 +66,48 @@ def test_around_centres_it_answers_what_it_does_at_each_point(widths: tuple[int,
     expected = sdf.sdf((centers[:, None] + offsets).reshape(-1, 3)).reshape(30, 8)
     assert np.allclose(values, expected, rtol=0, atol=1e-7)
     assert np.ptp(expected) > 0.1 * frame.scale
+
+
+@pytest.fixture(scope="module")
+def ball() -> NeuralSDF:
+    """A field of 150 points of a ball of radius 0.8, in radii of a world frame."""
+    directions = np.random.default_rng(0).standard_normal((150, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return fit(Samples(0.8 * directions, directions, UTM), FitOptions(quality="draft"))[0]
+
+
+@pytest.mark.parametrize("farther", [1.2, 1.5, 2.0, 4.0, 30.0])
+def test_far_outside_a_field_is_the_distance_to_the_box_and_on_to_the_surface(ball: NeuralSDF, farther: float) -> None:
+    directions = np.random.default_rng(1).standard_normal((300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found, true = ball.sdf(UTM.to_world(farther * directions)) / UTM.scale, farther - 0.8
+    assert (found > 0.6 * true).all()
+    assert (found < true + 0.8).all()
+    around = ball.sdf_around(UTM.to_world(farther * directions[:5]), UTM.scale * directions[5:8])
+    expected = ball.sdf((UTM.to_world(farther * directions[:5])[:, None] + UTM.scale * directions[5:8]).reshape(-1, 3))
+    assert np.allclose(around.ravel(), expected, rtol=0, atol=1e-6)
+
+
+def test_gradients_agree_with_differences_outside_of_the_box_and_are_one_at_least_along_the_way() -> None:
+    sdf, x = random_field(frame=UNIT), 2.5 * points(200)
+    beyond = BOX.nearest(x)[1]
+    x = x[(beyond > 0.01) & (np.abs(sdf.sdf(BOX.nearest(x)[0])) > 0.01)]
+    slopes = np.stack([(sdf.sdf(x + step) - sdf.sdf(x - step)) / 2e-5 for step in 1e-5 * np.eye(3)], axis=1)
+    value, gradient = sdf.sdf_and_gradient(x)
+    assert len(x) > 50
+    assert np.array_equal(value, sdf.sdf(x))
+    smooth = (np.abs(x - BOX.lower) > 1e-4).all(axis=1) & (np.abs(x - BOX.upper) > 1e-4).all(axis=1)
+    assert np.allclose(gradient[smooth], slopes[smooth], rtol=0, atol=1e-4)
+    way = x - BOX.nearest(x)[0]
+    assert np.allclose((gradient * way).sum(axis=1), np.linalg.norm(way, axis=1))
+
+
+def test_places_that_are_no_numbers_have_no_distance_and_those_at_infinity_an_infinite_one(ball: NeuralSDF) -> None:
+    x = np.array([[np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0], UTM.center])
+    values = ball.sdf(x)
+    assert np.isnan(values[0])
+    assert values[1] == np.inf
+    assert values[2] < 0
 
 
 def test_normals_are_unit_gradients_and_finite_where_the_gradient_vanishes() -> None:

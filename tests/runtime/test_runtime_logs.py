@@ -126,6 +126,31 @@ def test_a_log_that_cannot_be_written_is_refused(scan: Path, tmp_path: Path, cap
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo.log", "link.log", "ring.ply"]
 
 
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+@pytest.mark.parametrize("content", [b"1 2 3\n4 5 6\n", b"ply\nformat ascii 1.0\n", b"{}", b"\x00\xff\x00"])
+def test_a_log_is_never_appended_to_another_kind_of_file(
+    scan: Path, tmp_path: Path, content: bytes, dry: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    other.write_bytes(content)
+    assert run(scan, "-o", tmp_path / "mesh.obj", "--log", other, *WORDS, *dry) == ExitCode.USAGE
+    assert "is no log of gnrecon" in capfd.readouterr().err
+    assert other.read_bytes() == content
+    assert not (tmp_path / "mesh.obj").exists()
+
+
+def test_a_dry_run_refuses_the_log_that_a_run_would_refuse(scan: Path, tmp_path: Path) -> None:
+    words = ["-o", tmp_path / "mesh.obj", "--log", tmp_path / "mesh.obj", *WORDS, "--dry-run"]
+    assert run(scan, *words) == ExitCode.USAGE
+
+
+def test_an_empty_file_may_become_a_log(scan: Path, tmp_path: Path) -> None:
+    log = tmp_path / "run.log"
+    log.touch()
+    assert run(scan, "-o", tmp_path / "mesh.obj", "--log", log, *WORDS, "-q") == ExitCode.OK
+    assert " gnrecon." in log.read_text()
+
+
 def test_a_cancelled_run_is_logged(
     cloud: tuple[np.ndarray, np.ndarray], scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
