@@ -10,6 +10,7 @@ import pytest
 
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import read_any, read_cloud, read_mesh, read_reference
+from gnrecon.io.formats.pcd import read_pcd
 from gnrecon.runtime.errors import InputError
 
 POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]])
@@ -32,6 +33,36 @@ def test_pcd_with_padding_fields_of_nothing_upper_case_and_columns(tmp_path: Pat
         assert cloud.attributes["intensity"].tolist() == [5, 6, 7, 8]
         assert cloud.attributes["ring"].tolist() == [1, 2, 3, 4]
         assert set(cloud.attributes) == {"intensity", "ring"}
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_pcd_fields_of_several_numbers_are_kept_whole_or_named(encoding: str, tmp_path: Path) -> None:
+    rows = np.zeros(4, [("p", "<f4", 3), ("v", "<f4", 3), ("k", "<u2", 2), ("last", "u1")])
+    rows["p"], rows["v"], rows["k"], rows["last"] = POINTS, POINTS[::-1] + 7, [[1, 2], [3, 4], [5, 6], [7, 8]], 9
+    path = pcd(tmp_path / "a.pcd", "FIELDS", "x y z velocity k last", "4 4 4 4 2 1", "F F F F U U", "1 1 1 3 2 1", rows)
+    head, body = path.read_bytes().split(b"DATA binary\n")
+    if encoding == "ascii":
+        body = "".join(
+            f"{' '.join(map(repr, np.r_[r['p'], r['v'], r['k'], r['last']].tolist()))}\n" for r in rows
+        ).encode()
+    if encoding == "binary_compressed":
+        # Stored by fields, and packed as literal runs of at most 32 bytes.
+        columns = [rows["p"][:, i] for i in range(3)] + [rows[name] for name in ("v", "k", "last")]
+        plain = b"".join(column.tobytes() for column in columns)
+        runs = [plain[i : i + 32] for i in range(0, len(plain), 32)]
+        packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+        body = np.array([len(packed), len(plain)], "<u4").tobytes() + packed
+    path.write_bytes(head + f"DATA {encoding}\n".encode() + body)
+    contents = read_pcd(path)
+    np.testing.assert_array_equal(contents.points, POINTS)
+    assert contents.attributes["last"].tolist() == [9] * 4
+    if encoding == "binary_compressed":
+        assert contents.attributes["velocity"].tolist() == rows["v"][:, 0].tolist()
+        assert contents.unread == tuple(f"all but the first number of the field {name}" for name in ("velocity", "k"))
+    else:
+        np.testing.assert_array_equal(contents.attributes["velocity"], rows["v"])
+        np.testing.assert_array_equal(contents.attributes["k"], rows["k"])
+        assert contents.unread == ()
 
 
 def test_ply_with_bool_and_points_and_cr(tmp_path: Path) -> None:

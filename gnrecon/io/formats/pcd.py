@@ -3,14 +3,16 @@
 That reader keeps doubles and all scalar fields (open3d's older one misreads binary doubles). But on failure it prints a
 warning and returns an empty cloud, and it pads a short file with zeros. The amount of data is therefore compared with
 the header before reading, and the number of points afterwards. A contradictory header would abort the process, so it is
-refused here. Padding (fields named ``_``, also of no bytes), names in upper case and the old COLUMNS, which PCL and
-drivers of scanners write, are put into a header that the reader takes, over the same data; so are normals, which it
-would misread where their type is not that of the positions.
+refused here. Of a field of several numbers a point the reader keeps the first: such a field is read as one field for
+each number, which is the same data. Padding (fields named ``_``, also of no bytes), names in upper case and the old
+COLUMNS, which PCL and drivers of scanners write, are put into a header that the reader takes, over the same data; so
+are normals, which it would misread where their type is not that of the positions.
 """
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +30,7 @@ def read_pcd(path: Path) -> Contents:
     open3d = import_open3d()
 
     header, body = _split(path.read_bytes())
-    header = _plain(header)
+    header, vectors = _with_single_fields(_plain(header))
     declared = int(header["POINTS"][0])
     _require_complete(header, body, declared)
     with (
@@ -43,8 +45,11 @@ def read_pcd(path: Path) -> Contents:
     points = arrays.pop("positions", np.empty((0, 3)))
     if len(points) != declared:
         raise InputError(f"the header declares {declared} points, but {len(points)} could be read.")
-    single = {name: values[:, 0] for name, values in arrays.items() if values.shape[1:] == (1,)}
-    return from_columns({**arrays, **single}, None, points)
+    arrays |= {name: values[:, 0] for name, values in arrays.items() if values.shape[1:] == (1,)}
+    found = {name: np.stack([arrays.pop(part) for part in parts], axis=1) for name, parts in vectors.items() if parts}
+    contents = from_columns({**arrays, **found}, None, points)
+    unread = [f"all but the first number of the field {name}" for name, parts in vectors.items() if not parts]
+    return replace(contents, unread=(*contents.unread, *unread))
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:
@@ -99,6 +104,26 @@ def _plain(header: Header) -> Header:
     first = {"VERSION": header.get("VERSION", ["0.7"]), **plain}
     last = {key: words for key, words in header.items() if key not in first and key != "DATA"}
     return {**first, **last, "DATA": [word.lower() for word in header["DATA"][:1]]}
+
+
+def _with_single_fields(header: Header) -> tuple[Header, dict[str, list[str]]]:
+    """Return the header with a field for each number of a point, and the names of those of each longer field.
+
+    They are none in compressed data, where the numbers of a field lie together and cannot be told apart by the header.
+    """
+    columns = zip(*(header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT")), strict=True)
+    fields: list[tuple[str, str, str, str]] = []
+    vectors: dict[str, list[str]] = {}
+    for name, size, kind, count in columns:
+        parts = [name]
+        if int(count) > 1 and not name.startswith("_"):
+            vectors[name] = (
+                [] if header["DATA"] == ["binary_compressed"] else [f"{name}[{i}]" for i in range(int(count))]
+            )
+            parts = vectors[name] or parts
+        fields += [(part, size, kind, "1" if len(parts) > 1 else count) for part in parts]
+    keys = ("FIELDS", "SIZE", "TYPE", "COUNT")
+    return header | {key: list(words) for key, words in zip(keys, zip(*fields, strict=True), strict=True)}, vectors
 
 
 def _require_complete(header: Header, body: bytes, points: int) -> None:
