@@ -95,6 +95,8 @@ class Files:
         if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
         inputs, targets = self.inputs_and_targets()
+        if any(target == Path("-") for target in targets):
+            raise UsageError("Results are written to files, so none of them can be called -.")
         require_files(inputs, targets, self.overwrite)
 
     def inputs_and_targets(self) -> tuple[list[Path], list[Path]]:

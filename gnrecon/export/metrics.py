@@ -57,10 +57,9 @@ def measure(
     Raises
     ------
     InputError
-        When either has nothing to measure or coordinates that are not finite.
+        When either has nothing to measure or coordinates that are not finite, or the reference's points all coincide.
     UsageError
-        When `samples` or `scale` is not positive, the reference's points all coincide, or the reference of a lid has
-        no faces.
+        When `samples` or `scale` is not positive, or the reference of a lid has no faces.
     """
     if samples < 1:
         raise UsageError(f"The number of samples is {samples}, but must be at least 1.")
@@ -76,6 +75,8 @@ def measure(
         if broken := int((~np.isfinite(positions)).any(axis=1).sum()):
             raise InputError(f"The {name} has {broken} points that are not finite, so distances cannot be measured.")
     radius = float(np.linalg.norm(anchor - anchor.mean(axis=0), axis=1).max()) if scale is None else scale
+    if scale is None and not radius > 0:
+        raise InputError("The reference has no extent: all of its points coincide.")
     if not radius > 0:
         raise UsageError(f"Distances cannot be given relative to a scale of {radius}, which is not positive.")
     # One generator for both, so that a seed determines all numbers.

@@ -241,12 +241,14 @@ def _copy(
     """
     folder = tempfile.gettempdir()
     most, copied = int(most_disk_share * shutil.disk_usage(folder).free), 0
-    too_much = f"it takes more than {most / 1e9:,.1f} GB, {100 * most_disk_share:.0f} % of what is free in {folder}, "
+    size = f"{most / 1e9:,.1f} GB" if most >= 1e8 else f"{most / 1e6:,.1f} MB"
+    too_much = f"it takes more than {size}, {100 * most_disk_share:.0f} % of what is free in {folder}, where it is "
+    done = "copied" if packed_bytes is None else "unpacked"
     with target.open("wb") as file:
         while chunk := source.read(chunk_bytes):
             copied += len(chunk)
             if copied > most:
-                raise InputError(f"unpacked, {too_much}where it is unpacked; TMPDIR names another folder.")
+                raise InputError(f"{done}, {too_much}{done}; TMPDIR names another folder.")
             if packed_bytes is not None and copied > max(least_suspect_bytes, most_ratio * packed_bytes):
                 raise InputError(f"it unpacks to more than {most_ratio:.0f} times its size, as no scan does.")
             file.write(chunk)

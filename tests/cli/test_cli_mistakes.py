@@ -53,6 +53,7 @@ MISTAKES = [
     ("scan.ply -o scan.ply --overwrite", USAGE, "scan.ply is named twice; an input or another output is never"),
     ("scan.ply -o mesh.obj --preview picture.jpg", USAGE, "a PNG picture, so it cannot be called picture.jpg."),
     ("scan.ply -o mesh.obj --report page.html", USAGE, "JSON, so it cannot be called page.html; --html writes a page."),
+    ("scan.ply -o mesh.obj --report -", USAGE, "Results are written to files, so none of them can be called -."),
     ("scan.ply -o mesh.obj --save model.ply", USAGE, "saved as a .gnr file, so it cannot be called model.ply."),
     # An option's name
     ("scan.ply -o mesh.obj --fractoin 0.2", USAGE, "No such option: --fractoin; perhaps you mean '--fraction'."),
@@ -178,7 +179,7 @@ def test_help_lists_everyday_options_and_all_on_demand(
         if row.default is not False:
             assert " ".join(row.described.split()[-3:]) in plain, row.name
             assert "default: " in row.described
-    assert "[at least 16; default: 128 to 1,024, from the points' spacing]" in plain
+    assert "[at least 16; default: 64 to 1,024, from the points' spacing and noise; 256 of a saved field]" in plain
 
 
 FILES = [

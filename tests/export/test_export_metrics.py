@@ -164,3 +164,5 @@ def test_senseless_input_is_refused() -> None:
         measure(nothing, mesh)
     with pytest.raises(InputError, match="nothing to measure against"):
         measure(mesh, nothing)
+    with pytest.raises(InputError, match="all of its points coincide"):
+        measure(mesh, PointCloud(np.ones((3, 3))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import os
 import shutil
 import signal
@@ -28,8 +29,14 @@ def packed(tmp_path: Path) -> Path:
 
 def test_what_the_disk_does_not_take_is_refused(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5000))
-    with pytest.raises(InputError, match=r"scan.xyz.gz: unpacked, it takes more than 0.0 GB, 90 % of what is free in"):
+    with pytest.raises(InputError, match=r"scan.xyz.gz: unpacked, it takes more than 0.0 MB, 90 % of what is free in"):
         read_cloud(packed)
+
+
+def test_what_is_copied_is_not_called_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000_000))
+    with pytest.raises(InputError, match=r"^copied, it takes more than 4.5 MB, 90 % of .*, where it is copied; TMPDIR"):
+        read._copy(io.BytesIO(bytes(5_000_000)), tmp_path / "copy", None)
 
 
 def test_what_no_scan_is_like_is_refused(tmp_path: Path) -> None:
