@@ -34,9 +34,8 @@ class Options(OptionTable):
     """
 
     def __post_init__(self) -> None:
-        for name in ("crop", "clip_plane"):  # a single box or plane may be given as it is
-            value = getattr(self, name)
-            object.__setattr__(self, name, (value,) if isinstance(value, str) else value)
+        for name in ("crop", "clip_plane"):
+            object.__setattr__(self, name, _as_texts(getattr(self, name)))
         require_field_types(self)
         for name in ("fraction", "holdout"):
             if (share := getattr(self, name)) is not None:
@@ -285,3 +284,16 @@ def _default_cells(
     edge = (dense_cell_spacings if dense else sparse_cell_spacings) * neighbour_spacing(points)
     least, most = dense_cells if dense else sparse_cells
     return math.ceil(min(max(longest / edge, least), most)) if edge > 0 else most
+
+
+def _as_texts(value: Any) -> Any:
+    """Return boxes or planes as texts, where one may be given as it is, and each as numbers; others as they are."""
+    if isinstance(value, str):
+        return (value,)
+    try:
+        rows = np.atleast_2d(np.asarray(value))
+    except ValueError:  # rows of different lengths
+        return value
+    if rows.ndim != 2 or not rows.size or rows.dtype.kind not in "iuf" or np.ndim(value) == 0:
+        return value
+    return tuple(",".join(map(str, row)) for row in rows.tolist())

@@ -157,6 +157,35 @@ def test_the_docstring_has_every_option() -> None:
         assert row.help in Options.__doc__
 
 
+@pytest.mark.parametrize(
+    ("value", "texts"),
+    [
+        ("0,0,0,1,1,1", ("0,0,0,1,1,1",)),
+        ([0, 0, 0, 1, 1, 1.5], ("0.0,0.0,0.0,1.0,1.0,1.5",)),
+        (np.arange(6), ("0,1,2,3,4,5",)),
+        ([[0, 0, 0, 1, 1, 1], [2, 2, 2, 3, 3, 3]], ("0,0,0,1,1,1", "2,2,2,3,3,3")),
+        (["0,0,0,1,1,1", "2,2,2,3,3,3"], ("0,0,0,1,1,1", "2,2,2,3,3,3")),
+        ((), ()),
+    ],
+)
+def test_boxes_may_be_numbers(value: Any, texts: tuple[str, ...]) -> None:
+    options = Options.of(crop=value)
+    assert options.crop == texts
+    assert len(options.region().boxes) == len(texts)
+
+
+def test_what_is_no_box_is_refused() -> None:
+    assert Options.of(clip_plane=[0, 0, 1, -2.5]).clip_plane == ("0.0,0.0,1.0,-2.5",)
+    wrong: list[tuple[Any, str]] = [
+        ([0, 1, 2], "'0,1,2' is not a box: six numbers"),
+        ([[0, 0, 0, 1, 1, 1], [2, 2]], "crop must be a list of texts"),
+        ([True] * 6, "crop must be a list of texts"),
+    ]
+    for value, sentence in wrong:
+        with pytest.raises(UsageError, match=sentence):
+            Options.of(crop=value)
+
+
 def test_widths_are_read_from_text() -> None:
     assert typed("widths", "2000") == (2000,)
     assert typed("widths", "32,32,32") == (32, 32, 32)
