@@ -313,9 +313,9 @@ def _fit(run: _PipelineRun, ingested: Ingested) -> Fitted:
 
 def _mesh(run: _PipelineRun, scan: ScanRead, ingested: Ingested, fitted: Fitted) -> MeshedScan:
     """Mesh the field, so finely that faces are no farther off the surface than the field is."""
-    sdf = fitted.sdf
-    if run.refines_resolution and run.options.resolution is not None:
-        run.options = replace(run.options, resolution=cells_for_faces(sdf, run.options.resolution, ingested.sheet))
+    sdf, samples = fitted.sdf, ingested.samples
+    if run.refines_resolution and (cells := run.options.resolution) is not None:
+        run.options = replace(run.options, resolution=cells_for_faces(sdf, cells, ingested.sheet, len(samples)))
     # With the field's own points, so that a saved field makes the same mesh again.
     meshed = mesh_field(sdf, run.options.mesh(), data=sdf.data, stages=run.stages, advance=run.progress.advance)
     around = Neighbourhood(scan.cloud.points)
