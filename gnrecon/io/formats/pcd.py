@@ -109,7 +109,7 @@ def _plain(header: Header) -> Header:
 def _with_single_fields(header: Header) -> tuple[Header, dict[str, list[str]]]:
     """Return the header with a field for each number of a point, and the names of those of each longer field.
 
-    They are none in compressed data, where the numbers of a field lie together and cannot be told apart by the header.
+    They are none in compressed data, where the numbers of a field lie together and no header separates them.
     """
     columns = zip(*(header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT")), strict=True)
     fields: list[tuple[str, str, str, str]] = []
