@@ -291,9 +291,9 @@ def _as_texts(value: Any) -> Any:
     if isinstance(value, str):
         return (value,)
     try:
-        rows = np.atleast_2d(np.asarray(value))
+        rows = np.asarray(value)
     except ValueError:  # rows of different lengths
         return value
-    if rows.ndim != 2 or not rows.size or rows.dtype.kind not in "iuf" or np.ndim(value) == 0:
+    if rows.ndim not in (1, 2) or not rows.size or rows.dtype.kind not in "iuf":
         return value
-    return tuple(",".join(map(str, row)) for row in rows.tolist())
+    return tuple(",".join(map(str, row)) for row in np.atleast_2d(rows).tolist())

@@ -99,6 +99,12 @@ class Files:
             raise UsageError("Results are written to files, so none of them can be called -.")
         require_files(inputs, targets, self.overwrite)
 
+    @property
+    def named(self) -> list[Path]:
+        """All files that are read or written; a log must be none of them."""
+        inputs, targets = self.inputs_and_targets()
+        return [*inputs, *targets]
+
     def inputs_and_targets(self) -> tuple[list[Path], list[Path]]:
         """Return the files that are read, with those that scans name, and the files that are written."""
         targets = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
@@ -135,9 +141,8 @@ def run(
     """
     files.check()
     console = Console(stderr=True, quiet=quiet)
-    others = [path for paths in files.inputs_and_targets() for path in paths]
     bar = progress_bar(console, verbose) if watcher is None else nullcontext(watcher)
-    with logged(console if verbose else None, log, others), bar as progress:
+    with logged(console if verbose else None, log, files.named), bar as progress:
         result = reconstruct(files.scans, reference=files.reference, format=files.format, progress=progress, **options)
         result.report["command"] = command
         progress.stage("write")

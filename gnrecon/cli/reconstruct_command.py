@@ -133,7 +133,7 @@ def reconstruct_command(
 
         files.check()
         if log is not None:
-            require_log(log, [path for paths in files.inputs_and_targets() for path in paths])
+            require_log(log, files.named)
         raise SystemExit(info(scans, chosen, format))
     if limit_mb is not None:
         continue_in_child(limit_mb)

@@ -138,10 +138,10 @@ class NeuralSDF:
             values += self.detail.value_around(x, apart)
         values *= self.frame.scale
         # Only centres near the box's faces have offsets that may be outside.
-        reach = np.abs(apart).max(axis=0, initial=0.0)
-        rows = np.flatnonzero(~((x - reach >= self.box.lower) & (x + reach <= self.box.upper)).all(axis=1))
-        places = self.frame.to_world((x[rows, None] + apart).reshape(-1, 3))
-        values[rows] = self.sdf(places).reshape(-1, len(apart))
+        rows = np.flatnonzero(~self.box.holds(x, np.abs(apart).max(axis=0, initial=0.0)))
+        if len(rows):
+            places = self.frame.to_world((x[rows, None] + apart).reshape(-1, 3))
+            values[rows] = self.sdf(places).reshape(-1, len(apart))
         return values
 
     def gradient(self, points: npt.ArrayLike) -> Float:

@@ -37,11 +37,18 @@ class Box:
         """Return the bounding box of `points`, of shape (N, 3), widened by `margin` on each side."""
         return cls(points.min(axis=0) - margin, points.max(axis=0) + margin)
 
+    def holds(self, points: Float, reach: Float | float = 0.0) -> Mask:
+        """Return whether points, of shape (N, 3), and all within `reach` of them along each axis, are in the box."""
+        inside: Mask = np.all((points - reach >= self.lower) & (points + reach <= self.upper), axis=1)
+        return inside
+
     def nearest(self, points: Float) -> tuple[Float, Float]:
         """Return the nearest points of the box, of shape (N, 3), and the distances to them, of shape (N,).
 
         Where a point is not a number, so is its distance, and its nearest point is a corner.
         """
+        if self.holds(points).all():  # as in nearly all calls
+            return points, np.zeros(len(points))
         known = np.where(np.isnan(points).any(axis=1, keepdims=True), self.lower, points)
         near = np.clip(known, self.lower, self.upper)
         return near, np.linalg.norm(points - near, axis=1)
@@ -59,13 +66,13 @@ def continued_values(values: Float, beyond: Float) -> Float:
     values : array of shape (N,), at the nearest points of the box
     beyond : array of shape (N,), distances to these
     """
-    return np.where(beyond == 0.0, values, np.maximum(values, 0.0) + beyond)
+    return np.where(beyond == 0.0, values, np.maximum(values, 0.0) + beyond) if beyond.any() else values
 
 
 def continued(values: Float, gradients: Float, away: Float, beyond: Float) -> tuple[Float, Float]:
     """Return `continued_values` and their gradients; `gradients` and `away`, the way there, have the shape (N, 3)."""
-    out = ~(beyond == 0.0)
-    if out.any():
+    if beyond.any():
+        out = beyond != 0.0
         # The nearest point of the box moves with a point along the axes along which the point is within.
         along = np.where((values > 0.0)[:, None] & (away == 0.0), gradients, 0.0)
         gradients = np.where(out[:, None], along + away / np.where(out, beyond, 1.0)[:, None], gradients)

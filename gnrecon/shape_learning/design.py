@@ -258,5 +258,4 @@ class DesignRegion:
         near = sample_surface(self.mesh, round(near_share * count), rng).points
         near = near + near_deviation * rng.standard_normal(near.shape)
         points = np.concatenate([self.box.sample(count - len(near), rng), near])
-        within: Float = np.clip(points, self.box.lower, self.box.upper)
-        return within
+        return self.box.nearest(points)[0]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -21,14 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.harness import command_line
-from benchmarks.harness.measurement import run_command
+from benchmarks.harness.measurement import GNRECON, run_command
 from benchmarks.harness.tables import Figure, row_table
 from benchmarks.scaling_run import Ball
 from gnrecon.cli.scan_info import info
 from gnrecon.io import write_cloud
 from gnrecon.runtime.errors import ExitCode, UsageError
-
-GNRECON = (sys.executable, "-m", "gnrecon")
 
 FIGURES = (
     Figure("points", "points", "{:,}"),

@@ -20,15 +20,13 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.harness import command_line
-from benchmarks.harness.measurement import run_command
+from benchmarks.harness.measurement import GNRECON, run_command
 from benchmarks.harness.tables import Figure, row_table
 from benchmarks.scaling_run import Ball
 from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.io import read_mesh, write_cloud
 from gnrecon.runtime.errors import ExitCode, UsageError
 from gnrecon.runtime.files import atomic_write
-
-GNRECON = (sys.executable, "-m", "gnrecon")
 
 POISSON = """
 import sys, open3d

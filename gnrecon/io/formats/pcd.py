@@ -111,10 +111,10 @@ def _with_single_fields(header: Header) -> tuple[Header, dict[str, list[str]]]:
 
     They are none in compressed data, where the numbers of a field lie together and no header separates them.
     """
-    columns = zip(*(header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT")), strict=True)
+    keys = ("FIELDS", "SIZE", "TYPE", "COUNT")
     fields: list[tuple[str, str, str, str]] = []
     vectors: dict[str, list[str]] = {}
-    for name, size, kind, count in columns:
+    for name, size, kind, count in zip(*(header[key] for key in keys), strict=True):
         parts = [name]
         if int(count) > 1 and not name.startswith("_"):
             vectors[name] = (
@@ -122,7 +122,6 @@ def _with_single_fields(header: Header) -> tuple[Header, dict[str, list[str]]]:
             )
             parts = vectors[name] or parts
         fields += [(part, size, kind, "1" if len(parts) > 1 else count) for part in parts]
-    keys = ("FIELDS", "SIZE", "TYPE", "COUNT")
     return header | {key: list(words) for key, words in zip(keys, zip(*fields, strict=True), strict=True)}, vectors
 
 

@@ -28,6 +28,9 @@ from gnrecon.runtime.memory import process_peak_mb
 
 Result = TypeVar("Result")
 
+GNRECON = (sys.executable, "-m", "gnrecon")
+"""The words of its command."""
+
 
 def timed(call: Callable[[], Result], device: str = "cpu") -> tuple[float, Result]:
     """Return the seconds that a call takes, including all work that it started on the device, and its result."""
