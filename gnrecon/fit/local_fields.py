@@ -214,7 +214,8 @@ class _Cubes:
             cube = self.residuals, rows, length, space, self.features, hyperparameters, self.device
             return solve_cube(*cube, self.penalties, parameters=limits)
 
-        cubes = map_in_threads(solved, range(len(keys)), self.device, advance)
+        # In threads for a GPU too: the CPU looks for the points around a cube and sums their winding numbers.
+        cubes = map_in_threads(solved, range(len(keys)), advance=advance)
         if not any(cubes):
             # A few points that are far apart: a cube of one is better than none.
             cubes = [solved(number, 1) for number in range(len(keys))]

@@ -71,7 +71,10 @@ def robust_deviation(residuals: Float) -> float:
 
 def perpendicular(axis: Float) -> Float:
     """Return a vector at right angles to an axis, both of shape (3,); its length is not one."""
-    across: Float = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    least = int(np.abs(axis).argmin())
+    one, other = (least + 1) % 3, (least + 2) % 3
+    across = np.zeros(3)
+    across[one], across[other] = axis[other], -axis[one]
     return across
 
 

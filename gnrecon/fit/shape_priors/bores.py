@@ -22,6 +22,7 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.signed_distance import CoarseDistance
 from gnrecon.geometry.statistics import perpendicular, widest_gap
 from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.parallel import map_in_threads
 
 
 def samples_on_bores(
@@ -71,20 +72,25 @@ def _pairs_on_bores(
     points: Float, normals: Float, tree: cKDTree, reach: float, tolerance: float, parameters: DetectionParameters
 ) -> Int:
     """Return pairs of rows, of shape (K, 2), within reach that may lie on one bore, among points that face another."""
-    facing, close = np.zeros(len(points), dtype=bool), []
     pairs = tree.query_pairs(reach, output_type="ndarray")
-    for rows in slices(len(pairs), 200_000):
+
+    def of(rows: slice) -> tuple[Int, Int]:
+        """Return the pairs that face each other, and those that may lie on one bore."""
         one, other = pairs[rows].T
         n, m, offset = normals[one], normals[other], points[other] - points[one]
         cosine = np.einsum("kd,kd->k", n, m)
         # Both are in front of the other.
         concave = (np.einsum("kd,kd->k", offset, n) > 0) & (np.einsum("kd,kd->k", offset, m) < 0)
         opposed = concave & (cosine < cosine_of(parameters.max_pair_degrees))
-        facing[one[opposed]] = facing[other[opposed]] = True
         turned = concave & ~opposed & (cosine < cosine_of(parameters.min_pair_degrees))
         turned[turned] = meets_on_an_axis(offset[turned], n[turned], m[turned], tolerance)
-        close.append(pairs[rows][turned])
-    found = np.concatenate(close) if close else np.zeros((0, 2), dtype=int)
+        return pairs[rows][opposed], pairs[rows][turned]
+
+    parts = map_in_threads(of, slices(len(pairs), 200_000))
+    facing = np.zeros(len(points), dtype=bool)
+    for opposed, _ in parts:
+        facing[opposed] = True
+    found = np.concatenate([pairs[:0], *(turned for _, turned in parts)])
     chosen: Int = found[facing[found].all(axis=1)]
     return chosen
 

@@ -166,9 +166,9 @@ def is_inlier(
     angle_degrees: float = DetectionParameters.angle_degrees,
 ) -> Mask:
     """Return which points, of shape (N, 3), lie on a primitive by their height over it and by their normals."""
-    near = np.abs(primitive.signed_distance(points)) < max_height
-    cosine: Float = np.einsum("kd,kd->k", primitive.normal(points), normals)
-    inliers: Mask = near & (cosine > cosine_of(angle_degrees))
+    inliers: Mask = np.abs(primitive.signed_distance(points)) < max_height
+    near = np.flatnonzero(inliers)
+    inliers[near] = np.einsum("kd,kd->k", primitive.normal(points[near]), normals[near]) > cosine_of(angle_degrees)
     return inliers
 
 
