@@ -13,6 +13,8 @@ class FieldParameters:
     degrees_of_freedom: float = 12.0
     # Pairs of a point and a cube whose features are computed at once; they fit into the processor's cache.
     batch_pairs: int = 512
+    # The same on a GPU, which many small batches leave idle.
+    gpu_batch_pairs: int = 32_768
     # Points that one thread evaluates at a time.
     batch_points: int = 16_384
     # The same for values at offsets around centres, which take less memory each.

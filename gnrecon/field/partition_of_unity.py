@@ -295,6 +295,7 @@ class Detail:
         order: int,
         *,
         batch_pairs: int = FieldParameters.batch_pairs,
+        gpu_batch_pairs: int = FieldParameters.gpu_batch_pairs,
     ) -> list[Tensor]:
         """Return the functions of the cubes with derivatives, each at one point, in double precision.
 
@@ -308,7 +309,8 @@ class Detail:
         local, amplitudes = self.features.local(points, centers, lengths), self.amplitudes
         numbers = torch.as_tensor(cubes, device=amplitudes.device)
         own = [amplitudes.new_empty(len(points), *(order_ * [3])) for order_ in range(order + 1)]
-        for rows in slices(len(points), batch_pairs):
+        on_cpu = amplitudes.device.type == "cpu"
+        for rows in slices(len(points), batch_pairs if on_cpu else gpu_batch_pairs):
             sums = self.features.sums_of(local[rows], amplitudes[numbers[rows]], order)
             for whole, part in zip(own, sums, strict=True):
                 whole[rows] = part

@@ -211,15 +211,22 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         and only the sums have that of `like`
     size : number of columns of J
     like : tensor whose dtype and device are used
-    block_columns : columns of a block; large enough for fast matrix products, and small enough that little is computed
-        above the diagonal
+    block_columns : columns of a block on the CPU; large enough for fast matrix products, and small enough that little is
+        computed above the diagonal. A GPU has one product in the time of a few blocks
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
+    if like.device.type != "cpu":
+        for rows in chunks:
+            if rows.dtype == product.dtype:
+                product.addmm_(rows.T, rows)
+            else:
+                product += rows.T @ rows
+        return product
     # The last blocks come first: they take longest, and threads that share them end at the same time.
     blocks = slices(size, block_columns)[::-1]
     for rows in chunks:
         # Threads share the blocks and no sum, so that the result is the same for any number of them.
-        map_in_threads(partial(_add_block, product, rows), blocks, like.device)
+        map_in_threads(partial(_add_block, product, rows), blocks)
     return product
 
 
@@ -240,14 +247,7 @@ def gram_and_product(
 def _add_block(product: Tensor, rows: Tensor, block: slice) -> None:
     """Add the block's rows of J^T J, up to the diagonal."""
     before = slice(0, block.start)
-    if rows.device.type == "cpu":
-        # numpy's BLAS takes half of the time for a matrix by its own transpose, and knows processors of all makers.
-        left, right = rows[:, block].numpy(), rows[:, before].numpy()
-        product[block, block] += torch.from_numpy(left.T @ left)
-        product[block, before] += torch.from_numpy(left.T @ right)
-        return
-    place = product[block, : block.stop]
-    if rows.dtype == product.dtype:
-        place.addmm_(rows[:, block].T, rows[:, : block.stop])
-    else:
-        place += rows[:, block].T @ rows[:, : block.stop]
+    # numpy's BLAS takes half of the time for a matrix by its own transpose, and knows processors of all makers.
+    left, right = rows[:, block].numpy(), rows[:, before].numpy()
+    product[block, block] += torch.from_numpy(left.T @ left)
+    product[block, before] += torch.from_numpy(left.T @ right)
