@@ -211,8 +211,8 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         and only the sums have that of `like`
     size : number of columns of J
     like : tensor whose dtype and device are used
-    block_columns : columns of a block on the CPU; large enough for fast matrix products, and small enough that little is
-        computed above the diagonal. A GPU has one product in the time of a few blocks
+    block_columns : columns of a block on the CPU; large enough for fast matrix products, and small enough that little
+        is computed above the diagonal. A GPU has one product in the time of a few blocks
     """
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
     if like.device.type != "cpu":
