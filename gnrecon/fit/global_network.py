@@ -30,7 +30,7 @@ from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
 from gnrecon.fit.parameters import NetworkTermParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import sample_near_surface
-from gnrecon.residuals.constraints import eikonal, interface, normal_vector, value_range
+from gnrecon.residuals.constraints import Residual, eikonal, interface, normal_vector, value_range
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,16 @@ class Deviations:
 
     values: float
     normals: float
+
+    def followed(self, found: Deviations) -> Deviations:
+        """Return those of the next step: they rise at half the rate of the field's own, so that one bad step is little.
+
+        `found` are those of the field that the step starts at.
+        """
+        return Deviations(
+            (min(self.values, found.values) + found.values) / 2,
+            (min(self.normals, found.normals) + found.normals) / 2,
+        )
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,7 @@ class NetworkTerms:
     points, normals : of shape (V, 3), the validation points
     volume, distances : samples of free space, of shape (Q, 3), and their coarse signed distances, of shape (Q,)
     near : places near the surface at which the eikonal residual is measured, of shape (E, 3)
+    normal : the residual of the normals, of m components
     """
 
     scene: Scene
@@ -89,6 +100,7 @@ class NetworkTerms:
     distances: Tensor
     near: Tensor
     parameters: NetworkTermParameters
+    normal: Residual = normal_vector
     _latest: list[tuple[Siren, Tensor, Tensor]] = dataclass_field(
         default_factory=list, init=False, repr=False, compare=False
     )
@@ -101,6 +113,7 @@ class NetworkTerms:
         normals: Float,
         rng: np.random.Generator,
         *,
+        normal: Residual = normal_vector,
         parameters: NetworkTermParameters = NetworkTermParameters(),
     ) -> NetworkTerms:
         """Draw the samples of free space; without validation points, the points that are seen take their place."""
@@ -112,7 +125,7 @@ class NetworkTerms:
         count = parameters.eikonal_measured
         near = sample_near_surface(scene.samples.points, parameters.near_spacings * scene.coarse.spacing, count, rng)
         validation = scene.tensor(points), scene.tensor(normals)
-        return cls(scene, *validation, scene.tensor(x), scene.tensor(distance), scene.tensor(near), parameters)
+        return cls(scene, *validation, scene.tensor(x), scene.tensor(distance), scene.tensor(near), parameters, normal)
 
     def with_wrong_signs(self, field: Siren, theta: Tensor, rng: np.random.Generator) -> NetworkTerms:
         """Return the terms with more samples of free space where the field has the wrong sign."""
@@ -138,19 +151,21 @@ class NetworkTerms:
 
     def noise(self, field: Siren, theta: Tensor) -> Deviations:
         """Return robust deviations of the validation points from the field."""
-        distance, angle = self._misfits(field, theta)
+        distance, turn = self._misfits(field, theta)
         least, radius = self.parameters.least_deviation, self.radius
-        # Medians of the absolute value of a normal variable, and of the length of a normal vector in space.
-        values, normals = float(distance.median()) / 0.6745, float(angle.median()) / 1.538
+        # Medians of the length of a normal vector with one to three components.
+        medians = (0.6745, 1.1774, 1.538)
+        values = float(distance.median()) / medians[0]
+        normals = float(turn.norm(dim=1).median()) / medians[turn.shape[1] - 1]
         # The errors of estimated normals are alike among neighbours, so that validation points do not show them.
         least_angle = self.parameters.least_estimated_deviation if self.scene.samples.estimated else least
         return Deviations(max(values, least * radius), max(normals, least_angle))
 
     def prediction(self, field: Siren, theta: Tensor) -> Prediction:
         """Return how the field predicts."""
-        distance, angle = self._misfits(field, theta)
+        distance, turn = self._misfits(field, theta)
         wrong = self._signed(field, theta) < 0.0
-        return Prediction(distance / self.radius + angle, wrong, self.parameters.wrong_sign_score)
+        return Prediction(distance / self.radius + turn.norm(dim=1), wrong, self.parameters.wrong_sign_score)
 
     def score(self, field: Siren, theta: Tensor) -> float:
         """Return how badly it predicts, in disk radii."""
@@ -172,10 +187,10 @@ class NetworkTerms:
         return self.scene.coarse.radius
 
     def _misfits(self, field: Siren, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distances of the validation points from the surface, and |grad f - n|, both of shape (V,)."""
+        """Return the distances of the validation points from the surface, (V,), and residuals of normals, (V, m)."""
         value, gradient = field.value_and_gradient(theta, self.points)
         slope = (gradient * self.normals).sum(1).clamp_min(self.parameters.least_slope)
-        return value.abs() / slope, (gradient - self.normals).norm(dim=1)
+        return value.abs() / slope, self.normal(value, gradient, self.normals).residual
 
     def _is_wrong(self, field: Siren, theta: Tensor) -> Tensor:
         """Return the samples of free space at which f is beyond half of the one-sided bound, a mask of shape (Q,)."""
@@ -202,13 +217,14 @@ class NetworkTerms:
         points, normals = self.scene.points[rows], self.scene.normals[rows]
         value, gradient = field.value_and_gradient(theta, points)
         off = (value / noise.values).square()
-        turned = ((gradient - normals) / noise.normals).square().sum(1)
+        turn = self.normal(value, gradient, normals).residual
+        turned = (turn / noise.normals).square().sum(1)
         of_values = (freedom + 1) / (freedom + off) / noise.values**2
-        of_normals = (freedom + 3) / (freedom + turned) / noise.normals**2
+        of_normals = (freedom + turn.shape[1]) / (freedom + turned) / noise.normals**2
         # A term's weight is divided by its number of rows.
         return (
             ObjectiveTerm("interface", interface, points, None, len(rows) * of_values),
-            ObjectiveTerm("normal", normal_vector, points, normals, len(rows) * of_normals),
+            ObjectiveTerm("normal", self.normal, points, normals, len(rows) * of_normals),
         )
 
     def _free_space(self, field: Siren, theta: Tensor, rng: np.random.Generator) -> ObjectiveTerm:

@@ -24,7 +24,7 @@ from torch import Tensor
 from gnrecon.field.networks import Siren
 from gnrecon.field.widening import mean_of, widened
 from gnrecon.fit.fit_options import FitOptions, network_count, network_starts
-from gnrecon.fit.global_network import Deviations, NetworkTerms
+from gnrecon.fit.global_network import NetworkTerms
 from gnrecon.fit.initialisation import spectral_start
 from gnrecon.fit.objective import FieldProblem, Scene, start_terms
 from gnrecon.fit.parameters import InitialisationParameters, NetworkLadderParameters
@@ -213,12 +213,7 @@ class NetworkLadder:
             nonlocal noise
             del number
             end_if_asked()
-            found = terms.noise(field, theta)
-            # Deviations follow the field at half the rate at which they rise, so that one bad step has little effect.
-            noise = Deviations(
-                (min(noise.values, found.values) + found.values) / 2,
-                (min(noise.normals, found.normals) + found.normals) / 2,
-            )
+            noise = noise.followed(terms.noise(field, theta))
             return terms.problem(field, theta, noise, self.rng)
 
         def score(theta: Tensor) -> float:

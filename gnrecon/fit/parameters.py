@@ -291,10 +291,16 @@ class SingleNetworkParameters:
     start_points: int = 20_000  # most data points of the linear start of one wide layer
     wide_start_time_share: float = 0.4  # of the fit, measured, for the progress bar
     deep_start_time_share: float = 0.05
-    pool_samples: int = 30_000  # volume samples of a deep fit: signing them takes as long as a step
+    first_points: int = 600  # of the first step of a deep fit, at least one for so many of its parameters:
+    parameters_per_point: int = 4
+    points_growth: float = 1.1  # of the points from step to step, up to those of the global network's steps
+    least_gain: float = 0.01  # share of the left-out points' score whose loss ends a deep fit
+    # A network that has to follow the detail, too, is not held to a distance as firmly as the smooth global one.
+    near_eikonal_deviation: float = 0.3
+    far_eikonal_deviation: float = 1.0
     least_points_to_hold_out: int = 1000
     held_out_one_in: int = 20
-    held_out_patience_steps: int = 20
+    held_out_patience_steps: int = 8
     subspace_units: int = 400  # whose frequencies a step of a wide fit frees, so that J^T J stays small
     step_points: int = 4000  # most data points of a step of a wide fit
     krylov_tolerance: float = 0.3  # relative error in the energy norm: steps that a search shortens need no better

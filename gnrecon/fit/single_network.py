@@ -2,18 +2,18 @@
 
 *Several layers.* The start decides the result. From small weights the network is nearly linear, and Gauss-Newton spends
 50 to 90 steps on a plateau (the paper's start); from random frequencies and an exact solve of the last layer
-(`initialisation.spectral_start`) it has none. The stages (`continuation_stages`) then raise the number of rows (a step
-far from the minimum needs only part of the data), the weight of the data against the volume, and the precision of J:
-single precision suffices while the damping is well above its rounding. Of 1,000 points or more, one in twenty is held
-out; the fit ends when the residuals there stop falling, and returns the parameters for which they were least.
+(`initialisation.spectral_start`) it has none. The rows are those of the default fit's network (`global_network`), each
+over the deviation that left-out points have from the field, so that the weight of the data rises as the field gets
+nearer. The first steps use few points, drawn afresh, and each one more. Of 1,000 points or more, one in twenty is left
+out, and the fit ends when their score stops falling. The parameters of the least score are returned.
 
 *One wide layer.* See the comment on `fit_wide`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -21,10 +21,11 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
-from gnrecon.fit.fit_options import FitOptions
+from gnrecon.fit.fit_options import FitOptions, normal_residual
+from gnrecon.fit.global_network import NetworkTerms
 from gnrecon.fit.initialisation import Spectrum, spectral_start, wide_start
-from gnrecon.fit.objective import FieldProblem, Scene, data_terms, linear_data_terms, start_terms, step_terms
-from gnrecon.fit.parameters import SingleNetworkParameters
+from gnrecon.fit.objective import FieldProblem, Scene, linear_data_terms, start_terms, step_terms
+from gnrecon.fit.parameters import InitialisationParameters, NetworkTermParameters, SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import (
     LBFGS,
@@ -38,36 +39,7 @@ from gnrecon.optim import (
     Solution,
     StopRule,
 )
-from gnrecon.optim.problem import loss_of
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A part of the steps.
-
-    Parameters
-    ----------
-    until : share of the steps at which it ends
-    rows : most data points of a step
-    data_weight : of interface and normals
-    precision : of the Jacobian's factors
-    """
-
-    until: float
-    rows: int
-    data_weight: float
-    precision: torch.dtype
-
-
-def continuation_stages() -> tuple[Stage, ...]:
-    """Return the stages of a deep fit, measured in docs/research."""
-    return (
-        Stage(0.1, 2000, 1.0, torch.float32),
-        Stage(0.3, 6000, 1.0, torch.float32),
-        Stage(0.6, 15000, 30.0, torch.float32),
-        Stage(1.0, 15000, 1000.0, torch.float64),
-    )
 
 
 def fit_deep(
@@ -83,25 +55,31 @@ def fit_deep(
     """Fit a network of several hidden layers; `advance` is called when the start is solved."""
     steps = options.steps_for(len(scene.points))
     fitted, held = hold_out(scene, rng, parameters=parameters)
-    theta = spectral_start(field, fitted, partial(start_terms, fitted, options, rng), rng)
+    checked = fitted if held is None else held
+    validation = checked.points.cpu().numpy(), checked.normals.cpu().numpy()
+    near, far = parameters.near_eikonal_deviation, parameters.far_eikonal_deviation
+    rows = NetworkTermParameters(near_eikonal_deviation=near, far_eikonal_deviation=far)
+    terms = NetworkTerms.draw(fitted, *validation, rng, normal=normal_residual(options.normals), parameters=rows)
+    theta = spectral_start(
+        field, fitted, partial(start_terms, fitted, options, rng), rng, InitialisationParameters.hidden_weight_share
+    )
     advance(1.0)
-    # Signing volume samples takes as long as a step, so that one pool serves for all of them.
-    pool = tuple(scene.tensor(values) for values in fitted.volume(parameters.pool_samples, rng))
-
-    stages = continuation_stages()
+    noise = terms.noise(field, theta)
+    first = max(parameters.first_points, len(theta) // parameters.parameters_per_point)
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
-        stage = next((stage for stage in stages if number <= stage.until * steps), stages[-1])
-        rows = torch.as_tensor(np.sort(rng.permutation(len(pool[0]))[: min(stage.rows, scene.volume_count)]))
-        x, distance = (values[rows.to(values.device)] for values in pool)
-        terms = step_terms(fitted, options, rng, (x, distance), stage.rows, stage.data_weight)
-        return FieldProblem(field, terms, theta, precision=stage.precision)
+        nonlocal noise
+        noise = noise.followed(terms.noise(field, theta))
+        most = terms.parameters.data_rows
+        # In logarithms, as the power of thousands of steps is no number.
+        growing = math.exp(min((number - 1) * math.log(parameters.points_growth), math.log(most)))
+        return terms.with_rows(max(first, int(parameters.first_points * growing))).problem(field, theta, noise, rng)
 
     optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True))
-    # No stage may end early, because each one looks converged before the next raises the weight of the data.
-    stop = StopRule(steps, tolerance=0.0, patience=steps + 1, held_out_patience=parameters.held_out_patience_steps)
-    check = None if held is None else _held_out_loss(field, held, options, rng)
-    return optimiser.run(problem_at, theta, stop, callback, check)
+    # The score of points that are fitted shows which parameters are best, but not when they begin to follow noise.
+    patience = steps + 1 if held is None else parameters.held_out_patience_steps
+    stop = StopRule(steps, parameters.least_gain, steps + 1, held_out_patience=patience)
+    return optimiser.run(problem_at, theta, stop, callback, partial(terms.score, field))
 
 
 def hold_out(
@@ -121,18 +99,6 @@ def hold_out(
 
 def _only(scene: Scene, rows: Tensor) -> Scene:
     return replace(scene, points=scene.points[rows], normals=scene.normals[rows])
-
-
-def _held_out_loss(
-    field: Siren, held: Scene, options: FitOptions, rng: np.random.Generator
-) -> Callable[[Tensor], float]:
-    """Return the loss of interface and normals at the held-out points, as a function of theta."""
-    terms = data_terms(held, options, rng, len(held.points))
-
-    def loss(theta: Tensor) -> float:
-        return loss_of(FieldProblem(field, terms, theta), theta)
-
-    return loss
 
 
 # From the options' names to an optimiser.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from made_shapes import bored_plate
 from numpy.typing import NDArray
 
 from gnrecon.fit import FitOptions, NeuralSDF, fit
@@ -87,19 +88,17 @@ def test_deep_fit_of_a_sphere(normals: str) -> None:
 @pytest.mark.parametrize("search", SEARCHES)
 @pytest.mark.parametrize("widths", [(40,), (8, 8)], ids=str)
 def test_every_search_lowers_the_loss(search: str, widths: tuple[int, ...]) -> None:
-    sdf, solution = fit(sphere(150), FitOptions(widths=widths, steps=2, search=search))
+    sdf, solution = fit(sphere(), FitOptions(widths=widths, steps=2, search=search))
     assert all(record.loss < record.before for record in solution.history)
     assert np.all(np.isfinite(sdf.sdf(FRAME.to_world(directions(50, 2)))))
 
 
-@pytest.mark.parametrize(("optimiser", "steps"), [("gn", 10), ("adam", 250), ("lbfgs", 10)])
+@pytest.mark.parametrize(("optimiser", "steps"), [("gn", 20), ("adam", 1000), ("lbfgs", 10)])
 def test_every_optimiser_lowers_the_loss_of_a_deep_network(optimiser: str, steps: int) -> None:
-    sdf, solution = fit(sphere(150), FitOptions(widths=(8, 8), steps=steps, optimiser=optimiser))
+    sdf, solution = fit(sphere(), FitOptions(widths=(16, 16), steps=steps, optimiser=optimiser))
     assert len(solution.history) == steps
-    # Within the last stage, whose weights do not change.
-    last = [record.loss for record in solution.history[int(0.6 * steps) :]]
-    third = len(last) // 3
-    assert np.mean(last[-third:]) < np.mean(last[:third])
+    losses, third = [record.loss for record in solution.history], steps // 3
+    assert np.mean(losses[-third:]) < np.mean(losses[:third])
     assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(50, 2)))).mean() < 0.05 * FRAME.scale
 
 
@@ -112,7 +111,9 @@ def test_every_optimiser_lowers_the_loss_of_a_wide_network(optimiser: str) -> No
 # In row space a step's ten thousand rows take minutes; `tests/linalg` and `tests/optim` have it on smaller ones.
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "row-space"])
 def test_every_solver_fits(solver: str) -> None:
-    sdf, solution = fit(sphere(150), FitOptions(widths=(8, 8), steps=4, solver=solver))
+    # GMRES takes a second for a step.
+    steps = 10 if solver == "gmres" else 20
+    sdf, solution = fit(sphere(), FitOptions(widths=(16, 16), steps=steps, solver=solver))
     assert all(record.loss < record.before for record in solution.history)
     assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(50, 2)))).mean() < 0.03 * FRAME.scale
 
@@ -147,6 +148,23 @@ def test_same_seed_same_bits(widths: tuple[int, ...]) -> None:
     first, again, other = (fit(sphere(150), FitOptions(widths=widths, steps=2, seed=seed))[0] for seed in (3, 3, 4))
     assert torch.equal(first.theta, again.theta)
     assert not torch.equal(first.theta, other.theta)
+
+
+def test_a_scan_with_a_narrow_gap_gets_no_sheet_across_free_space() -> None:
+    # Two plates a tenth of their side apart: a field that is only near the points may have any sign elsewhere.
+    rng = np.random.default_rng(3)
+    lower, upper = (bored_plate(1500, 0.6, 0.05, 0.2, seed=seed) for seed in (1, 2))
+    points = np.concatenate([lower[0] - [0, 0, 0.11], upper[0] + [0, 0, 0.11]])
+    sdf, _ = fit(
+        Samples(points, np.concatenate([lower[1], upper[1]]), FRAME), FitOptions(widths=(24, 24, 24), steps=60)
+    )
+    x = rng.uniform(-0.75, 0.75, (4000, 3))
+    offset = np.abs(np.abs(x[:, 2]) - 0.11) - 0.05
+    across, bore = np.abs(x[:, :2]).max(axis=1) - 0.6, 0.2 - np.hypot(x[:, 0], x[:, 1])
+    outside = np.max([offset, across, bore], axis=0)
+    clear = np.abs(outside) > 0.03
+    wrong = (sdf.sdf(FRAME.to_world(x[clear])) < 0) != (outside[clear] < 0)
+    assert wrong.mean() < 0.005
 
 
 def test_more_points_than_a_step_takes() -> None:
