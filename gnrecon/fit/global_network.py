@@ -153,10 +153,10 @@ class NetworkTerms:
         """Return robust deviations of the validation points from the field."""
         distance, turn = self._misfits(field, theta)
         least, radius = self.parameters.least_deviation, self.radius
-        # Medians of the length of a normal vector with one to three components.
-        medians = (0.6745, 1.1774, 1.538)
-        values = float(distance.median()) / medians[0]
-        normals = float(turn.norm(dim=1).median()) / medians[turn.shape[1] - 1]
+        # Medians of the length of a normal vector by its number of components; with more, nearly the root of that.
+        medians, components = {1: 0.6745, 2: 1.1774, 3: 1.538}, turn.shape[1]
+        values = float(distance.median()) / medians[1]
+        normals = float(turn.norm(dim=1).median()) / medians.get(components, components**0.5)
         # The errors of estimated normals are alike among neighbours, so that validation points do not show them.
         least_angle = self.parameters.least_estimated_deviation if self.scene.samples.estimated else least
         return Deviations(max(values, least * radius), max(normals, least_angle))

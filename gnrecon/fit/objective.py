@@ -272,11 +272,10 @@ def step_terms(
     rng: np.random.Generator,
     volume: tuple[Tensor, Tensor],
     most: int,
-    data_weight: float = 1.0,
     *,
     parameters: ObjectiveParameters = ObjectiveParameters(),
 ) -> list[ObjectiveTerm]:
-    """Draw the terms of one step: at most `most` data points, with `data_weight` times their weight, and the volume.
+    """Draw the terms of one step: at most `most` data points, and the volume.
 
     Parameters
     ----------
@@ -285,17 +284,15 @@ def step_terms(
     eikonal_count = min(parameters.eikonal_samples, most)
     near = sample_near_surface(scene.samples.points, 2 * scene.coarse.spacing, eikonal_count, rng)
     around = np.concatenate([near, scene.box.sample(eikonal_count // 3, rng)])
-    eikonal_weight = (parameters.eikonal_reach_spacings * scene.coarse.spacing) ** 2 * data_weight**0.5
+    eikonal_weight = (parameters.eikonal_reach_spacings * scene.coarse.spacing) ** 2
     return [
-        *data_terms(scene, options, rng, most, data_weight),
+        *data_terms(scene, options, rng, most),
         distance_term(scene, *volume),
         ObjectiveTerm("eikonal", eikonal, scene.tensor(around), None, eikonal_weight),
     ]
 
 
-def data_terms(
-    scene: Scene, options: FitOptions, rng: np.random.Generator, most: int, weight: float = 1.0
-) -> list[ObjectiveTerm]:
+def data_terms(scene: Scene, options: FitOptions, rng: np.random.Generator, most: int) -> list[ObjectiveTerm]:
     """Return interface and normals at the data points, or at a random `most` of them."""
     points, normals = scene.points, scene.normals
     if len(points) > most:
@@ -303,8 +300,8 @@ def data_terms(
         points, normals = points[rows], normals[rows]
     relative = normal_weight(scene.coarse.spacing, scene.reach)
     return [
-        ObjectiveTerm("interface", interface, points, None, weight),
-        ObjectiveTerm("normal", normal_residual(options.normals), points, normals, weight * relative),
+        ObjectiveTerm("interface", interface, points),
+        ObjectiveTerm("normal", normal_residual(options.normals), points, normals, relative),
     ]
 
 

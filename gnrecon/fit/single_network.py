@@ -57,23 +57,26 @@ def fit_deep(
     fitted, held = hold_out(scene, rng, parameters=parameters)
     checked = fitted if held is None else held
     validation = checked.points.cpu().numpy(), checked.normals.cpu().numpy()
-    near, far = parameters.near_eikonal_deviation, parameters.far_eikonal_deviation
-    rows = NetworkTermParameters(near_eikonal_deviation=near, far_eikonal_deviation=far)
+    least = field.layout.count // parameters.parameters_per_point
+    rows = NetworkTermParameters(
+        data_rows=max(NetworkTermParameters.data_rows, least),
+        near_eikonal_deviation=parameters.near_eikonal_deviation,
+        far_eikonal_deviation=parameters.far_eikonal_deviation,
+    )
     terms = NetworkTerms.draw(fitted, *validation, rng, normal=normal_residual(options.normals), parameters=rows)
     theta = spectral_start(
         field, fitted, partial(start_terms, fitted, options, rng), rng, InitialisationParameters.hidden_weight_share
     )
     advance(1.0)
     noise = terms.noise(field, theta)
-    first = max(parameters.first_points, len(theta) // parameters.parameters_per_point)
 
     def problem_at(number: int, theta: Tensor) -> FieldProblem:
         nonlocal noise
         noise = noise.followed(terms.noise(field, theta))
-        most = terms.parameters.data_rows
         # In logarithms, as the power of thousands of steps is no number.
-        growing = math.exp(min((number - 1) * math.log(parameters.points_growth), math.log(most)))
-        return terms.with_rows(max(first, int(parameters.first_points * growing))).problem(field, theta, noise, rng)
+        growing = math.exp(min((number - 1) * math.log(parameters.points_growth), math.log(rows.data_rows)))
+        few = terms.with_rows(max(least, int(parameters.first_points * growing)))
+        return few.problem(field, theta, noise, rng)
 
     optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True))
     # The score of points that are fitted shows which parameters are best, but not when they begin to follow noise.
