@@ -121,20 +121,17 @@ def spectral_start(
     scene: Scene,
     terms_of: TermsOf,
     rng: np.random.Generator,
-    hidden_weight_share: float = 1.0,
     *,
     parameters: InitialisationParameters = InitialisationParameters(),
 ) -> Tensor:
     """Return parameters, of shape (p,), of a network of several layers whose last one solves `terms_of` the volume.
-
-    The weights between hidden layers have `hidden_weight_share` of the bound that keeps the variance of sines.
 
     Raises
     ------
     FitError
         When the linear system cannot be solved.
     """
-    theta = random_network(field, rng, scene.points, hidden_weight_share)
+    theta = random_network(field, rng, scene.points, parameters.hidden_weight_share)
     count = parameters.spectral_samples
     x, distance = scene.volume(count, rng)
     terms = terms_of(scene.tensor(x), scene.tensor(distance), count)

@@ -147,9 +147,7 @@ class NetworkLadder:
 
         def first_steps(start: NetworkLadder) -> Solution:
             terms = partial(start_terms, start.terms.scene, start.options, start.rng)
-            theta = spectral_start(
-                field, start.terms.scene, terms, start.rng, InitialisationParameters.hidden_weight_share
-            )
+            theta = spectral_start(field, start.terms.scene, terms, start.rng)
             # The score rises before it falls, as the damping finds its size: no patience ends these steps.
             return start._fitted(field, theta, tried, patience=tried)
 

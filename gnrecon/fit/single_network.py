@@ -25,7 +25,7 @@ from gnrecon.fit.fit_options import FitOptions, normal_residual
 from gnrecon.fit.global_network import NetworkTerms
 from gnrecon.fit.initialisation import Spectrum, spectral_start, wide_start
 from gnrecon.fit.objective import FieldProblem, Scene, linear_data_terms, start_terms, step_terms
-from gnrecon.fit.parameters import InitialisationParameters, NetworkTermParameters, SingleNetworkParameters
+from gnrecon.fit.parameters import NetworkTermParameters, SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import (
     LBFGS,
@@ -64,9 +64,7 @@ def fit_deep(
         far_eikonal_deviation=parameters.far_eikonal_deviation,
     )
     terms = NetworkTerms.draw(fitted, *validation, rng, normal=normal_residual(options.normals), parameters=rows)
-    theta = spectral_start(
-        field, fitted, partial(start_terms, fitted, options, rng), rng, InitialisationParameters.hidden_weight_share
-    )
+    theta = spectral_start(field, fitted, partial(start_terms, fitted, options, rng), rng)
     advance(1.0)
     noise = terms.noise(field, theta)
 

@@ -217,10 +217,7 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
     product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
     if like.device.type != "cpu":
         for rows in chunks:
-            if rows.dtype == product.dtype:
-                product.addmm_(rows.T, rows)
-            else:
-                product += rows.T @ rows
+            product += rows.T @ rows
         return product
     # The last blocks come first: they take longest, and threads that share them end at the same time.
     blocks = slices(size, block_columns)[::-1]
