@@ -84,6 +84,12 @@ def without_such_option(error: Any) -> str:
     """Return the sentence on a usage error of typer's; an unknown option is answered with the likeliest right one."""
     name, known = getattr(error, "option_name", None), getattr(error, "possibilities", None)
     if name is None or not hasattr(error, "possibilities"):
-        return str(error.format_message())
+        return str(error.format_message()) + _rejected_value(error)
     nearest = suggestion(name, known or (), kind="")
     return f"No such option: {name}{nearest}."
+
+
+def _rejected_value(error: Any) -> str:
+    """Return words on the value that was rejected, where the sentence of newer versions of typer leaves it out."""
+    causes = getattr(error.__cause__, "errors", None)
+    return "" if causes is None else f", but is {causes()[0]['input']!r}"

@@ -72,6 +72,8 @@ MISTAKES = [
     ("scan.ply -o mesh.obj --fraction 120%", USAGE, "The fraction of points is 120%, but must lie in (0, 1]."),
     ("scan.ply -o mesh.obj --holdout 100%", USAGE, "must lie between 0 and 1."),
     ("scan.ply -o mesh.obj --resolution fine", USAGE, "Invalid value for '--resolution'"),
+    ("scan.ply -o mesh.obj --resolution 1e3", USAGE, "'1e3'"),
+    ("scan.ply -o mesh.obj --feature-angle 20", USAGE, "angle needs a step that keeps edges; add --remesh, --simplify"),
     ("scan.ply -o mesh.obj --resolution 3", USAGE, "The resolution must be at least 16 cells, not 3."),
     ("scan.ply -o mesh.obj --quality hihg", USAGE, "The quality must be one of draft, normal, high, not 'hihg'."),
     ("scan.ply -o mesh.obj --subsample randm", USAGE, "'randm' is unknown; expected one of random, voxel"),

@@ -45,7 +45,7 @@ class RefineOptions:
     Raises
     ------
     UsageError
-        When a value is out of its range, or lengths are to adapt without one being given.
+        When a value is out of its range, lengths are to adapt without one being given, or an angle has no use.
     """
 
     remesh: float | None = None
@@ -65,6 +65,8 @@ class RefineOptions:
             raise UsageError(f"The feature angle must be from 5 to 90 degrees, not {self.feature_angle}.")
         if self.adaptive and self.remesh is None:
             raise UsageError("Adaptive edge lengths need a longest one; add --remesh LENGTH.")
+        if self.feature_angle != type(self).feature_angle and not self.anything:
+            raise UsageError("A feature angle needs a step that keeps edges; add --remesh, --simplify or --faces.")
 
     @property
     def anything(self) -> bool:
