@@ -159,7 +159,8 @@ def _product(changed: Tensor, others: Tensor, axes: tuple[int, ...]) -> Tensor:
 #     d(x) = sum_b w_b(x) sum_j a_bj sin(F_j . (x - c_b) / l_b + p_j)
 #
 # All cubes share frequencies F and phases p; each has a centre c_b, a length l_b and output weights a_b of its own.
-# If no cube contains x, d = 0. Coordinates are relative to the cube, so that single precision does not lose digits.
+# If no cube contains x, d = 0. Another detail, of longer lengths, may be added.
+# Coordinates are relative to the cube, so that single precision does not lose digits.
 
 
 @dataclass(frozen=True)
@@ -179,6 +180,8 @@ class Detail:
     position, angle : float
         Standard deviations of the data's noise that the amplitudes were solved for: of positions along the normal, in
         unit coordinates, and of normals, in radians.
+    coarser : Detail, optional
+        One of longer lengths that is added.
     """
 
     partition: Partition
@@ -188,14 +191,23 @@ class Detail:
     amplitudes: Tensor
     position: float
     angle: float
+    coarser: Detail | None = None
 
     def __len__(self) -> int:
         return len(self.keys)
 
     @property
+    def levels(self) -> Iterator[Detail]:
+        """The detail itself and those that are added, from short to long lengths."""
+        level: Detail | None = self
+        while level is not None:
+            yield level
+            level = level.coarser
+
+    @property
     def count(self) -> int:
-        """Number of parameters."""
-        return self.amplitudes.numel() + 4 * len(self.features) + len(self.lengths)
+        """Number of parameters of all levels."""
+        return sum(one.amplitudes.numel() + 4 * len(one.features) + len(one.lengths) for one in self.levels)
 
     def as_dict(self, scale: float) -> dict[str, float]:
         """Return the fitted values as plain numbers; lengths are multiplied by `scale`, the radius of the cloud."""
@@ -210,7 +222,8 @@ class Detail:
 
     def to(self, dtype: torch.dtype) -> Detail:
         """Return the same detail with features of another precision."""
-        return replace(self, features=self.features.to(dtype), amplitudes=self.amplitudes.to(dtype))
+        coarser = None if self.coarser is None else self.coarser.to(dtype)
+        return replace(self, features=self.features.to(dtype), amplitudes=self.amplitudes.to(dtype), coarser=coarser)
 
     def value(self, x: Float) -> Float:
         """Return d, of shape (N,), at x, of shape (N, 3)."""
@@ -231,7 +244,7 @@ class Detail:
             values[rows] = self._blend_around(x[rows], offsets)
 
         map_in_threads(fill, slices(len(x), max(1, batch_values // len(offsets))), self.amplitudes.device)
-        return values
+        return values if self.coarser is None else values + self.coarser.value_around(x, offsets)
 
     def hessian(self, x: Float) -> Float:
         """Return the second derivatives of d, of shape (N, 3, 3), at x, of shape (N, 3)."""
@@ -246,6 +259,9 @@ class Detail:
                 total[rows] = part
 
         map_in_threads(fill, slices(len(x), batch_points), self.amplitudes.device)
+        if self.coarser is not None:
+            for total, part in zip(sums, self.coarser._blended(x, order), strict=True):
+                total += part
         return sums
 
     def _blend(self, x: Float, order: int) -> list[Float]:

@@ -14,9 +14,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from gnrecon.field.detail_tensors import detail_of, detail_tensors, plain_name
 from gnrecon.field.networks import Siren
-from gnrecon.field.partition_of_unity import Detail, Partition
-from gnrecon.field.random_features import Features
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame
 from gnrecon.geometry.signed_distance import Box, continued, continued_values
@@ -80,7 +80,8 @@ class NeuralSDF:
     @property
     def finite(self) -> bool:
         """Whether all parameters that were fitted are finite."""
-        parts = [self.theta] if self.detail is None else [self.theta, self.detail.amplitudes]
+        levels = () if self.detail is None else self.detail.levels
+        parts = [self.theta, *(level.amplitudes for level in levels)]
         return all(bool(torch.isfinite(values).all()) for values in parts)
 
     @property
@@ -291,9 +292,10 @@ def _require_sense(
     lengths = ("frame.center", "frame.scale", "box", "detail.lattice", "detail.noise", "detail.lengths")
     kinds |= dict.fromkeys(lengths, (torch.float64,))
     for name, tensor in tensors.items():
-        if name not in kinds:
+        plain = plain_name(name)
+        if plain not in kinds:
             raise InputError(f"{path} holds {name!r}, which is no part of a gnrecon model.")
-        if tensor.dtype not in kinds[name]:
+        if tensor.dtype not in kinds[plain]:
             raise InputError(f"{path} holds {name!r} as {str(tensor.dtype).removeprefix('torch.')}.")
         if name in shapes and tensor.shape != shapes[name]:
             raise InputError(f"{path} holds {name!r} of shape {tuple(tensor.shape)}, not {shapes[name]}.")
@@ -346,55 +348,3 @@ def _require_distances(path: str | Path, sdf: NeuralSDF, *, each: int = 6, most_
         size = np.abs(values).max() / sdf.frame.scale + np.abs(gradients).max()
     if not size <= most_boxes * max(1.0, float(np.linalg.norm(high - low))):
         raise InputError(f"{path} holds a field whose values are no distances: they reach {size:.3g} radii.")
-
-
-# The local fields as tensors of a model file, and back.
-
-
-def detail_tensors(detail: Detail) -> dict[str, Tensor]:
-    """Return a detail as tensors by name; the lattice is its origin, its cell and its overlap."""
-    lattice = [*detail.partition.origin.tolist(), detail.partition.cell, detail.partition.overlap]
-    tensors = {
-        "detail.lattice": torch.tensor(lattice, dtype=torch.float64),
-        "detail.noise": torch.tensor([detail.position, detail.angle], dtype=torch.float64),
-        "detail.keys": torch.as_tensor(detail.keys),
-        "detail.lengths": torch.as_tensor(detail.lengths),
-        "detail.frequencies": detail.features.frequencies,
-        "detail.phases": detail.features.phases,
-        "detail.amplitudes": detail.amplitudes,
-    }
-    return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-
-
-def detail_of(
-    path: str | Path, tensors: Mapping[str, Tensor], *, most_cells: int = 1 << 20, least_noise: float = 1e-9
-) -> Detail | None:
-    """Return the detail among a file's tensors, or None where there is none.
-
-    Raises
-    ------
-    InputError
-        When tensors are missing or do not fit together.
-    """
-    if not any(name.startswith("detail.") for name in tensors):
-        return None
-    lattice, noise, keys, lengths = (
-        tensors[f"detail.{name}"].cpu().numpy() for name in ("lattice", "noise", "keys", "lengths")
-    )
-    frequencies, phases, amplitudes = (tensors[f"detail.{name}"] for name in ("frequencies", "phases", "amplitudes"))
-    cubes, features = len(lengths), len(phases)
-    shapes = (lattice.shape, noise.shape, keys.shape, lengths.shape, tuple(frequencies.shape), tuple(amplitudes.shape))
-    if shapes != ((5,), (2,), (cubes, 3), (cubes,), (features, 3), (cubes, features)):
-        raise InputError(f"{path} holds local fields whose parts do not fit together: {shapes}.")
-    if not ((lengths > 0).all() and (noise > 0).all() and lattice[3] > 0 and 0 < lattice[4] <= 1):
-        raise InputError(f"{path} holds local fields whose lengths or noise are not positive.")
-    if len({frequencies.dtype, phases.dtype, amplitudes.dtype}) > 1 or not cubes or not features:
-        raise InputError(f"{path} holds local fields of different types, or none.")
-    if not (np.abs(keys) < most_cells).all() or len(np.unique(keys, axis=0)) != cubes:
-        raise InputError(f"{path} holds local fields in cubes that repeat or are too far off.")
-    numbers = np.concatenate([np.abs(lattice), 1 / lattice[3:], noise, least_noise / noise, lengths, 1 / lengths])
-    if not (numbers < most_cells).all() or float(frequencies.abs().max()) > most_cells:
-        raise InputError(f"{path} holds local fields whose lengths are out of range.")
-    partition = Partition(lattice[:3], float(lattice[3]), float(lattice[4]))
-    of_all = Features(frequencies, phases)
-    return Detail(partition, keys, lengths, of_all, amplitudes, float(noise[0]), float(noise[1]))

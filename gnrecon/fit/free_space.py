@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.networks import Siren
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit.parameters import FreeSpaceParameters
-from gnrecon.geometry.arrays import Float, Mask
+from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding, winding_number
 
@@ -49,7 +50,7 @@ class Volume:
         points: Float,
         own: Float,
         signed: Float,
-        certain: Mask,
+        sureness: Float,
         distance: Float,
         bound_share: float = FreeSpaceParameters.sign_bound_share,
         *,
@@ -59,20 +60,23 @@ class Volume:
 
         A field that is somewhat steeper or flatter than a distance needs no correction; forcing it to the distance
         would overshoot between samples. Nor does one of the other sign where the sign is uncertain, as in a cavity of
-        which little was scanned: the smooth field closes it no worse.
+        which little was scanned: the smooth field closes it no worse. Above a hole the distance of the data is no
+        distance of the surface, which closes the hole as a film. A share |1 - 2 w| of it is left to the film, with the
+        winding number w: exactly so above the middle of a round hole in a plane.
 
         Parameters
         ----------
         points : array of shape (Q, 3)
         own, signed : arrays of shape (Q,), the field, and the coarse distance
-        certain : mask of shape (Q,), where the sign of that is certain
+        sureness : array of shape (Q,), |1 - 2 w|: beyond one half, the sign of that distance is certain
         distance : array of shape (Q,), of the data
         bound_share : of the coarse distance, that the field must keep where the sign is certain
         """
-        near, far = parameters.least_field_share * signed, parameters.most_field_share * signed
+        certain, film = sureness > 0.5, np.minimum(sureness, 1.0) * signed
+        near, far = parameters.least_field_share * film, parameters.most_field_share * signed
         agreed = certain | (own * signed > 0)
         wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
-        bound = bound_share * signed - own
+        bound = bound_share * film - own
         lower = np.where(certain & (signed > 0), bound, -np.inf)
         upper = np.where(certain & (signed < 0), bound, np.inf)
         return cls(points, wanted, lower, upper, -own, distance)
@@ -108,6 +112,7 @@ class CubeSpace:
     dipoles : of all points
     network, theta : the global field in unit coordinates
     rng : draws the samples
+    coarser : local fields that are added to the global one, if there are some
     parameters : FreeSpaceParameters
     signed_by : returns other signed distances than the coarse ones, for places and these, where a penalty fills holes
     """
@@ -121,6 +126,7 @@ class CubeSpace:
     network: Siren
     theta: Tensor
     rng: np.random.Generator
+    coarser: Detail | None = None
     parameters: FreeSpaceParameters = FreeSpaceParameters()
     signed_by: Callable[[Float, Float], Float] | None = None
 
@@ -179,5 +185,7 @@ class CubeSpace:
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
         value = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
-        certain = is_sign_certain(winding)
-        return Volume.around(x, value, signed, certain, distance, bound_share, parameters=self.parameters)
+        if self.coarser is not None:
+            value += self.coarser.value(x)
+        sureness = np.abs(1.0 - 2.0 * winding)
+        return Volume.around(x, value, signed, sureness, distance, bound_share, parameters=self.parameters)

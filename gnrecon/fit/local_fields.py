@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -21,12 +22,12 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import CubeSpace
 from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem, precise_enough
-from gnrecon.fit.model_selection import FieldResiduals
-from gnrecon.fit.parameters import LocalFieldParameters
+from gnrecon.fit.model_selection import FieldResiduals, patch_likelihood
+from gnrecon.fit.parameters import CoarserFieldParameters, FreeSpaceParameters, LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.octree import DipoleTree
-from gnrecon.geometry.signed_distance import scene_dipoles
+from gnrecon.geometry.signed_distance import is_sign_certain, kd_tree_order, sample_near_surface, winding_number
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
@@ -48,7 +49,7 @@ def fit_detail(
     *,
     parameters: LocalFieldParameters = LocalFieldParameters(),
 ) -> Detail:
-    """Return the local fields that are added to a global field.
+    """Return the local fields that are added to a global field, with coarser ones where a clean scan has gaps.
 
     Parameters
     ----------
@@ -68,9 +69,76 @@ def fit_detail(
         hyperparameters.angle,
         features,
     )
+    advance = subrange(advance, parameters.selection_time_share, 1.0)
     penalties = None if shape is None else shape(hyperparameters.length)
-    cubes = _Cubes.of(sdf, residuals, hyperparameters, features, rng, device, penalties, parameters)
-    return cubes.detail(subrange(advance, parameters.selection_time_share, 1.0))
+    if penalties is None and _needs_coarser(residuals, hyperparameters, rng.spawn(1)[0]):
+        coarser = _coarser(sdf, residuals, hyperparameters, rng.spawn(1)[0], device, parameters)
+        sdf, residuals = replace(sdf, detail=coarser), residuals.after(coarser)
+    return _Cubes.of(sdf, residuals, hyperparameters, features, rng, device, penalties, parameters).detail(advance)
+
+
+def _needs_coarser(
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
+    rng: np.random.Generator,
+    *,
+    group: int = 64,
+    parameters: CoarserFieldParameters = CoarserFieldParameters(),
+) -> bool:
+    """Return whether coarser corrections are to bridge gaps: places next to the data where no sign is certain.
+
+    On a noisy scan they would add an error of their own, and noise hides the steps that they are to avoid.
+
+    Parameters
+    ----------
+    residuals : at the points
+    hyperparameters : of the scan
+    rng : draws the places
+    group : places whose winding number is summed together
+    """
+    length = hyperparameters.length
+    if parameters.length_ratio * length > parameters.most_length_radii:
+        return False
+    if residuals.rms < parameters.least_rms_noises * hyperparameters.position:
+        return False
+    density, dipoles = residuals.density, residuals.dipoles
+    spread = parameters.gap_spread_lengths * length
+    x = sample_near_surface(residuals.points, spread, parameters.gap_samples, rng)
+    distance, nearest = density.tree.query(x)
+    clear = distance > FreeSpaceParameters.clearance_disk_radii * density.disks[nearest]
+    x, distance = x[clear], distance[clear]
+    order, found = kd_tree_order(x), 0
+    for rows in (order[some] for some in slices(len(x), group)):
+        lower, upper = x[rows].min(axis=0), x[rows].max(axis=0)
+        center = (lower + upper) / 2
+        places, moments, radii = dipoles.dipoles_for(center, float((upper - lower).max()) / 2)
+        winding = winding_number(x[rows] - center, places - center, moments, radii, dtype=torch.float32)
+        found += int((~is_sign_certain(dipoles.sides.centred(winding, distance[rows]))).sum())
+    return found >= parameters.least_gap_samples
+
+
+def _coarser(
+    sdf: NeuralSDF,
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
+    rng: np.random.Generator,
+    device: str,
+    limits: LocalFieldParameters,
+    *,
+    parameters: CoarserFieldParameters = CoarserFieldParameters(),
+) -> Detail:
+    """Return local fields of a longer length, fitted to a part of the points; parameters as those of `fit_detail`.
+
+    What they do not resolve is noise to them. The likeliest noise is chosen, but no less than the scan's.
+    """
+    some = residuals.take(np.flatnonzero(rng.random(len(residuals)) < parameters.point_share))
+    length = parameters.length_ratio * hyperparameters.length
+    position, angle = patch_likelihood(some, some.density.radius, rng, device).likeliest(length)
+    position, angle = max(position, hyperparameters.position), max(angle, hyperparameters.angle)
+    chosen = Hyperparameters(length, position, angle, robust=hyperparameters.robust)
+    found = _Cubes.of(sdf, some, chosen, parameters.features, rng, device, None, limits).detail(ignore_progress)
+    _log.info("The scan has gaps: coarser local fields of length scale %.3g radii bridge them.", length)
+    return found
 
 
 def cube_length(
@@ -165,7 +233,6 @@ class _Cubes:
 
     sdf: NeuralSDF
     residuals: FieldResiduals
-    dipoles: DipoleTree
     hyperparameters: Hyperparameters
     features: Features
     partition: Partition
@@ -192,9 +259,7 @@ class _Cubes:
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
         features, seed = Features.draw(count, rng, like), int(rng.integers(2**32))
-        disks = residuals.density.disks
-        dipoles = DipoleTree.of(residuals.points, *scene_dipoles(residuals.points, residuals.normals, disks))
-        return cls(sdf, residuals, dipoles, hyperparameters, features, partition, seed, device, penalties, parameters)
+        return cls(sdf, residuals, hyperparameters, features, partition, seed, device, penalties, parameters)
 
     def detail(self, advance: ProgressCallback) -> Detail:
         """Fit all cubes that hold data."""
@@ -223,7 +288,13 @@ class _Cubes:
         lengths, amplitudes = zip(*filter(None, cubes), strict=True)
         _log.info("Fitted %d local fields; %d cubes had too few points.", len(kept), len(keys) - len(kept))
         noise = hyperparameters.position, hyperparameters.angle
-        return Detail(self.partition, keys[kept], np.array(lengths), self.features, torch.stack(amplitudes), *noise)
+        fitted = keys[kept], np.array(lengths), self.features, torch.stack(amplitudes)
+        return Detail(self.partition, *fitted, *noise, coarser=self.sdf.detail)
+
+    @cached_property
+    def _coarser(self) -> Detail | None:
+        """Coarser local fields, in the precision that free space asks for."""
+        return None if self.sdf.detail is None else self.sdf.detail.to(torch.float32)
 
     def _space(self, key: Int, center: Float) -> CubeSpace:
         """Return the space of a cube."""
@@ -234,9 +305,10 @@ class _Cubes:
             sdf.box,
             density.tree,
             density.disks,
-            self.dipoles,
+            self.residuals.dipoles,
             sdf.field,
             sdf.theta,
             cube_generator(self.seed, key),
+            self._coarser,
             signed_by=None if self.penalties is None else self.penalties.volume_distances,
         )

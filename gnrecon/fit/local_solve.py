@@ -89,10 +89,16 @@ class Patch:
         """Root mean square of what the correction should be at the points, or a tiny value."""
         return max(float(self.value.square().mean().sqrt()), 1e-6)
 
-    @property
-    def deviation(self) -> Tensor:
-        """Standard deviation of what the correction should be at the samples of the volume, of shape (Q,)."""
-        return LocalSolveParameters.volume_deviation_share * self.distance
+    def deviation(self, length: float, size: float) -> Tensor:
+        """Return the standard deviation of what the correction should be at the samples of the volume, of shape (Q,).
+
+        It is a share of the distance, but where no sign is certain, as across a hole, at most what a correction of that
+        length and size has left there: finite features do not fade by themselves, and would crumple the film.
+        """
+        wide = LocalSolveParameters.volume_deviation_share * self.distance
+        left = size * (torch.exp(-0.5 * (self.distance / length).square()) + LocalSolveParameters.faded_share)
+        doubtful = self.lower.isinf() & self.upper.isinf() & (self.wanted == 0.0)
+        return torch.where(doubtful, torch.minimum(wide, left), wide)
 
 
 class PatchSystem:
@@ -132,9 +138,14 @@ class PatchSystem:
         return product.mul_(slopes @ slopes.T), (along * slopes).sum(dim=1)
 
     @cached_property
+    def _deviation(self) -> Tensor:
+        """Standard deviation of the samples of the volume."""
+        return self._patch.deviation(self._length, self._size)
+
+    @cached_property
     def _free(self) -> Features:
         """The features of the volume: its deviations are wide, so that single precision is mostly enough."""
-        return self._features.precise_enough(float((self._size / self._patch.deviation).square().sum()))
+        return self._features.precise_enough(float((self._size / self._deviation).square().sum()))
 
     @cached_property
     def _sines(self) -> Tensor:
@@ -144,7 +155,7 @@ class PatchSystem:
     @cached_property
     def _volume(self) -> tuple[Tensor, Tensor]:
         """J^T J and J^T y of the samples of the volume."""
-        wanted, deviation = self._patch.wanted, self._patch.deviation
+        wanted, deviation = self._patch.wanted, self._deviation
         return self._sums([(self._sines / deviation[:, None].to(self._sines), wanted / deviation)])
 
     def _phases(self) -> Iterator[tuple[slice, Tensor]]:
@@ -316,7 +327,7 @@ class LocalRowSystem:
     def __init__(self, patch: Patch, features: Features, length: float, size: float) -> None:
         variance, features = size**2 * 2.0 / len(features), features.to(patch.value.dtype)
         sines, slopes = _data_rows(patch, features, length, slice(None))
-        free, wanted = _volume_rows(patch, features, length)
+        free, wanted = _volume_rows(patch, features, length, size)
         rows = torch.cat([sines, *slopes, free])
         self._spread = variance * rows.T
         self._kernel = rows @ self._spread
@@ -383,7 +394,7 @@ def _data_rows(patch: Patch, features: Features, length: float, rows: slice) -> 
     return sines, [cosines * (features.frequencies[:, axis] / length) for axis in range(3)]
 
 
-def _volume_rows(patch: Patch, features: Features, length: float) -> tuple[Tensor, Tensor]:
+def _volume_rows(patch: Patch, features: Features, length: float, size: float) -> tuple[Tensor, Tensor]:
     """Return the features at the samples of the volume, of shape (Q, m), and their targets, over their deviation."""
-    deviation = patch.deviation
+    deviation = patch.deviation(length, size)
     return features.phase(patch.volume, patch.center, length).sin() / deviation[:, None], patch.wanted / deviation

@@ -21,6 +21,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import Volume
@@ -32,8 +33,9 @@ from gnrecon.fit.parameters import (
     SurfaceLikelihoodParameters,
 )
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import Density
+from gnrecon.geometry.signed_distance import Density, scene_dipoles
 from gnrecon.runtime.parallel import map_in_threads
 
 
@@ -67,9 +69,24 @@ class FieldResiduals:
         return Density(self.points)
 
     @cached_property
+    def dipoles(self) -> DipoleTree:
+        """Of the points, for their winding number."""
+        return DipoleTree.of(self.points, *scene_dipoles(self.points, self.normals, self.density.disks))
+
+    @cached_property
     def rms(self) -> float:
         """Root mean square of the values."""
         return float(np.sqrt(np.mean(self.value**2)))
+
+    def take(self, rows: Int) -> FieldResiduals:
+        """Return those of some points."""
+        at = (self.points[rows], self.normals[rows], self.value[rows], self.gradient[rows])
+        return FieldResiduals(*at, self.estimated, self.noise)
+
+    def after(self, detail: Detail) -> FieldResiduals:
+        """Return the residuals of the field with a detail that is added."""
+        value, gradient = detail.value_and_gradient(self.points)
+        return replace(self, value=self.value + value, gradient=self.gradient + gradient)
 
     def within(self, center: Float, reach: float) -> Int:
         """Return the rows of the points in the cube of half an edge `reach` about a centre, in order."""
@@ -137,7 +154,7 @@ def _by_positions(
     return Hyperparameters(length, noise, parameters.angle_radians, rms_factor=size / max(residuals.rms, 1e-6))
 
 
-def _marginal_likelihood(
+def patch_likelihood(
     residuals: FieldResiduals,
     radius: float,
     rng: np.random.Generator,
@@ -246,7 +263,7 @@ class CrossValidation:
         count = min(cube_features, most)
         features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = residuals.points[chosen]
-        likelihood = None if residuals.estimated else _marginal_likelihood(residuals, radius, rng.spawn(1)[0], device)
+        likelihood = None if residuals.estimated else patch_likelihood(residuals, radius, rng.spawn(1)[0], device)
         found = list(out[near])
         return cls(residuals, radius, features, centers, found, held_out, device, None, likelihood, parameters)
 

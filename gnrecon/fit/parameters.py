@@ -39,6 +39,20 @@ class LocalFieldParameters:
 
 
 @dataclass(frozen=True)
+class CoarserFieldParameters:
+    """Local fields of longer lengths, on which those of a clean scan with gaps are fitted (`fit.local_fields`)."""
+
+    length_ratio: float = 3.0  # of their length scale and the scan's
+    most_length_radii: float = 0.25  # of theirs: longer features are those of the global field
+    least_rms_noises: float = 10.0  # that the global field is wrong by, over the noise: more noise hides steps
+    point_share: float = 1 / 3  # of the points, that they are fitted to
+    features: int = 300  # of each
+    gap_samples: int = 10_000  # of space, two lengths about the points
+    gap_spread_lengths: float = 2.0
+    least_gap_samples: int = 2  # of an uncertain sign, clear of the points, which a closed scan has none of
+
+
+@dataclass(frozen=True)
 class FreeSpaceParameters:
     """Samples of free space in a cube (`fit.free_space`)."""
 
@@ -169,6 +183,7 @@ class LocalSolveParameters:
 
     correction_rms_factor: float = 3.0  # prior standard deviation of the correction, over the residuals' RMS
     volume_deviation_share: float = 0.5  # standard deviation in free space, as a share of the distance from the data
+    faded_share: float = 0.1  # of the prior standard deviation, that a correction has left far from the data
     bound_passes: int = 5  # most active-set passes, while samples have the wrong sign, or too little far away
     bound_deviation_share: float = 0.05  # first standard deviation of one that is alone, as a share of the distance
     bound_tightening: float = 0.65  # of that deviation from pass to pass, for samples that stay beyond

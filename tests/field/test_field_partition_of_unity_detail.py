@@ -121,3 +121,19 @@ def test_single_precision_is_near_and_counts_are_right(rng: np.random.Generator)
     np.testing.assert_allclose(of.to(torch.float32).value(x), of.value(x), atol=2e-6 * float(of.amplitudes.abs().sum()))
     assert of.count == 5 * 7 + 7 * 3 + 7 + 5
     assert of.as_dict(2.0)["position_noise"] == 2e-3
+
+
+def test_a_coarser_detail_is_added(rng: np.random.Generator) -> None:
+    of, other = detail(rng), detail(rng, 3, 4)
+    both, x, offsets = replace(of, coarser=other), points(of, rng), rng.uniform(-0.3, 0.3, (11, 3))
+    assert list(both.levels) == [both, other]
+    assert both.count == of.count + other.count
+    np.testing.assert_allclose(both.value(x), of.value(x) + other.value(x), atol=1e-14)
+    for whole, one, more in zip(*(each.value_and_gradient(x) for each in (both, of, other)), strict=True):
+        np.testing.assert_allclose(whole, one + more, atol=1e-12)
+    np.testing.assert_allclose(both.hessian(x), of.hessian(x) + other.hessian(x), atol=1e-10)
+    around = of.value_around(x, offsets) + other.value_around(x, offsets)
+    np.testing.assert_allclose(both.value_around(x, offsets), around, atol=1e-12)
+    single = both.to(torch.float32)
+    assert single.coarser is not None
+    assert single.coarser.amplitudes.dtype == torch.float32

@@ -273,3 +273,18 @@ def test_features_of_single_precision_give_nearly_the_same(patch: Patch, feature
     )
     assert single.dtype == torch.float64
     assert 0 < float((single - exact).norm()) < 1e-4 * float(exact.norm())
+
+
+def test_corrections_fade_where_no_sign_is_certain(patch: Patch) -> None:
+    unbounded = torch.full_like(patch.distance, torch.inf)
+    distance = torch.linspace(0.1, 9 * LENGTH, 8).to(patch.distance)
+    wide = LocalSolveParameters.volume_deviation_share * distance
+    film = replace(patch, lower=-unbounded, upper=unbounded, wanted=0 * patch.wanted, distance=distance)
+    size = 0.01
+    deviation = film.deviation(LENGTH, size)
+    assert (deviation.diff() < 0).all()
+    assert float(deviation[-1]) == pytest.approx(LocalSolveParameters.faded_share * size)
+    # Nearer than that share of the distance they never are held, nor where a sign or a value is asked for.
+    assert torch.equal(film.deviation(LENGTH, 1e3), wide)
+    for other in (replace(film, lower=0 * distance), replace(film, upper=0 * distance), replace(film, wanted=distance)):
+        assert torch.equal(other.deviation(LENGTH, size), wide)

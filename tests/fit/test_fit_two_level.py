@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
+from gnrecon.export import curvatures
+from gnrecon.field.random_features import Features
+from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit, local_fields
 from gnrecon.fit import two_level as adaptive
 from gnrecon.fit.model_selection import FieldResiduals, _smoothest, select_hyperparameters
 from gnrecon.fit.parameters import ModelSelectionParameters, SurfaceLikelihoodParameters
@@ -107,6 +110,46 @@ def test_corners_of_a_cube_far_from_each_other_are_fitted(farther: float) -> Non
     assert len(sdf.detail) > 0
 
 
+def with_gap(samples: Samples, *, radius: float = 0.25) -> tuple[Samples, Samples]:
+    """A scan of the rippled sphere without the points about one place, and those points."""
+    off = np.linalg.norm(samples.points - [0.0, 0.0, 0.8], axis=1) < radius
+    parts = [(samples.points[rows], samples.normals[rows]) for rows in (~off, off)]
+    return Samples(*parts[0], FRAME), Samples(*parts[1], FRAME)
+
+
+def bending(sdf: NeuralSDF, about: Samples) -> float:
+    """Mean curvature over that of the sphere, root mean square at the field's own surface about some points."""
+    x = FRAME.to_world(about.points)
+    for _ in range(10):
+        value, gradient = sdf.sdf_and_gradient(x)
+        x = x - (value / (gradient**2).sum(axis=1))[:, None] * gradient
+    mean = curvatures(sdf.gradient(x), sdf.hessian(x))[0]
+    return float(np.sqrt(np.mean((mean * FRAME.scale * 0.8) ** 2)))
+
+
+def test_a_gap_of_a_clean_scan_is_bridged_by_coarser_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+    scan, unseen = with_gap(rippled(4000, np.random.default_rng(5)))
+    bridged = fit(scan, FitOptions(quality="draft"))[0]
+    assert bridged.detail is not None
+    assert bridged.detail.coarser is not None
+    assert np.median(bridged.detail.coarser.lengths) > 2 * np.median(bridged.detail.lengths)
+    monkeypatch.setattr(local_fields, "_needs_coarser", lambda *_: False)
+    plain = fit(scan, FitOptions(quality="draft"))[0]
+    x = FRAME.to_world(unseen.points)
+    assert np.abs(bridged.sdf(x)).mean() < 0.8 * np.abs(plain.sdf(x)).mean()
+    assert bending(bridged, unseen) < bending(plain, unseen)
+
+
+@pytest.mark.parametrize(("noise", "gap"), [(0.0, False), (0.004, True)], ids=["closed", "noisy"])
+def test_other_scans_get_no_coarser_fields(noise: float, gap: bool, rng: np.random.Generator) -> None:
+    scan = rippled(2500, rng)
+    scan = with_gap(scan)[0] if gap else scan
+    moved = scan.points + noise * rng.standard_normal((len(scan), 1)) * scan.normals
+    sdf, _ = fit(Samples(moved, scan.normals, FRAME), FitOptions(quality="draft"))
+    assert sdf.detail is not None
+    assert sdf.detail.coarser is None
+
+
 def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:
     samples = clean[0]
     few = Samples(samples.points[::4], samples.normals[::4], FRAME)
@@ -127,6 +170,22 @@ def test_a_field_with_detail_is_saved_and_read(clean: tuple[Samples, NeuralSDF],
     assert read.parameters == sdf.parameters > 10_000
     assert read.detail is not None
     assert read.detail.as_dict(1.0) == sdf.detail.as_dict(1.0)  # type: ignore[union-attr]
+
+
+def test_a_field_with_coarser_detail_is_saved_and_read(clean: tuple[Samples, NeuralSDF], tmp_path: Path) -> None:
+    samples, sdf = clean
+    detail = sdf.detail
+    assert detail is not None
+    features = Features(2 * detail.features.frequencies, 1 + detail.features.phases)
+    changed = {"keys": detail.keys + 1, "lengths": 3 * detail.lengths, "amplitudes": 2 * detail.amplitudes}
+    coarser = replace(detail, features=features, **changed)
+    two, path = replace(sdf, detail=replace(detail, coarser=coarser)), tmp_path / "two.gnr"
+    x = FRAME.to_world(samples.points + 0.01)
+    two.save(path)
+    again = NeuralSDF.load(path)
+    np.testing.assert_array_equal(again.sdf(x), two.sdf(x))
+    assert np.abs(two.sdf(x) - sdf.sdf(x)).max() > 1e-6
+    assert again.parameters == two.parameters == 2 * sdf.parameters - len(sdf.theta)
 
 
 def test_a_detail_that_does_not_fit_together_is_refused(clean: tuple[Samples, NeuralSDF], tmp_path: Path) -> None:
