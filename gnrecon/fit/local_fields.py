@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -26,6 +25,7 @@ from gnrecon.fit.model_selection import FieldResiduals, patch_likelihood
 from gnrecon.fit.parameters import CoarserFieldParameters, FreeSpaceParameters, LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.signed_distance import is_sign_certain, kd_tree_order, sample_near_surface, winding_number
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
@@ -97,7 +97,7 @@ def _needs_coarser(
     group : places whose winding number is summed together
     """
     length = hyperparameters.length
-    if parameters.length_ratio * length > parameters.most_length_radii:
+    if len(residuals) < parameters.least_points or parameters.length_ratio * length > parameters.most_length_radii:
         return False
     if residuals.rms < parameters.least_rms_noises * hyperparameters.position:
         return False
@@ -229,10 +229,12 @@ def _likeliest_length(
 
 @dataclass(frozen=True)
 class _Cubes:
-    """The cubes of a detail with the data that they are fitted to."""
+    """The cubes of a detail with the data that they are fitted to, on a coarser detail if there is one."""
 
     sdf: NeuralSDF
     residuals: FieldResiduals
+    dipoles: DipoleTree
+    coarser: Detail | None
     hyperparameters: Hyperparameters
     features: Features
     partition: Partition
@@ -259,7 +261,10 @@ class _Cubes:
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
         features, seed = Features.draw(count, rng, like), int(rng.integers(2**32))
-        return cls(sdf, residuals, hyperparameters, features, partition, seed, device, penalties, parameters)
+        # Free space asks for no more than single precision.
+        coarser = None if sdf.detail is None else sdf.detail.to(torch.float32)
+        data = residuals, residuals.dipoles, coarser
+        return cls(sdf, *data, hyperparameters, features, partition, seed, device, penalties, parameters)
 
     def detail(self, advance: ProgressCallback) -> Detail:
         """Fit all cubes that hold data."""
@@ -291,11 +296,6 @@ class _Cubes:
         fitted = keys[kept], np.array(lengths), self.features, torch.stack(amplitudes)
         return Detail(self.partition, *fitted, *noise, coarser=self.sdf.detail)
 
-    @cached_property
-    def _coarser(self) -> Detail | None:
-        """Coarser local fields, in the precision that free space asks for."""
-        return None if self.sdf.detail is None else self.sdf.detail.to(torch.float32)
-
     def _space(self, key: Int, center: Float) -> CubeSpace:
         """Return the space of a cube."""
         sdf, density = self.sdf, self.residuals.density
@@ -305,10 +305,10 @@ class _Cubes:
             sdf.box,
             density.tree,
             density.disks,
-            self.residuals.dipoles,
+            self.dipoles,
             sdf.field,
             sdf.theta,
             cube_generator(self.seed, key),
-            self._coarser,
+            self.coarser,
             signed_by=None if self.penalties is None else self.penalties.volume_distances,
         )

@@ -42,6 +42,7 @@ class LocalFieldParameters:
 class CoarserFieldParameters:
     """Local fields of longer lengths, on which those of a clean scan with gaps are fitted (`fit.local_fields`)."""
 
+    least_points: int = 500  # of the scan: between fewer, gaps are nothing special
     length_ratio: float = 3.0  # of their length scale and the scan's
     most_length_radii: float = 0.25  # of theirs: longer features are those of the global field
     least_rms_noises: float = 10.0  # that the global field is wrong by, over the noise: more noise hides steps
