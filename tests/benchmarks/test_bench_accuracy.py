@@ -152,7 +152,7 @@ def test_parts_with_bores_are_scanned_from_outside(name: str, genus: int) -> Non
 def test_groups_and_names_choose_cases_once() -> None:
     assert list(chosen_cases(["noisy", "plate", "noisy"], GROUPS)) == ["plate", *GROUPS["noisy"]]
     assert list(chosen_cases(["clean", "noisy", "sparse"], GROUPS)) == list(GROUPS["analytic"])
-    sizes = {"srb": 6, "vipss": 2, "organic": 18, "open": 6, "bores": 10, "damaged": 6}
+    sizes = {"srb": 6, "vipss": 2, "organic": 18, "gaps": 6, "open": 6, "bores": 10, "damaged": 6}
     assert {name: len(GROUPS[name]) for name in sizes} == sizes
     assert set(chosen_cases(GROUPS, GROUPS)) == set(CASES)
     assert set(hard_cases()).isdisjoint(GROUPS["clean"])

@@ -49,6 +49,15 @@ def test_points_are_drawn_as_trimesh_draws_them() -> None:
     assert np.allclose(normals, same.face_normals[faces], rtol=0, atol=1e-9)
 
 
+def test_scans_with_gaps_have_no_points_in_their_balls() -> None:
+    surface = ball()
+    whole, cut = Sampling(3000), Sampling(3000, gaps=4)
+    centers, radii = cut.balls(surface, 3)
+    inside = np.linalg.norm(whole.scan(surface, 3).points[:, None] - centers, axis=2) < radii
+    assert inside.any(axis=0).all()
+    assert len(cut.scan(surface, 3)) == 3000 - inside.any(axis=1).sum()
+
+
 def test_noise_and_tilt_of_a_sampling_are_as_large_as_they_say() -> None:
     surface = ball()
     exact = Sampling(4000).scan(surface, 1)

@@ -67,13 +67,26 @@ def stored_name(case: Case) -> StoredName | None:
     return case.stored if isinstance(case, Within) else None
 
 
-def _organic() -> dict[str, Case]:
+def _organic_shapes() -> dict[str, tuple[ShapeFile, int | None]]:
+    """Return the files of organic shapes with the genus of each."""
     # The horse's faces look inward, and so do its normals, as they did when the stored figures were measured.
-    shapes = {
+    return {
         "cow": (ShapeFile("cow.obj", up="y", view=(35.0, 15.0)), None),
         "homer": (ShapeFile("homer.obj", up="y", view=(35.0, 15.0)), 0),
         "horse": (ShapeFile("horse.ply", up="z", view=(120.0, 15.0)), 0),
     }
+
+
+def _gaps() -> dict[str, Case]:
+    samplings = {"5000 points, gaps": Sampling(5000, gaps=8), "20000 points, gaps": Sampling(20_000, gaps=8)}
+    return {
+        f"{name}, {title}": Within("organic", SurfaceScan(file, sampling, genus))
+        for name, (file, genus) in _organic_shapes().items()
+        for title, sampling in samplings.items()
+    }
+
+
+def _organic() -> dict[str, Case]:
     samplings = {
         "1000 points": (Sampling(1000), "organic/{}_1000_0.0"),
         "5000 points, noise 0.5%, tilt 15": (Sampling(5000, noise=0.005, tilt=15.0), "organic/{}_5000_0.005"),
@@ -87,7 +100,7 @@ def _organic() -> dict[str, Case]:
     }
     return {
         f"{name}, {title}": Within("organic", SurfaceScan(file, sampling, genus), StoredName(stored.format(name)))
-        for name, (file, genus) in shapes.items()
+        for name, (file, genus) in _organic_shapes().items()
         for title, (sampling, stored) in samplings.items()
     }
 
@@ -181,6 +194,7 @@ def _groups() -> dict[str, dict[str, Case]]:
         "srb": {name: Within("srb", case, stored.get(name)) for name, case in srb.items()},
         "vipss": {name: Within("vipss500", case, stored.get(name)) for name, case in vipss.items()},
         "organic": _organic(),
+        "gaps": _gaps(),
         "open": _open(),
         "bores": _bores(),
         "damaged": _damaged(),

@@ -32,22 +32,33 @@ class Sampling:
     tilt : angle in degrees; to each unit normal a Gaussian vector is added, whose part across the normal has a root
         mean square length of the angle's tangent
     normals : whether the scan has any
+    gaps : number of balls about random points of the surface whose points are left out
+    gap_radii : of the smallest and of the largest ball; the others lie evenly between
     """
 
     points: int
     noise: float = 0.0
     tilt: float = 0.0
     normals: bool = True
+    gaps: int = 0
+    gap_radii: tuple[float, float] = (0.05, 0.11)
 
     def scan(self, surface: Mesh, seed: int) -> PointCloud:
         """Return the scan of a seed. Its normals lead to the side that the faces of the surface look to."""
         points, normals = draw_surface(surface, self.points, seed)
+        for center, radius in zip(*self.balls(surface, seed), strict=True):
+            outside = np.linalg.norm(points - center, axis=1) > radius
+            points, normals = points[outside], normals[outside]
         rng = np.random.default_rng(seed)
         # Two directions lie across a normal, so that each has half of the mean square.
         deviation = np.tan(np.radians(self.tilt)) / np.sqrt(2)
         normals = unit(normals + deviation * rng.standard_normal(normals.shape))
         points = points + self.noise * rng.standard_normal(points.shape)
         return PointCloud(points, normals if self.normals else None)
+
+    def balls(self, surface: Mesh, seed: int) -> tuple[Float, Float]:
+        """Return the centres, of shape (gaps, 3), and the radii of the balls that the scan of a seed leaves out."""
+        return draw_surface(surface, self.gaps, seed + 1)[0], np.linspace(*self.gap_radii, self.gaps)
 
 
 def draw_surface(mesh: Mesh, count: int, seed: int) -> tuple[Float, Float]:
