@@ -205,6 +205,11 @@ class Detail:
             level = level.coarser
 
     @property
+    def cubes(self) -> int:
+        """Number of cubes of all levels."""
+        return sum(map(len, self.levels))
+
+    @property
     def count(self) -> int:
         """Number of parameters of all levels."""
         return sum(one.amplitudes.numel() + 4 * len(one.features) + len(one.lengths) for one in self.levels)
@@ -212,7 +217,7 @@ class Detail:
     def as_dict(self, scale: float) -> dict[str, float]:
         """Return the fitted values as plain numbers; lengths are multiplied by `scale`, the radius of the cloud."""
         return {
-            "cubes": len(self),
+            "cubes": self.cubes,
             "features": len(self.features),
             "cell": scale * self.partition.cell,
             "length": scale * float(np.median(self.lengths)),

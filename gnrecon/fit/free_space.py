@@ -50,7 +50,7 @@ class Volume:
         points: Float,
         own: Float,
         signed: Float,
-        sureness: Float,
+        winding: Float,
         distance: Float,
         bound_share: float = FreeSpaceParameters.sign_bound_share,
         *,
@@ -61,18 +61,18 @@ class Volume:
         A field that is somewhat steeper or flatter than a distance needs no correction; forcing it to the distance
         would overshoot between samples. Nor does one of the other sign where the sign is uncertain, as in a cavity of
         which little was scanned: the smooth field closes it no worse. Above a hole the distance of the data is no
-        distance of the surface, which closes the hole as a film. A share |1 - 2 w| of it is left to the film, with the
-        winding number w: exactly so above the middle of a round hole in a plane.
+        distance of the surface, which closes the hole as a film. A share |1 - 2 w| of it is left to the film:
+        exactly so above the middle of a round hole in a plane.
 
         Parameters
         ----------
         points : array of shape (Q, 3)
         own, signed : arrays of shape (Q,), the field, and the coarse distance
-        sureness : array of shape (Q,), |1 - 2 w|: beyond one half, the sign of that distance is certain
+        winding : array of shape (Q,), the winding number w
         distance : array of shape (Q,), of the data
         bound_share : of the coarse distance, that the field must keep where the sign is certain
         """
-        certain, film = sureness > 0.5, np.minimum(sureness, 1.0) * signed
+        certain, film = is_sign_certain(winding), np.minimum(np.abs(1.0 - 2.0 * winding), 1.0) * signed
         near, far = parameters.least_field_share * film, parameters.most_field_share * signed
         agreed = certain | (own * signed > 0)
         wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)
@@ -187,5 +187,4 @@ class CubeSpace:
         value = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
         if self.coarser is not None:
             value += self.coarser.value(x)
-        sureness = np.abs(1.0 - 2.0 * winding)
-        return Volume.around(x, value, signed, sureness, distance, bound_share, parameters=self.parameters)
+        return Volume.around(x, value, signed, winding, distance, bound_share, parameters=self.parameters)

@@ -48,8 +48,8 @@ class CoarserFieldParameters:
     least_rms_noises: float = 10.0  # that the global field is wrong by, over the noise: more noise hides steps
     point_share: float = 1 / 3  # of the points, that they are fitted to
     features: int = 300  # of each
-    gap_samples: int = 10_000  # of space, two lengths about the points
-    gap_spread_lengths: float = 2.0
+    gap_samples: int = 10_000  # of space about the points
+    gap_spread_lengths: float = 2.0  # standard deviation of their distance along each axis
     least_gap_samples: int = 2  # of an uncertain sign, clear of the points, which a closed scan has none of
 
 

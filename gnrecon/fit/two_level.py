@@ -294,7 +294,7 @@ def _summary(detail: Detail, data: _Data, options: FitOptions) -> FitSummary:
     snapped = None if data.sharp is None else data.sharp.snapped
     averaging = None if data.sharp is None else data.sharp.averaging
     return FitSummary(
-        cubes=sum(len(level) for level in detail.levels),
+        cubes=detail.cubes,
         length=chosen["length"],
         position_noise=chosen["position_noise"],
         angle_noise=chosen["angle_noise"],

@@ -66,7 +66,7 @@ def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:
     own = np.array([-0.1, 0.01, 0.2, 0.25, 0.9, 0.2, -0.02, -0.2, -0.9])
     signed = np.repeat([0.2, -0.2], [5, 4])
     certain = np.arange(9) != 1
-    volume = Volume.around(np.zeros((9, 3)), own, signed, np.where(certain, 1.0, 0.4), np.abs(signed))
+    volume = Volume.around(np.zeros((9, 3)), own, signed, np.where(certain, 0.0, 0.3), np.abs(signed))
     near, far = 0.2 * FreeSpaceParameters.least_field_share, 0.2 * FreeSpaceParameters.most_field_share
     asked = [near, 0.4 * near, 0.2, 0.25, far, -near, -near, -0.2, -far]
     np.testing.assert_allclose(own + volume.wanted, asked, atol=1e-15)
@@ -79,7 +79,7 @@ def test_free_space_asks_for_about_the_distance_and_for_its_sign() -> None:
 
 def test_free_space_of_a_doubtful_sign_is_left_to_the_field() -> None:
     own, signed = np.array([-0.1, -0.9, 0.1, 0.01, 0.9]), np.array([0.2, 0.2, -0.2, 0.2, 0.2])
-    volume = Volume.around(np.zeros((5, 3)), own, signed, np.full(5, 0.4), np.abs(signed))
+    volume = Volume.around(np.zeros((5, 3)), own, signed, np.full(5, 0.3), np.abs(signed))
     near, far = 0.4 * 0.2 * FreeSpaceParameters.least_field_share, 0.2 * FreeSpaceParameters.most_field_share
     np.testing.assert_allclose(own + volume.wanted, [-0.1, -0.9, 0.1, near, far], atol=1e-15)
     assert np.isneginf(volume.lower).all()
@@ -90,9 +90,9 @@ def test_above_a_hole_the_distance_of_its_rim_is_no_distance_of_the_film() -> No
     """A disk-shaped hole of radius one in the plane z = 0, seen from its axis: w = (1 - z / sqrt(1 + z^2)) / 2."""
     height = np.array([-3.0, -0.9, -0.2, -1e-3, 1e-3, 0.2, 0.9, 3.0])
     rim = np.sqrt(1 + height**2)
-    sureness = np.abs(height) / rim
+    winding = (1 - height / rim) / 2
     # The field is the height over the film, and right everywhere.
-    volume = Volume.around(np.zeros((8, 3)), height, np.sign(height) * rim, sureness, rim)
+    volume = Volume.around(np.zeros((8, 3)), height, np.sign(height) * rim, winding, rim)
     np.testing.assert_array_equal(volume.wanted, 0.0)
     assert (volume.lower <= 0).all()
     assert (volume.upper >= 0).all()
