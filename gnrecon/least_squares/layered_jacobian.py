@@ -89,41 +89,58 @@ class LayeredJacobian:
 
     def dense(self) -> Iterator[Tensor]:
         """Yield chunks of rows, in the precision in which the factors are stored, of at most `chunk_bytes`."""
-        return self._dense(self.blocks())
+        return self._dense(self.blocks(), self.rows)
 
     def _chunk(self, block: Block) -> int:
         """Return how many rows are multiplied out at a time."""
         return max(64, self.chunk_bytes // max(block[0].left.element_size() * self.columns, 1))
 
-    def _dense(self, blocks: Iterable[Block]) -> Iterator[Tensor]:
+    def _dense(self, blocks: Iterable[Block], rows: int) -> Iterator[Tensor]:
+        """Yield chunks of at most so many rows, of as many blocks as fit: few long products are faster than many."""
         buffer: Tensor | None = None
+        filled = 0
         for block in blocks:
-            length = max(1, min(self._chunk(block), len(block[0])))
-            if buffer is None or len(buffer) < length:
-                # No longer than the block: fresh memory costs as much as what is written to it.
-                buffer = torch.empty(length, self.columns, dtype=_stored(block), device=self.device)
-            for start in range(0, len(block[0]), len(buffer)):
-                part = [layer.take(slice(start, start + len(buffer))) for layer in block]
-                chunk = buffer[: len(part[0])]
+            most, start = self._chunk(block), 0
+            while start < len(block[0]):
+                if buffer is None:
+                    # No longer than all rows: fresh memory costs as much as what is written to it.
+                    buffer = torch.empty(min(most, rows), self.columns, dtype=_stored(block), device=self.device)
+                part = [layer.take(slice(start, start + len(buffer) - filled)) for layer in block]
+                chunk = buffer[filled : filled + len(part[0])]
                 for layer, group in zip(part, self.groups, strict=True):
                     layer.write(chunk[:, group])
-                yield chunk
+                start, filled = start + len(chunk), filled + len(chunk)
+                if filled == len(buffer):
+                    yield buffer
+                    filled = 0
+        if buffer is not None and filled:
+            yield buffer[:filled]
 
     def gram(self) -> Tensor:
         """Return J^T J, its lower triangle valid."""
         small = self.pieces * self.columns**2 * self.dtype.itemsize <= self.chunk_bytes
         if not (small and self.kept and self.device.type == "cpu"):
-            return self._gram(self.blocks())
-        # Threads share the blocks and no sum; which blocks a sum has does not depend on the number of threads.
+            return self._gram(self.blocks(), self.rows, self.dtype)
+        # Threads share the blocks and no sum; which blocks a sum has does not depend on the number of threads. The sums
+        # have the precision of the products, which are two in most steps, with as many rows each.
         blocks = list(self.blocks())
         shares = [blocks[number :: self.pieces] for number in range(self.pieces)]
-        total, *others = map_in_threads(self._gram, shares, self.device)
+
+        def product_of(share: list[Block]) -> Tensor:
+            return self._gram(
+                share, sum(len(block[0]) for block in share), self.stored, block_columns=max(self.columns, 1)
+            )
+
+        total, *others = map_in_threads(product_of, shares, self.device)
         for product in others:
             total += product
-        return total
+        return total.to(self.dtype)
 
-    def _gram(self, blocks: Iterable[Block]) -> Tensor:
-        return gram(self._dense(map(_without_zero_rows, blocks)), self.columns, self._zeros(0))
+    def _gram(self, blocks: Iterable[Block], rows: int, dtype: torch.dtype, *, block_columns: int = 192) -> Tensor:
+        """Return J^T J of blocks of at most so many rows, summed in a precision."""
+        like = torch.zeros(0, dtype=dtype, device=self.device)
+        chunks = self._dense(map(_without_zero_rows, blocks), rows)
+        return gram(chunks, self.columns, like, block_columns=block_columns)
 
     def group_grams(self) -> list[Tensor]:
         """Return the layers' blocks of J^T J, each with a valid lower triangle."""

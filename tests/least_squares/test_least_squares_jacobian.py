@@ -26,6 +26,12 @@ def dense_with_groups(seed: int, stored: torch.dtype) -> Made:
     return DenseJacobian(J, (5, 0, 7), chunk=6), J.double()
 
 
+def in_shares(seed: int, stored: torch.dtype) -> Made:
+    """Blocks that are kept, so that J^T J is summed in two shares."""
+    jacobian, J = layered(seed, [(4, True), (0, False), (7, True)], stored=stored)
+    return replace(jacobian, kept=True), J
+
+
 MAKERS: dict[str, Callable[[int, torch.dtype], Made]] = {
     "dense": dense_with_groups,
     "network": lambda seed, stored: layered(seed, stored=stored),
@@ -35,6 +41,7 @@ MAKERS: dict[str, Callable[[int, torch.dtype], Made]] = {
     "no rows": lambda seed, stored: layered(seed, [(0, True)], stored=stored),
     "some units": lambda seed, stored: layered(seed, units=((2, 0), None), stored=stored),
     "a fixed layer": lambda seed, stored: layered(seed, units=((), None), stored=stored),
+    "in shares": in_shares,
     "no columns": lambda seed, stored: layered(seed, units=((), ()), stored=stored),
     "dense, no rows": lambda _, stored: (DenseJacobian(torch.zeros(0, 4, dtype=stored)), torch.zeros(0, 4, dtype=F64)),
     "dense, no columns": lambda _, stored: (
@@ -136,7 +143,7 @@ def test_rounded_factors_keep_the_precision_of_vectors() -> None:
 def test_long_blocks_are_cut_into_tiles_and_chunks() -> None:
     jacobian, J = layered(3, [(70, True), (67, False)])
     jacobian = replace(jacobian, tile_rows=5, chunk_bytes=1)
-    assert [len(chunk) for chunk in jacobian.dense()] == [64, 6, 64, 3]
+    assert [len(chunk) for chunk in jacobian.dense()] == [64, 64, 9], "a chunk has rows of both blocks"
     close(jacobian.gram().tril(), (J.T @ J).tril(), F64)
     close(
         jacobian.kernel([2.0, 3.0]).tril(),
@@ -169,12 +176,13 @@ def test_rows_of_zeros_are_not_multiplied(monkeypatch: pytest.MonkeyPatch) -> No
     jacobian = LayeredJacobian(lambda: blocks, whole.rows, whole.group_sizes, whole.device)
     multiplied: list[int] = []
 
-    def counted(chunks: Iterable[Tensor], size: int, like: Tensor) -> Tensor:
-        return gram((multiplied.append(len(chunk)) or chunk for chunk in chunks), size, like)
+    def counted(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: int) -> Tensor:
+        counting = (multiplied.append(len(chunk)) or chunk for chunk in chunks)
+        return gram(counting, size, like, block_columns=block_columns)
 
     monkeypatch.setattr(module, "gram", counted)
     close(jacobian.gram().tril(), (J[acting].T @ J[acting]).tril(), F64)
-    assert multiplied == [5, 8]
+    assert multiplied == [13]
 
 
 @pytest.mark.parametrize("tangents", [True, False])
