@@ -1,10 +1,10 @@
 """The smooth global field: a sine network by Gauss-Newton, or one linear layer of sine features.
 
-A linear field is solved first (`linear_field`). A network of several layers is then fitted with eikonal regularisation
-(`global_network`). It is the global field where it predicts the validation points and the sign of free space better, by
-more than chance: on organic scans nearly always. A thin wall that sparse points hardly show may be lost on its way, and
-noise may hide that it is better; then the linear field remains, as it does in draft quality. With curvature penalties
-the global field is the linear one, on which they are then minimised.
+A linear field is solved (`linear_field`) and, side by side, a network of several layers is fitted with eikonal
+regularisation (`global_network`). The network is the global field where it predicts the validation points and the sign
+of free space better, by more than chance: on organic scans nearly always. A thin wall that sparse points hardly show
+may be lost on its way, and noise may hide that it is better; then the linear field remains, as it does in draft
+quality. With curvature penalties the global field is the linear one, on which they are then minimised.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions, network_steps
 from gnrecon.fit.global_network import NetworkTerms
 from gnrecon.fit.linear_field import fit_linear
-from gnrecon.fit.network_ladder import NetworkLadder
+from gnrecon.fit.network_ladder import NetworkLadder, Rival
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import GlobalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
-from gnrecon.runtime.progress import ProgressCallback, subrange
+from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
 _log = logging.getLogger(__name__)
 
@@ -98,31 +98,40 @@ def fit_global(
     """
     seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
     scene = Scene.of(seen, options.device, rng)
-    share = 1.0 if linear_only else parameters.linear_time_share
-    linear = fit_linear(
-        samples, held_out, scene, options, rng, subrange(advance, 0.0, share), parameters=parameters.linear
-    )
-    first = GlobalField(linear.sdf, linear.solution, scene, linear.length)
+
+    def solved(advance: ProgressCallback) -> GlobalField:
+        linear = fit_linear(samples, held_out, scene, options, rng, advance, parameters=parameters.linear)
+        return GlobalField(linear.sdf, linear.solution, scene, linear.length)
+
     if linear_only:
-        return first
+        return solved(advance)
     points, normals = samples.points[held_out], samples.normals[held_out]
-    terms = NetworkTerms.draw(scene, points, normals, rng, parameters=parameters.terms)
-    of_linear = terms.prediction(linear.sdf.field, linear.sdf.theta)
-    if of_linear.score < parameters.exact_score:
-        _log.info("The linear field predicts the validation points: %.3g disk radii.", of_linear.score)
+    # The linear field and the networks are fitted side by side, each with random numbers of its own.
+    of_networks = rng.spawn(1)[0]
+    terms = NetworkTerms.draw(scene, points, normals, of_networks, parameters=parameters.terms)
+    linear: list[GlobalField] = []
+
+    def score_of_linear() -> float:
+        linear.append(solved(ignore_progress))
+        return terms.score(linear[0].sdf.field, linear[0].sdf.theta)
+
+    rival = Rival(score_of_linear, exact_score=parameters.exact_score)
+    step = _counted(callback, advance, network_steps(len(scene.points), parameters=parameters.ladder))
+    ladder = NetworkLadder(terms, options, of_networks, step, rival, parameters.ladder)
+    fitted = ladder.fit()
+    first = linear[0]
+    if fitted is None:
+        _log.info("The linear field predicts the validation points: %.3g disk radii.", rival.score)
         return first
-    step = _counted(
-        callback, subrange(advance, share, 1.0), network_steps(len(scene.points), parameters=parameters.ladder)
-    )
-    ladder = NetworkLadder(terms, options, rng, step, of_linear.score, parameters.ladder)
-    field, solution, _ = ladder.fit()
+    field, solution, _ = fitted
+    of_linear = terms.prediction(first.sdf.field, first.sdf.theta)
     found = terms.prediction(field, solution.theta)
     _log.info("Score of validation points: linear field %.3g, network %.3g disk radii.", of_linear.score, found.score)
     better = found.is_better_than(of_linear, standard_errors=parameters.ladder.gain_standard_errors)
     if not (better or solution.interrupted):
-        return replace(first, solution=replace(linear.solution, history=solution.history))
+        return replace(first, solution=replace(first.solution, history=solution.history))
     sdf = NeuralSDF(field, solution.theta, samples.frame, scene.box, options.as_dict())
-    return GlobalField(sdf, solution, scene, linear.length, ladder, linear.sdf)
+    return GlobalField(sdf, solution, scene, first.length, ladder, first.sdf)
 
 
 def _counted(callback: Callback | None, advance: ProgressCallback, most_steps: int) -> Callback:

@@ -156,7 +156,6 @@ class GlobalFieldParameters:
     terms: NetworkTermParameters = NetworkTermParameters()
     ladder: NetworkLadderParameters = NetworkLadderParameters()
     exact_score: float = 0.1  # of the linear field, disk radii and radians: below, a network has nothing to gain
-    linear_time_share: float = 0.3  # of the global fit, measured, for the progress bar
 
 
 @dataclass(frozen=True)

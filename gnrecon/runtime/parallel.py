@@ -200,8 +200,8 @@ def run_in_threads(
 ) -> list[Result]:
     """Return ``work(item)`` for long runs that are independent, in their order, up to the first that is the last.
 
-    As many as there are workers run side by side, each in one thread; a run that is left over has all threads for the
-    pieces of its own work. The results are the same for any number of threads.
+    As many as there are workers run side by side, each in one thread, and the next one starts when one ends; a run that
+    is alone has all threads for the pieces of its own work. The results are the same for any number of threads.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def run_in_threads(
         caller's thread
     items : sequence
     device : where the work is done; on a GPU the runs follow one another
-    is_last : whether the results after one are not wanted
+    is_last : whether the results after one are not wanted; runs that have started already are asked to end
     check_seconds : between two looks at the runs
 
     Raises
@@ -217,20 +217,25 @@ def run_in_threads(
     KeyboardInterrupt
         When the caller is interrupted, and no run has returned what it had.
     """
-    together = worker_count() if torch.device(device).type == "cpu" else 1
+    together = min(worker_count(), len(items)) if torch.device(device).type == "cpu" else 1
+    if together > 1:
+        return _run_together(work, items, is_last, together, check_seconds)
     found: list[Result] = []
-    for first in range(0, len(items), together):
-        group = items[first : first + together]
-        results = [work(group[0])] if len(group) == 1 else _run_group(work, group, check_seconds)
-        for result in results:
-            found.append(result)
-            if is_last(result):
-                return found
+    for item in items:
+        found.append(work(item))
+        if is_last(found[-1]):
+            break
     return found
 
 
-def _run_group(work: Callable[[Item], Result], items: Sequence[Item], check_seconds: float) -> list[Result]:
-    """Return the results of runs that are all running at the same time."""
+def _run_together(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    is_last: Callable[[Result], bool],
+    together: int,
+    check_seconds: float,
+) -> list[Result]:
+    """Return the results of runs of which several are running at the same time."""
     runs = _Runs()
 
     def run(item: Item) -> Result:
@@ -238,24 +243,38 @@ def _run_group(work: Callable[[Item], Result], items: Sequence[Item], check_seco
         _runs.set(runs)
         return work(item)
 
-    def make_calls(futures: Sequence[Future[Result]]) -> None:
-        running = set(futures)
-        while running or not runs.calls.empty():
-            running = wait(running, check_seconds).not_done
+    def wait_for(future: Future[Result]) -> Result:
+        """Return its result; until then, make the calls of all runs."""
+        while not (future.done() and runs.calls.empty()):
+            wait([future], check_seconds)
             with suppress(Empty):
                 while True:
                     runs.calls.get_nowait()()
+        return future.result()
 
-    with ThreadPoolExecutor(len(items), initializer=set_threads, initargs=(1,)) as pool:
+    found: list[Result] = []
+    with ThreadPoolExecutor(together, initializer=set_threads, initargs=(1,)) as pool:
         futures = [pool.submit(run, item) for item in items]
         try:
-            make_calls(futures)
+            for future in futures:
+                found.append(wait_for(future))
+                if is_last(found[-1]):
+                    break
         except BaseException as error:
-            runs.asked.set()
-            wait(futures)
+            started = _ended(futures, runs)
             if not (isinstance(error, KeyboardInterrupt) and runs.ended):
                 raise
-        return [future.result() for future in futures]
+            return [future.result() for future in started]
+        _ended(futures, runs)
+    return found
+
+
+def _ended(futures: Sequence[Future[Result]], runs: _Runs) -> list[Future[Result]]:
+    """Ask runs to end, wait for those that have started, and return these."""
+    runs.asked.set()
+    started = [future for future in futures if not future.cancel()]
+    wait(started)
+    return started
 
 
 def end_if_asked() -> None:

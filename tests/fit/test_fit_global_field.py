@@ -16,7 +16,7 @@ from gnrecon.fit.fit_options import network_steps
 from gnrecon.fit.global_field import GlobalField, fit_global
 from gnrecon.fit.global_network import Deviations, NetworkTerms, Prediction
 from gnrecon.fit.initialisation import random_network
-from gnrecon.fit.network_ladder import NetworkLadder
+from gnrecon.fit.network_ladder import NetworkLadder, Rival
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import (
     FitParameters,
@@ -27,6 +27,8 @@ from gnrecon.fit.parameters import (
 from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.optim import Record, Solution
+from gnrecon.runtime.errors import FitError
+from gnrecon.runtime.parallel import fixed_sums
 from gnrecon.runtime.progress import ignore_progress
 
 FRAME = Frame(np.array([1.0, 2.0, 3.0]), 2.0)
@@ -225,6 +227,43 @@ def test_all_starts_but_the_best_end_early(monkeypatch: pytest.MonkeyPatch, rng:
     assert len(solution.history) == sum(len(one[3].history) for one in taken)
     assert [record.step for record in solution.history] == list(range(1, len(solution.history) + 1))
     assert network_steps(900, parameters=parameters) == 16
+
+
+@pytest.mark.parametrize("count", [360, 900])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_rival_that_is_exact_needs_no_network(count: int, threads: int, rng: np.random.Generator) -> None:
+    rival = Rival(lambda: 0.05, exact_score=0.1)
+    ladder = NetworkLadder(terms_of(capsule(count, 0), rng), FitOptions(), rng, rival=rival)
+    with fixed_sums(threads):
+        assert ladder.fit() is None
+    assert ladder.history == []
+
+
+def test_no_more_networks_are_fitted_where_the_rival_is_better() -> None:
+    parameters = NetworkLadderParameters(widths=(4,), first_steps=2, points_per_member=600)
+
+    def scores(threads: int, rival: float) -> list[float | None]:
+        rng = np.random.default_rng(1)
+        ladder = NetworkLadder(
+            terms_of(capsule(360, 0), rng), FitOptions(), rng, rival=Rival(lambda: rival), parameters=parameters
+        )
+        with fixed_sums(threads):
+            assert ladder.fit() is not None
+        return [record.held_out for record in ladder.history]
+
+    both, one = scores(1, 1e9), scores(1, 0.0)
+    assert len(both) == 2 * len(one)
+    assert (scores(3, 1e9), scores(3, 0.0)) == (both, one)
+
+
+def test_the_error_of_a_rival_is_that_of_the_fit(rng: np.random.Generator) -> None:
+    def fails() -> float:
+        raise FitError("no")
+
+    for threads in (1, 2):
+        ladder = NetworkLadder(terms_of(capsule(360, 0), rng), FitOptions(), rng, rival=Rival(fails))
+        with fixed_sums(threads), pytest.raises(FitError, match="no"):
+            ladder.fit()
 
 
 def test_an_interrupt_ends_the_fit_also_where_an_earlier_network_is_better(

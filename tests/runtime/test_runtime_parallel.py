@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Barrier, get_ident
+from threading import Barrier, Event, get_ident
 from typing import Any
 
 import numpy as np
@@ -211,16 +211,47 @@ def test_runs_have_their_results_in_order_up_to_the_last(threads: int) -> None:
     with fixed_sums(threads):
         found = run_in_threads(run, [1, 2, 3, 4, 5], is_last=lambda result: result[0] == 4)
     assert [(number, inner) for number, _, inner in found] == [(n, [n, 2 * n]) for n in (1, 2, 3, 4)]
-    if threads == 2:
-        assert {workers for _, workers, _ in found} == {1}, "each run has one thread"
-    # Four were wanted; those that ran beside the last have been in vain.
+    assert {workers for _, workers, _ in found} == {1}, "each run has one thread"
+    # Four were wanted; one that has started beside the last has been in vain, and its call may not have been made.
     assert set(seen) == {get_ident()}
-    assert len(seen) == {1: 4, 2: 4, 3: 5}[threads]
+    assert 4 <= len(seen) <= (4 if threads == 1 else 5)
 
 
-def test_a_run_that_is_left_over_has_all_threads() -> None:
+def test_a_run_that_is_alone_has_all_threads() -> None:
     with fixed_sums(2):
-        assert run_in_threads(lambda _: worker_count(), [0, 1, 2]) == [1, 1, 2]
+        assert run_in_threads(lambda _: worker_count(), [0]) == [2]
+
+
+def test_the_next_run_starts_when_one_ends() -> None:
+    third = Event()
+
+    def run(number: int) -> bool:
+        if number == 2:
+            third.set()
+        return number > 0 or third.wait(20)
+
+    with fixed_sums(2):
+        assert run_in_threads(run, [0, 1, 2]) == [True] * 3, "the first waits for the third"
+
+
+def test_runs_after_the_last_are_asked_to_end() -> None:
+    both, ended = Barrier(2), []
+
+    def run(number: int) -> int:
+        both.wait(20)
+        deadline = time.monotonic() + 20
+        while number == 1 and time.monotonic() < deadline:
+            try:
+                end_if_asked()
+            except KeyboardInterrupt:
+                ended.append(number)
+                break
+            time.sleep(0.001)
+        return number
+
+    with fixed_sums(2):
+        assert run_in_threads(run, [0, 1, 2], is_last=lambda _: True) == [0]
+    assert ended == [1]
 
 
 def test_an_interrupt_of_the_caller_ends_the_runs_with_what_they_have() -> None:
@@ -238,7 +269,7 @@ def test_an_interrupt_of_the_caller_ends_the_runs_with_what_they_have() -> None:
             return f"{number} ended"
 
     with fixed_sums(2):
-        assert run_in_threads(run, [0, 1]) == ["0 ended", "1 ended"]
+        assert run_in_threads(run, [0, 1, 2]) == ["0 ended", "1 ended"]
 
 
 def test_an_interrupt_that_no_run_has_seen_is_not_lost() -> None:
