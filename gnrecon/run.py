@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +25,16 @@ from rich.progress import (
 from rich.text import Text
 
 from gnrecon.config import settings_text
-from gnrecon.io import all_input_files, check_writable, written_origin
+from gnrecon.io import written_origin
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
 from gnrecon.rendering import render, render_sheet
 from gnrecon.report.html import page_text
 from gnrecon.report.time_left import TimeLeft
-from gnrecon.runtime.errors import ExitCode, UsageError
-from gnrecon.runtime.files import atomic_write, one_line, printable, require_files
+from gnrecon.run_files import Files
+from gnrecon.runtime.errors import ExitCode
+from gnrecon.runtime.files import atomic_write, one_line, printable
 from gnrecon.runtime.interrupts import ignore_interrupts
 from gnrecon.runtime.logs import logged
 
@@ -56,64 +56,6 @@ STAGES = {
 }
 
 
-@dataclass(frozen=True)
-class Files:
-    """The files that a run reads and writes; `config` is written, `settings` is the configuration that was read."""
-
-    scans: tuple[Path, ...]
-    output: Path
-    reference: Path | None = None
-    report: Path | None = None
-    preview: Path | None = None
-    model: Path | None = None
-    html: Path | None = None
-    overwrite: bool = False
-    format: str | None = None
-    thumbnail: Path | None = None
-    config: Path | None = None
-    settings: Path | None = None
-
-    def check(self) -> None:
-        """Refuse, before any work, what would fail after it.
-
-        Raises
-        ------
-        UsageError
-            When an extension is unknown, or two files are the same.
-        InputError
-            When an input is missing.
-        OutputError
-            When a target exists and may not be overwritten, or its folder is missing.
-        """
-        check_writable(self.output)
-        if self.preview is not None and self.preview.suffix.lower() != ".png":
-            raise UsageError(f"The preview is a PNG picture, so it cannot be called {self.preview}.")
-        if self.model is not None and self.model.suffix.lower() != ".gnr":
-            raise UsageError(f"A fitted field is saved as a .gnr file, so it cannot be called {self.model}.")
-        if self.report is not None and self.report.suffix.lower() in (".html", ".htm"):
-            raise UsageError(f"The report is JSON, so it cannot be called {self.report}; --html writes a page.")
-        if self.html is not None and self.html.suffix.lower() not in (".html", ".htm"):
-            raise UsageError(f"The page is an HTML file, so it cannot be called {self.html}.")
-        inputs, targets = self.inputs_and_targets()
-        if any(target == Path("-") for target in targets):
-            raise UsageError("Results are written to files, so none of them can be called -.")
-        require_files(inputs, targets, self.overwrite)
-
-    @property
-    def named(self) -> list[Path]:
-        """All files that are read or written; a log must be none of them."""
-        inputs, targets = self.inputs_and_targets()
-        return [*inputs, *targets]
-
-    def inputs_and_targets(self) -> tuple[list[Path], list[Path]]:
-        """Return the files that are read, with those that scans name, and the files that are written."""
-        targets = (self.output, self.report, self.preview, self.model, self.html, self.thumbnail, self.config)
-        inputs = [path for path in (self.reference, self.settings) if path is not None]
-        return [*all_input_files(self.scans, self.format), *all_input_files(inputs)], [
-            path for path in targets if path is not None
-        ]
-
-
 def run(
     files: Files,
     options: dict[str, Any],
@@ -128,7 +70,8 @@ def run(
 
     Parameters
     ----------
-    files, options : what is read and written, and how, see `Options`
+    files : what is read and written, checked by `Files.check`
+    options : how, see `Options`
     command : the command line, for the report
     quiet, verbose : print failures only; print choices, counts, stages and steps
     log : file to append the library's log to
@@ -139,7 +82,6 @@ def run(
     GnreconError
         From any stage; nothing is written then.
     """
-    files.check()
     console = Console(stderr=True, quiet=quiet)
     bar = progress_bar(console, verbose) if watcher is None else nullcontext(watcher)
     with logged(console if verbose else None, log, files.named), bar as progress:

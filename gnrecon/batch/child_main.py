@@ -48,7 +48,8 @@ def work(argument: dict[str, Any]) -> int:
 
 
 def _reconstruct(argument: dict[str, Any], folder: Path) -> ExitCode:
-    from gnrecon.run import Files, run
+    from gnrecon.run import run
+    from gnrecon.run_files import Files
 
     paths = {kind: folder / name for kind, name in argument["files"].items()}
     reference = argument["reference"]
@@ -62,6 +63,7 @@ def _reconstruct(argument: dict[str, Any], folder: Path) -> ExitCode:
         html=paths.get("page"),
         thumbnail=paths["thumbnail"],
     )
+    files.check()
     progress = ProgressFile(argument["name"], progress_file(folder))
     return ExitCode(run(files, argument["options"], command=argument["command"], watcher=progress))
 

@@ -107,7 +107,7 @@ def reconstruct_command(
 ) -> None:
     """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""
     from gnrecon.config import read_settings
-    from gnrecon.run import Files, run
+    from gnrecon.run_files import Files
 
     del help_all, debug  # `main` reads it from the arguments, because it handles failures
     given = given_options(context, options) | ({} if memory is None else {"memory": memory})
@@ -127,14 +127,16 @@ def reconstruct_command(
         config=save_config,
         settings=config,
     )
+    files.check()
     if dry_run:
         from gnrecon.cli.scan_info import info
         from gnrecon.runtime.logs import require_log
 
-        files.check()
         if log is not None:
             require_log(log, files.named)
         raise SystemExit(info(scans, chosen, format))
     if limit_mb is not None:
         continue_in_child(limit_mb)
+    from gnrecon.run import run
+
     raise SystemExit(run(files, chosen, command=context.obj, quiet=quiet, verbose=verbose, log=log))

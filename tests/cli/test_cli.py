@@ -419,6 +419,25 @@ def test_the_command_line_starts_without_the_stages() -> None:
     assert "scipy" not in loaded
 
 
+def test_files_are_refused_before_the_libraries_of_a_fit_are_loaded(scan: Path, out: Path) -> None:
+    (out / "there.ply").touch()
+    code = (
+        "import sys\n"
+        "from gnrecon.cli.app import main\n"
+        "try:\n    main(sys.argv[1:])\n"
+        "except SystemExit as end:\n    print(end.code, *{'torch', 'scipy', 'open3d'} & set(sys.modules))\n"
+    )
+    for source, target, ends in (
+        (scan, "there.ply", ExitCode.OUTPUT),
+        (out / "none.ply", "new.ply", ExitCode.INPUT),
+        (scan, "new.docx", ExitCode.USAGE),
+    ):
+        command = [sys.executable, "-c", code, str(source), "-o", str(out / target)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.stdout == f"{int(ends)}\n", done.stderr
+    assert names(out) == ["there.ply"]
+
+
 def test_a_scan_from_standard_input_makes_all_files(scan: Path, out: Path) -> None:
     command = [sys.executable, "-m", "gnrecon", "-", "--format", "ply", "-o", str(out / "a.ply"), *FAST_WORDS]
     command += ["--html", str(out / "a.html")]
