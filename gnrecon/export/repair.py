@@ -35,6 +35,7 @@ from gnrecon.export.verify import require_sound, verify
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
+from gnrecon.runtime.quiet_imports import import_uninterrupted
 
 
 def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
@@ -285,8 +286,7 @@ def _vote(
 def _nearest_components(mesh: Mesh, labels: Int, points: Float) -> Int:
     """Return the component, of shape (N,), that each point's nearest face, of labels of shape (F,), belongs to.
 
-    Most points are so near to a vertex of the largest component that no other can be nearer; the others are few, and
-    the search for the nearest face takes a library that is slow to load.
+    Most points are so near to a vertex of the largest component that no other can be nearer; the others are few.
     """
     largest = int(np.bincount(labels).argmax())
     one, others = submesh(mesh, labels == largest), submesh(mesh, labels != largest)
@@ -296,7 +296,30 @@ def _nearest_components(mesh: Mesh, labels: Int, points: Float) -> Int:
     unclear = next_near - reach <= near
     nearest = np.full(len(points), largest, dtype=labels.dtype)
     if unclear.any():
-        nearest[unclear] = labels[nearest_on_surface(mesh, points[unclear])[1]]
+        within = np.minimum(near, next_near)[unclear]
+        nearest[unclear] = labels[_nearest_faces(mesh, points[unclear], within)]
+    return nearest
+
+
+def _nearest_faces(mesh: Mesh, points: Float, within: Float, *, most_pairs: int = 300_000) -> Int:
+    """Return the nearest face of each point, of shape (N,), which is at most as far as `within`, of shape (N,).
+
+    Few points are compared with the faces about them, as the library that finds the nearest of all is slow to load.
+    """
+    corners = mesh.vertices[mesh.faces]
+    tree = cKDTree(corners.mean(axis=1))
+    # A triangle's points are no farther from its centre than two thirds of its longest side, in single precision.
+    radius = (1 + 1e-6) * (within + float(side_lengths(mesh).max()) * 2 / 3)
+    counts = tree.query_ball_point(points, radius, return_length=True)
+    if counts.sum() > most_pairs:
+        return nearest_on_surface(mesh, points)[1]
+    closest_point = import_uninterrupted("trimesh").triangles.closest_point
+    faces = np.concatenate(tree.query_ball_point(points, radius)).astype(np.int64)
+    repeated = np.repeat(points, counts, axis=0)
+    distance = np.linalg.norm(closest_point(corners[faces], repeated) - repeated, axis=1)
+    starts = np.cumsum(counts) - counts
+    order = np.lexsort([distance, np.repeat(np.arange(len(points)), counts)])
+    nearest: Int = faces[order[starts]]
     return nearest
 
 

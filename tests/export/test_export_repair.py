@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 from analytic_fields import UTM, Field, ball_mesh, plate, shells, sines, sphere, union
 from planted_defects import touching_in_a_vertex, touching_in_an_edge, with_a_fin, with_a_flipped_face
+from scipy.spatial import cKDTree
+from trimesh.triangles import closest_point
 
 from gnrecon.export import (
     drop_stray_components,
@@ -21,10 +24,14 @@ from gnrecon.export import (
     verify,
     verify_file,
 )
-from gnrecon.export.mesh_statistics import submesh
+from gnrecon.export.mesh_statistics import face_components, submesh
+from gnrecon.export.metrics import nearest_on_surface
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
 from gnrecon.runtime.errors import MeshError, UsageError
+
+repair_module = sys.modules["gnrecon.export.repair"]
+"""The package has a function of that name."""
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +157,35 @@ def test_the_best_supported_part_stays_however_few_the_points() -> None:
     mesh, _ = remove_stray(both, np.array([[0.8, 0, 0]]))
     assert verify(mesh).components == 1
     assert mesh.vertices[:, 0].min() > 0.3
+
+
+def test_each_point_is_nearest_to_the_component_of_its_nearest_face(rng: np.random.Generator) -> None:
+    # Two balls that nearly touch, and long faces next to short ones.
+    both = extract(Field(union(sphere(0.5, (-0.4, 0, 0)), sphere(0.2, (0.38, 0, 0)))), resolution=48)
+    vertices = np.concatenate([both.vertices, [[1.1, -3, -3], [1.1, 3, -3], [1.1, 0, 3]]])
+    mesh = Mesh(vertices, np.concatenate([both.faces, [[len(vertices) - 3, len(vertices) - 2, len(vertices) - 1]]]))
+    points = np.concatenate([rng.uniform(-1, 1, (300, 3)), [0.14, 0, 0] + 0.03 * rng.standard_normal((300, 3))])
+    within = cKDTree(mesh.vertices).query(points)[0]
+    distances, exact = nearest_on_surface(mesh, points)
+    labels = face_components(mesh)
+    assert len(np.unique(labels[exact])) == 3
+    for most_pairs in (10**9, 0):
+        found = repair_module._nearest_faces(mesh, points, within, most_pairs=most_pairs)
+        corners = mesh.vertices[mesh.faces[found]]
+        off = np.linalg.norm(closest_point(corners, points) - points, axis=1)
+        np.testing.assert_allclose(off, distances, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(repair_module._nearest_components(mesh, labels, points), labels[exact])
+
+
+def test_few_points_next_to_a_stray_part_need_no_other_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*_: object) -> None:
+        raise AssertionError("open3d is asked for")
+
+    monkeypatch.setattr(repair_module, "nearest_on_surface", slow)
+    both = extract(Field(union(sphere(0.5, (-0.4, 0, 0)), sphere(0.1, (0.25, 0, 0)))), resolution=48)
+    mesh, actions = remove_stray(both, on_sphere(0.5, 1000, (-0.4, 0, 0)))
+    assert verify(mesh).components == 1
+    assert "Dropped 1 of 2 components" in actions[0]
 
 
 def test_nested_shells_stay_oriented() -> None:
