@@ -1,4 +1,4 @@
-"""The linear start of the global field: one wide layer of sine features, whose length and normal weight are selected.
+"""The linear global field: one wide layer of sine features, whose length scale and weight of normals are selected.
 
 Small fields of each candidate length scale and weight are fitted to some of the points; the validation points select
 among them (`field_smoothness`). Heavy normals make the field exact on smooth shapes. On a shape with more detail than

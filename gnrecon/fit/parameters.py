@@ -84,7 +84,7 @@ class OutlierParameters:
 
 @dataclass(frozen=True)
 class LinearFieldParameters:
-    """The linear start of the global field (`fit.linear_field`)."""
+    """The linear global field, with which the networks are compared (`fit.linear_field`)."""
 
     units: int = 1000
     wrong_sign_share: float = 4e-3  # of free space, that heavier normals may give the wrong sign
