@@ -26,13 +26,13 @@ from rich.text import Text
 
 from gnrecon.config import settings_text
 from gnrecon.io import written_origin
+from gnrecon.io.run_files import Files
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress as PipelineProgress
 from gnrecon.pipeline import Reconstruction, reconstruct
 from gnrecon.rendering import render, render_sheet
 from gnrecon.report.html import page_text
 from gnrecon.report.time_left import TimeLeft
-from gnrecon.run_files import Files
 from gnrecon.runtime.errors import ExitCode
 from gnrecon.runtime.files import atomic_write, one_line, printable
 from gnrecon.runtime.interrupts import ignore_interrupts

@@ -48,8 +48,8 @@ def work(argument: dict[str, Any]) -> int:
 
 
 def _reconstruct(argument: dict[str, Any], folder: Path) -> ExitCode:
+    from gnrecon.io.run_files import Files
     from gnrecon.run import run
-    from gnrecon.run_files import Files
 
     paths = {kind: folder / name for kind, name in argument["files"].items()}
     reference = argument["reference"]

@@ -107,7 +107,7 @@ def reconstruct_command(
 ) -> None:
     """Reconstruct one scan: gnrecon SCAN -o MESH (the word reconstruct may be left out)."""
     from gnrecon.config import read_settings
-    from gnrecon.run_files import Files
+    from gnrecon.io.run_files import Files
 
     del help_all, debug  # `main` reads it from the arguments, because it handles failures
     given = given_options(context, options) | ({} if memory is None else {"memory": memory})

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from gnrecon.io import all_input_files, check_writable
+from gnrecon.io.named_files import all_input_files
+from gnrecon.io.write import check_writable
 from gnrecon.runtime.errors import UsageError
 from gnrecon.runtime.files import require_files
 
