@@ -16,7 +16,7 @@ import numpy as np
 
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions, network_steps
-from gnrecon.fit.global_network import NetworkTerms
+from gnrecon.fit.global_network import NetworkTerms, Prediction
 from gnrecon.fit.linear_field import fit_linear
 from gnrecon.fit.network_ladder import NetworkLadder, Rival
 from gnrecon.fit.objective import Scene
@@ -109,22 +109,23 @@ def fit_global(
     # The linear field and the networks are fitted side by side, each with random numbers of its own.
     of_networks = rng.spawn(1)[0]
     terms = NetworkTerms.draw(scene, points, normals, of_networks, parameters=parameters.terms)
-    linear: list[GlobalField] = []
+    linear: list[tuple[GlobalField, Prediction]] = []
 
     def score_of_linear() -> float:
-        linear.append(solved(ignore_progress))
-        return terms.score(linear[0].sdf.field, linear[0].sdf.theta)
+        field = solved(ignore_progress)
+        prediction = terms.prediction(field.sdf.field, field.sdf.theta)
+        linear.append((field, prediction))
+        return prediction.score
 
     rival = Rival(score_of_linear, exact_score=parameters.exact_score)
     step = _counted(callback, advance, network_steps(len(scene.points), parameters=parameters.ladder))
     ladder = NetworkLadder(terms, options, of_networks, step, rival, parameters.ladder)
     fitted = ladder.fit()
-    first = linear[0]
+    ((first, of_linear),) = linear
     if fitted is None:
         _log.info("The linear field predicts the validation points: %.3g disk radii.", rival.score)
         return first
     field, solution, _ = fitted
-    of_linear = terms.prediction(first.sdf.field, first.sdf.theta)
     found = terms.prediction(field, solution.theta)
     _log.info("Score of validation points: linear field %.3g, network %.3g disk radii.", of_linear.score, found.score)
     better = found.is_better_than(of_linear, standard_errors=parameters.ladder.gain_standard_errors)

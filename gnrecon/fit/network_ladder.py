@@ -209,16 +209,19 @@ class NetworkLadder:
             starts, run_in_threads(NetworkLadder._first_steps, starts, self.options.device, _is_interrupted)
         )
 
+    @property
+    def _start_count(self) -> int:
+        return network_starts(len(self.terms.scene.points), parameters=self.parameters)
+
     def _starts(self) -> list[NetworkLadder]:
         """Return the ladders of the starts, of which one is continued, with few rows."""
         few = replace(self, terms=self.terms.with_rows(self.parameters.first_rows))
-        return few._parts(network_starts(len(self.terms.scene.points), parameters=self.parameters))
+        return few._parts(self._start_count)
 
     def _first_steps(self) -> Solution:
         """Return a random start of the first width after as many steps as each start has."""
         field = self._first_field()
-        starts = network_starts(len(self.terms.scene.points), parameters=self.parameters)
-        steps = self.parameters.first_steps if starts == 1 else self.parameters.trial_steps
+        steps = self.parameters.first_steps if self._start_count == 1 else self.parameters.trial_steps
         terms = partial(start_terms, self.terms.scene, self.options, self.rng)
         theta = spectral_start(field, self.terms.scene, terms, self.rng)
         # The score rises before it falls, as the damping finds its size: no patience ends these steps.

@@ -120,27 +120,24 @@ class LayeredJacobian:
         """Return J^T J, its lower triangle valid."""
         small = self.pieces * self.columns**2 * self.dtype.itemsize <= self.chunk_bytes
         if not (small and self.kept and self.device.type == "cpu"):
-            return self._gram(self.blocks(), self.rows, self.dtype)
-        # Threads share the blocks and no sum; which blocks a sum has does not depend on the number of threads. The sums
-        # have the precision of the products, which are two in most steps, with as many rows each.
+            return gram(self._nonzero_chunks(self.blocks(), self.rows), self.columns, self._zeros(0))
+        # Threads share the blocks and no sum; which blocks a sum has does not depend on the number of threads.
         blocks = list(self.blocks())
         shares = [blocks[number :: self.pieces] for number in range(self.pieces)]
+        # Most shares are one product, so that sums in the precision of the products lose nothing.
+        like, block_columns = self._zeros(0).to(self.stored), max(self.columns, 1)
 
         def product_of(share: list[Block]) -> Tensor:
-            return self._gram(
-                share, sum(len(block[0]) for block in share), self.stored, block_columns=max(self.columns, 1)
-            )
+            chunks = self._nonzero_chunks(share, sum(len(block[0]) for block in share))
+            return gram(chunks, self.columns, like, block_columns=block_columns)
 
         total, *others = map_in_threads(product_of, shares, self.device)
         for product in others:
             total += product
         return total.to(self.dtype)
 
-    def _gram(self, blocks: Iterable[Block], rows: int, dtype: torch.dtype, *, block_columns: int = 192) -> Tensor:
-        """Return J^T J of blocks of at most so many rows, summed in a precision."""
-        like = torch.zeros(0, dtype=dtype, device=self.device)
-        chunks = self._dense(map(_without_zero_rows, blocks), rows)
-        return gram(chunks, self.columns, like, block_columns=block_columns)
+    def _nonzero_chunks(self, blocks: Iterable[Block], rows: int) -> Iterator[Tensor]:
+        return self._dense(map(_without_zero_rows, blocks), rows)
 
     def group_grams(self) -> list[Tensor]:
         """Return the layers' blocks of J^T J, each with a valid lower triangle."""
