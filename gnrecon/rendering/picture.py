@@ -1,7 +1,7 @@
 """Pictures of meshes and scans by ray casting, so that no display and no graphics card is needed.
 
-Every pixel is the mean of nine samples. Surfaces are shaded by interpolated vertex normals, points as small balls. The
-entries are `render` and `render_sheet`.
+A pixel is the mean of nine samples, one of a surface that looks the same all about is a single one. Surfaces are shaded
+by interpolated vertex normals, points as small balls. The entries are `render` and `render_sheet`.
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from gnrecon.export.metrics import ray_scene
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.arrays import Float, Mask
 from gnrecon.geometry.colors import as_bytes, to_linear
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.rendering.rays import Camera, View, ambient_occlusion, draw_points, gamma_decoded, gamma_encoded, shade
 from gnrecon.rendering.rendering_parameters import RenderingParameters, SheetParameters
+from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.errors import UsageError
 
 Image = npt.NDArray[np.uint8]
@@ -72,9 +74,7 @@ def render(
     if size[0] < panels or size[1] < 1:
         raise UsageError(f"A picture of {size[0]} x {size[1]} pixels has no room for {panels} panels.")
     strips = _draw_panels(shown, views, up, size, (gamma_decoded(color), gamma_decoded(point_color)))
-    samples = RenderingParameters.supersampling
-    light = np.concatenate(strips, axis=1)
-    image: Image = gamma_encoded(light.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3)))
+    image: Image = gamma_encoded(np.concatenate(strips, axis=1))
     if path is not None:
         write_image(image, Path(path))
     return image
@@ -87,7 +87,7 @@ def _draw_panels(
     size: tuple[int, int],
     colors: tuple[Float, Float],
 ) -> list[Float]:
-    """Linear light of each panel, with all its samples; the colours are those of a mesh and of points."""
+    """Linear light of each panel; the colours are those of a mesh and of points."""
     # Everything is centred and scaled to about one, because the ray caster uses float32.
     places = np.concatenate([_places(part) for part in shown])
     centre = (places.min(axis=0) + places.max(axis=0)) / 2
@@ -103,8 +103,14 @@ def _draw_panels(
         if isinstance(part, Mesh):
             strips.append(_draw_mesh(part.with_vertices(unit), camera, colors[0]))
         else:
-            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, colors[1]))
+            strips.append(_pixels(_draw_cloud(PointCloud(unit, part.normals), camera, colors[1]), samples))
     return strips
+
+
+def _pixels(light: Float, samples: int) -> Float:
+    """Means over the samples, `samples` along each side of a pixel, of an image of light of shape (H, W, 3)."""
+    height, width = light.shape[0] // samples, light.shape[1] // samples
+    return np.asarray(light.reshape(height, samples, width, samples, 3).mean(axis=(1, 3)))
 
 
 def _places(part: Mesh | PointCloud) -> Float:
@@ -117,32 +123,74 @@ def _background(camera: Camera, *, top: float = 1.0, bottom: float = 0.86) -> Fl
     return np.broadcast_to(rows[:, None, None], (camera.height, camera.width, 3)).copy()
 
 
-def _draw_mesh(mesh: Mesh, camera: Camera, color: Float, *, samples: int = RenderingParameters.supersampling) -> Float:
-    from open3d import core
+class _Surface:
+    """A mesh of about unit size, which rays are cast at.
 
-    scene = ray_scene(mesh.vertices, mesh.faces)
-    rays = camera.rays()
-    answer = scene.cast_rays(core.Tensor.from_numpy(rays.astype(np.float32)))
-    distance = answer["t_hit"].numpy()
-    hit = np.isfinite(distance)
-    corners = mesh.faces[answer["primitive_ids"].numpy()[hit]]
-    # Single precision is enough for a picture, and there are millions of samples.
-    u, v = answer["primitive_uvs"].numpy()[hit].T
-    shares = np.stack([1 - u - v, u, v], axis=1)
-    normals = np.einsum("ij,ijk->ik", shares, mesh.vertex_normals().astype(np.float32)[corners])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-9))
-    if "colors" in mesh.attributes:
-        light = to_linear(as_bytes(mesh.attributes["colors"])[:, :3])
-        color = np.einsum("ij,ijk->ik", shares, light.astype(np.float32)[corners])
-    # Occlusion is computed once per pixel and not per sample: it varies slowly, and costs most.
-    coarse = np.zeros_like(hit)
-    coarse[::samples, ::samples] = hit[::samples, ::samples]
-    places = rays[coarse][:, :3] + distance[coarse][:, None] * rays[coarse][:, 3:]
-    small = ambient_occlusion(scene, places, normals[coarse[hit]], hit[::samples, ::samples])
-    sky = small.repeat(samples, 0).repeat(samples, 1)[: hit.shape[0], : hit.shape[1]]
-    image = _background(camera)
-    image[hit] = shade(normals, color, camera.axes, sky[hit])
-    return image
+    Parameters
+    ----------
+    mesh : Mesh
+    color : array of shape (3,), linear; of a mesh without colours of its own
+    """
+
+    def __init__(self, mesh: Mesh, color: Float) -> None:
+        self.scene, self.faces = ray_scene(mesh.vertices, mesh.faces), mesh.faces
+        # Single precision is enough for a picture, and there are millions of samples.
+        self._normals, self._color, self._colors = mesh.vertex_normals().astype(np.float32), color, None
+        if "colors" in mesh.attributes:
+            self._colors = to_linear(as_bytes(mesh.attributes["colors"])[:, :3]).astype(np.float32)
+
+    def cast(self, rays: Float) -> tuple[Mask, Float, Float, Float]:
+        """Which rays, (N, 6), hit, and of the M that do the places, unit normals and colours, (M, 3), or one colour."""
+        from open3d import core
+
+        answer = self.scene.cast_rays(core.Tensor.from_numpy(rays))
+        distance = answer["t_hit"].numpy()
+        hit = np.isfinite(distance)
+        corners = self.faces[answer["primitive_ids"].numpy()[hit]]
+        u, v = answer["primitive_uvs"].numpy()[hit].T
+        shares = np.stack([1 - u - v, u, v], axis=1)
+        normals = np.einsum("ij,ijk->ik", shares, self._normals[corners])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-9))
+        colors = self._color if self._colors is None else np.einsum("ij,ijk->ik", shares, self._colors[corners])
+        return hit, rays[hit, :3] + distance[hit, None] * rays[hit, 3:], normals, colors
+
+
+def _draw_mesh(
+    mesh: Mesh,
+    camera: Camera,
+    color: Float,
+    *,
+    samples: int = RenderingParameters.supersampling,
+    least_change: float = 0.02,
+    batch_pixels: int = 1 << 15,
+) -> Float:
+    """Linear light of the pixels, each `samples` of the camera's wide.
+
+    One is sampled more than once where its light differs from a neighbour's by `least_change` or more.
+    """
+    surface = _Surface(mesh, color)
+    image = _pixels(_background(camera), samples)
+    row, column = np.indices(image.shape[:2]).reshape(2, -1)
+    found, places, normals, colors = surface.cast(camera.rays(samples * (column + 0.5), samples * (row + 0.5)))
+    hit = found.reshape(image.shape[:2])
+    sky = ambient_occlusion(surface.scene, places, normals, hit)
+    paper = image.reshape(-1, 3).copy()
+    image[hit] = shade(normals, colors, camera.axes, sky[hit])
+    # What a pixel sees beside its middle shows in a neighbour; a margin finds what is narrower than a pixel.
+    change = maximum_filter(image, (3, 3, 1)) - minimum_filter(image, (3, 3, 1))
+    edge = np.flatnonzero(maximum_filter(change.max(axis=2), 3) >= least_change)
+    image = image.reshape(-1, 3)
+    steps = np.indices((samples, samples)).reshape(2, -1) + 0.5
+    for part in slices(len(edge), batch_pixels):
+        pixels = edge[part]
+        places_of = [
+            (samples * place[pixels, None] + step).reshape(-1) for place, step in zip((column, row), steps, strict=True)
+        ]
+        found, _, normals, colors = surface.cast(camera.rays(*places_of))
+        light = paper[pixels].repeat(samples**2, 0)
+        light[found] = shade(normals, colors, camera.axes, sky.reshape(-1)[pixels].repeat(samples**2)[found])
+        image[pixels] = light.reshape(len(pixels), -1, 3).mean(axis=1)
+    return image.reshape(*hit.shape, 3)
 
 
 def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:

@@ -89,14 +89,16 @@ class Camera:
         offsets = [s * (high - low) / 2 for (high, low), s in zip(planes, slopes, strict=True)]
         return cls(np.array([*offsets, distance]) @ axes, axes, width, height)
 
-    def rays(self) -> Float:
-        """Origins and unit directions through the pixels' middles, of shape (height, width, 6)."""
-        x = (np.arange(self.width) + 0.5 - self.width / 2) / self.focal
-        y = (self.height / 2 - np.arange(self.height) - 0.5) / self.focal
-        rays = np.empty((self.height, self.width, 6))
-        rays[..., :3] = self.eye
-        rays[..., 3:] = x[None, :, None] * self.axes[0] + y[:, None, None] * self.axes[1] - self.axes[2]
-        rays[..., 3:] /= np.linalg.norm(rays[..., 3:], axis=2, keepdims=True)
+    def rays(self, column: Float, row: Float) -> Float:
+        """Origins and unit directions through places of the picture, of shape (N, 6), as the ray caster takes them.
+
+        `column` and `row`, of shape (N,), count pixels from the upper left corner; pixels' middles are at halves.
+        """
+        x, y = (column - self.width / 2) / self.focal, (self.height / 2 - row) / self.focal
+        ways = x[:, None] * self.axes[0] + y[:, None] * self.axes[1] - self.axes[2]
+        rays = np.empty((len(x), 6), dtype=np.float32)
+        rays[:, :3] = self.eye
+        rays[:, 3:] = ways / np.sqrt(x**2 + y**2 + 1.0)[:, None]
         return rays
 
     def project(self, points: Float) -> tuple[Float, Float, Float]:
@@ -194,6 +196,8 @@ def ambient_occlusion(
 ) -> Float:
     """Share of the sky seen from surface points, as an image, smoothed over about a pixel.
 
+    Neighbouring pixels look in different directions, a quarter of all each, and share what they see by the smoothing.
+
     Parameters
     ----------
     scene : open3d's ray-casting scene of the surface
@@ -205,10 +209,27 @@ def ambient_occlusion(
         How near something must be to cover the sky.
     """
     image = np.zeros(hit.shape)
-    image[hit] = sky_visibility(scene, points, normals, reach, sphere_directions())
+    row, column = np.nonzero(hit)
+    turn = 2 * (row % 2) + column % 2
+    directions = sphere_directions(RenderingParameters.light.sky_directions // 4)
+    image[hit] = _sky_in_turns(scene, points, normals, reach, turn, directions)
     # Averaging over the surface's own pixels alone keeps the outline free of a halo.
     smooth = gaussian_filter(image, 1.2) / np.maximum(gaussian_filter(hit.astype(np.float64), 1.2), 1e-9)
     return np.asarray(smooth)
+
+
+def _sky_in_turns(scene: Any, points: Float, normals: Float, reach: float, turn: Int, directions: Float) -> Float:
+    """Share of the sky that points see in `directions`, turned about at random: equal numbers `turn` by the same turn.
+
+    With the same directions for all, bands would show.
+    """
+    share = np.empty(len(points))
+    # Normal numbers make quaternions of uniformly distributed rotations.
+    rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(int(turn.max(initial=0)) + 1, 4)))
+    for number, rotation in enumerate(rotations):
+        part = np.flatnonzero(turn == number)
+        share[part] = sky_visibility(scene, points[part], normals[part], reach, rotation.apply(directions))
+    return share
 
 
 def sphere_directions(count: int = RenderingParameters.light.sky_directions) -> Float:
@@ -244,19 +265,15 @@ def vertex_ambient_occlusion(
     reach : float, halves of the mesh's longest side
         How near something must be to cover the sky.
     direction_sets : int
-        Rotated sets of directions that vertices take in turn: with the same set for all, bands would show.
+        Rotated sets of directions that vertices take in turn.
     smoothing_passes : int
         Times that a vertex takes the mean of itself and its neighbours, which mixes their directions.
     """
     centre, size = centre_and_size(mesh)
     unit = (mesh.vertices - centre) / size
     scene, normals = ray_scene(unit, mesh.faces), mesh.vertex_normals()
-    share = np.empty(len(unit))
-    # Normal numbers make quaternions of uniformly distributed rotations.
-    rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(direction_sets, 4)))
-    for turn, rotation in enumerate(rotations):
-        part = slice(turn, None, direction_sets)
-        share[part] = sky_visibility(scene, unit[part], normals[part], reach, rotation.apply(sphere_directions()))
+    turn = np.arange(len(unit)) % direction_sets
+    share = _sky_in_turns(scene, unit, normals, reach, turn, sphere_directions())
     start, end = mesh.faces[:, [0, 1, 2]].reshape(-1), mesh.faces[:, [1, 2, 0]].reshape(-1)
     own = np.arange(len(share))
     rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])

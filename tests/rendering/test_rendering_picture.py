@@ -97,10 +97,11 @@ def test_every_view_frames_the_whole_shape(view: object) -> None:
 
 def test_rays_and_projection_are_inverse() -> None:
     camera = Camera.framing(np.random.default_rng(0).normal(size=(50, 3)), "three-quarter", "z", 30, 20)
-    rays = camera.rays()
-    column, row, _ = camera.project((rays[..., :3] + 3.7 * rays[..., 3:]).reshape(-1, 3))
-    assert np.allclose(column.reshape(20, 30), np.arange(30) + 0.5)
-    assert np.allclose(row.reshape(20, 30), np.arange(20)[:, None] + 0.5)
+    down, across = np.indices((20, 30)).reshape(2, -1) + 0.5
+    rays = camera.rays(across, down)
+    column, row, _ = camera.project(rays[:, :3] + 3.7 * rays[:, 3:])
+    assert np.allclose(column, across, atol=1e-4)
+    assert np.allclose(row, down, atol=1e-4)
 
 
 def test_hollows_are_darker_than_the_open() -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gnrecon.export.project import SignedDistance
+from gnrecon.export.project import SignedDistance, sdf_and_gradient
 from gnrecon.export.remeshing.edge_operators import split
 from gnrecon.export.remeshing.edge_table import CreasedSurface, EdgeTable, area_vectors, unit
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -123,12 +123,14 @@ def _crease_points(
 
 
 def newton_feet(points: Float, field: SignedDistance, steps: int = 2) -> tuple[Float, Float]:
-    """Points of shape (N, 3) brought to the zero level by Newton steps, and the field's unit gradients there."""
-    gradient = field.gradient(points)
+    """Points of shape (N, 3) brought to the zero level by Newton steps, and the field's unit gradients before the last.
+
+    The last step is short, so that the gradient changes little along it, and is not evaluated again.
+    """
     for _ in range(steps):
+        value, gradient = sdf_and_gradient(field, points)
         squares = np.maximum(np.einsum("ij,ij->i", gradient, gradient), np.finfo(np.float64).tiny)
-        points = points - (field.sdf(points) / squares)[:, None] * gradient
-        gradient = field.gradient(points)
+        points = points - (value / squares)[:, None] * gradient
     return points, unit(gradient)
 
 
