@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from gnrecon.pipeline import Progress, Reconstruction, reconstruct
     from gnrecon.rendering import render
     from gnrecon.report.html import write_page
-    from gnrecon.report.report import report_schema
+    from gnrecon.report.schema import report_schema
     from gnrecon.solid import Shape, shaped
 
 _ROOMS = {
@@ -93,7 +93,7 @@ _ROOMS = {
     "gnrecon.rendering": ("render",),
     "gnrecon.report.html": ("write_page",),
     "gnrecon.pipeline": ("Progress", "Reconstruction", "reconstruct"),
-    "gnrecon.report.report": ("report_schema",),
+    "gnrecon.report.schema": ("report_schema",),
     "gnrecon.solid": ("Shape", "shaped"),
 }
 

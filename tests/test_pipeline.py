@@ -22,7 +22,7 @@ from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, Reconstruction, reconstruct
 from gnrecon.report.html import page_text
-from gnrecon.report.report import SCHEMA_VERSION
+from gnrecon.report.schema import SCHEMA_VERSION
 from gnrecon.runtime.errors import InputError, MemoryLimitError, MeshError, UsageError
 from gnrecon.runtime.parallel import worker_count
 

@@ -90,6 +90,6 @@ def doctor_command() -> None:
 
 def schema_command() -> None:
     """Print the JSON schema of the report: every field with its meaning and unit."""
-    from gnrecon.report.report import schema_text
+    from gnrecon.report.schema import schema_text
 
     print(schema_text(), end="")

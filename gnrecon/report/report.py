@@ -1,18 +1,14 @@
-"""Records the stages of a run with their times and peak memory, its resources, and the versions of the libraries.
-
-`report.schema.json` in this folder, in JSON Schema 2020-12, gives the meaning and unit of each field of a report.
-"""
+"""Records the stages of a run with their times and peak memory, its resources, and the versions of the libraries."""
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import metadata, resources
+from importlib import metadata
 from typing import Any
 
 import torch
@@ -96,18 +92,3 @@ def versions() -> dict[str, str]:
     for name in ("numpy", "scipy", "torch", "open3d", "scikit-image", "manifold3d", "trimesh"):
         found[name] = metadata.version(name)
     return found
-
-
-SCHEMA_VERSION = "1.0"
-"""Of the report: the first number grows when a field goes or changes its meaning, the second when one is added."""
-
-
-def schema_text() -> str:
-    """Return the schema as the text of a JSON file."""
-    return (resources.files("gnrecon.report") / "report.schema.json").read_text(encoding="utf-8")
-
-
-def report_schema() -> dict[str, Any]:
-    """Return the JSON schema of `Reconstruction.report`, which ``--report`` writes."""
-    schema: dict[str, Any] = json.loads(schema_text())
-    return schema

@@ -17,7 +17,8 @@ from gnrecon.ingest import IngestCounts, Layers, Survey, guess_units
 from gnrecon.io import Reading
 from gnrecon.optim import Solution
 from gnrecon.options import Options
-from gnrecon.report.report import SCHEMA_VERSION, Stages, plain, versions
+from gnrecon.report.report import Stages, plain, versions
+from gnrecon.report.schema import SCHEMA_VERSION
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from gnrecon.batch.runner import locked_output_folder, run_batch
 from gnrecon.cli.app import main
 from gnrecon.config import Settings, read_settings
 from gnrecon.export import verify_file
-from gnrecon.report.report import report_schema
+from gnrecon.report.schema import report_schema
 from gnrecon.runtime.errors import ExitCode, InputError, OutputError, UsageError
 from gnrecon.runtime.files import sync
 from gnrecon.runtime.interrupts import polite_ends

@@ -96,14 +96,15 @@ def test_files_that_cannot_be_read(tmp_path: Path, command: CommandLine) -> None
     command.refuses(ExitCode.USAGE, "Missing argument", "check")
 
 
-def test_a_check_loads_no_torch_and_no_open3d(tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", [["check", "cube.obj", "--json"], ["schema"]])
+def test_a_light_command_loads_no_torch_and_no_open3d(tmp_path: Path, command: list[str]) -> None:
     write_mesh(cube(), tmp_path / "cube.obj")
     code = (
         "import sys\n"
         "from gnrecon.cli.app import main\n"
-        "try:\n    main(['check', sys.argv[1], '--json'])\n"
+        "try:\n    main(sys.argv[1:])\n"
         "except SystemExit as end:\n    assert not end.code\n"
         "assert not {'torch', 'open3d', 'skimage'} & set(sys.modules), 'heavy'\n"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "cube.obj")], capture_output=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code, *command], cwd=tmp_path, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -12,7 +12,7 @@ from made_shapes import sphere
 from scan_files import write_scan
 
 from gnrecon.cli.app import main
-from gnrecon.report.report import report_schema
+from gnrecon.report.schema import report_schema
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: object) -> str:

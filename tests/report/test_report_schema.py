@@ -20,7 +20,7 @@ from gnrecon.ingest import IngestCounts
 from gnrecon.optim import Record
 from gnrecon.options import Options
 from gnrecon.pipeline import Progress, reconstruct
-from gnrecon.report.report import SCHEMA_VERSION, report_schema
+from gnrecon.report.schema import SCHEMA_VERSION, report_schema
 
 Report = dict[str, Any]
 

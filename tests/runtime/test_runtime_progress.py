@@ -17,7 +17,7 @@ from gnrecon.cli.app import main
 from gnrecon.geometry.point_cloud import PointCloud
 from gnrecon.optim import Record
 from gnrecon.pipeline import Progress, reconstruct
-from gnrecon.report.report import report_schema
+from gnrecon.report.schema import report_schema
 from gnrecon.report.time_left import TimeLeft
 from gnrecon.run import STAGES, ConsoleProgress
 from gnrecon.runtime.errors import Cancelled, ExitCode
