@@ -76,14 +76,14 @@ def test_a_developable_can_is_whole_again(monkeypatch: pytest.MonkeyPatch) -> No
         assert np.abs(Can().distance(elsewhere)).mean() < 0.01
         return float(np.sqrt(np.mean(Can().distance(hole) ** 2)))
 
-    developable = [off(seed, prior="developable") for seed in range(2)]
-    monkeypatch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
-    monkeypatch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
-    monkeypatch.setattr(sharp, "resample_primitives", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
-    smooth = off()
+    with monkeypatch.context() as patch:
+        patch.setattr(sharp, "complete_holes", lambda *_: HoleCompletion.none())
+        patch.setattr(adaptive, "complete_holes", lambda *_: HoleCompletion.none())
+        patch.setattr(sharp, "resample_primitives", lambda *_: (np.zeros((0, 3)), np.zeros((0, 3))))
+        smooth = off()
     assert smooth > 0.01
     # One fit in some ends in a worse minimum, and which one depends on the order of sums.
-    assert min(developable) < 0.4 * smooth
+    assert any(off(seed, prior="developable") < 0.4 * smooth for seed in range(2))
 
 
 def test_strain_smooths() -> None:

@@ -238,9 +238,10 @@ def test_runs_after_the_last_are_asked_to_end() -> None:
     both, ended = Barrier(2), []
 
     def run(number: int) -> int:
-        both.wait(20)
+        if number < 2:
+            both.wait(20)
         deadline = time.monotonic() + 20
-        while number == 1 and time.monotonic() < deadline:
+        while number > 0 and time.monotonic() < deadline:
             try:
                 end_if_asked()
             except KeyboardInterrupt:
@@ -251,7 +252,7 @@ def test_runs_after_the_last_are_asked_to_end() -> None:
 
     with fixed_sums(2):
         assert run_in_threads(run, [0, 1, 2], is_last=lambda _: True) == [0]
-    assert ended == [1]
+    assert 1 in ended, "the third may have begun, and ends too"
 
 
 def test_an_interrupt_of_the_caller_ends_the_runs_with_what_they_have() -> None:
