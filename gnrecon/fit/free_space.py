@@ -19,8 +19,9 @@ from torch import Tensor
 
 from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Detail
+from gnrecon.field.random_features import Features
 from gnrecon.fit.parameters import FreeSpaceParameters
-from gnrecon.geometry.arrays import Float
+from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding, winding_number
 
@@ -91,13 +92,64 @@ class Volume:
         return self.points, self.wanted, self.lower, self.upper, self.zero, self.distance
 
 
-class _Samples(NamedTuple):
-    """Places, of shape (Q, 3), with the distance of the nearest point, its disk's radius and the winding number."""
+@dataclass(frozen=True)
+class CubeLattice:
+    """The nodes of a cubic lattice in a cube, in blocks: at `offsets`, of shape (K, 3), from `corners`, (C, 3).
 
+    Corners are relative to the cube's centre. A sum of sines at all nodes takes the sines of corners and offsets alone,
+    see `Stencil`.
+    """
+
+    center: Float
+    corners: Float
+    offsets: Float
+
+    @classmethod
+    def of(cls, center: Float, reach: float, step: float, shift: Float, *, block: int = 4) -> CubeLattice:
+        """Return nodes at most `step` apart, in a cube of half an edge `reach`; `shift`, of shape (3,), is in steps."""
+        blocks = math.ceil(2 * reach / step / block)
+        step = 2 * reach / (blocks * block)
+        corners, offsets = (
+            np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
+            for count in (blocks, block)
+        )
+        return cls(center, step * (block * corners + shift) - reach, step * offsets)
+
+    def nodes(self) -> Float:
+        """Return all nodes, of shape (C K, 3), block by block."""
+        return self.center + (self.corners[:, None] + self.offsets).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class LatticeVolume:
+    """Samples at some nodes of a lattice, of shape (Q,) as rows of `nodes`."""
+
+    volume: Volume
+    lattice: CubeLattice
+    rows: Int
+
+    def sums(self, features: Features, length: float) -> Callable[[Tensor], Tensor]:
+        """Return the function from amplitudes, (m,), to sums of features of a length about the centre, (Q,)."""
+        stencil = features.stencil(self.lattice.offsets / length)
+        corners = torch.as_tensor(self.lattice.corners, device=features.phases.device)
+        phases = features.phase(corners, torch.zeros_like(corners[0]), length)
+        rows = torch.as_tensor(self.rows, device=phases.device)
+        return lambda amplitudes: stencil.sums(phases, amplitudes.to(phases)).flatten()[rows]
+
+
+class _Samples(NamedTuple):
+    """Places, of shape (Q, 3), their rows, the nearest point's distance, its disk's radius, and the winding number."""
+
+    rows: Int
     places: Float
     distance: Float
     disks: Float
     winding: Float
+
+    def take(self, some: Mask) -> _Samples:
+        """Return some of the samples."""
+        rows, *values = self
+        return _Samples(rows[some], *(value[some] for value in values))
 
 
 @dataclass(frozen=True)
@@ -134,10 +186,12 @@ class CubeSpace:
         """Return samples of the whole cube that lie clear of the data."""
         limits = self.parameters
         x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (limits.volume_samples, 3))
-        return self._volume(self._clear(x, limits.clearance_disk_radii, 0.0), self.theta, limits.sign_bound_share)
+        samples = self._clear(x, limits.clearance_disk_radii, 0.0)
+        own = self.network.value(self.theta, torch.as_tensor(samples.places).to(self.theta))
+        return self._volume(samples, own, limits.sign_bound_share)
 
-    def near(self, length: float, noise: float) -> Volume:
-        """Return samples all over the space about the data where the sign is certain, one in each cell of a lattice.
+    def near(self, length: float, noise: float) -> LatticeVolume:
+        """Return samples all over the space about the data where the sign is certain, at the nodes of a lattice.
 
         Samples drawn at random would miss most warts, which are no larger than the length of the features.
 
@@ -147,14 +201,16 @@ class CubeSpace:
         noise : standard deviation of the points' positions
         """
         limits = self.parameters
-        count = math.ceil(2 * self.reach / (limits.near_step_lengths * length))
-        cells = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
-        x = self.center + self.reach * (2.0 * (cells + self.rng.random(cells.shape)) / count - 1.0)
+        lattice = CubeLattice.of(self.center, self.reach, limits.near_step_lengths * length, self.rng.random(3))
         clear = limits.near_clearance_noises * noise
-        samples = self._clear(x, limits.near_clearance_disk_radii, clear, limits.near_reach_lengths * length + clear)
-        certain = _Samples(*(values[is_sign_certain(samples.winding)] for values in samples))
+        most = limits.near_reach_lengths * length + clear
+        samples = self._clear(lattice.nodes(), limits.near_clearance_disk_radii, clear, most)
+        certain = samples.take(is_sign_certain(samples.winding))
         # Bounds are wide, so that single precision is enough for the field.
-        return self._volume(certain, self.theta.float(), limits.near_bound_share)
+        theta = self.theta.float()
+        corners, offsets = (torch.as_tensor(x).to(theta) for x in (self.center + lattice.corners, lattice.offsets))
+        own = self.network.around(theta, offsets)(corners).flatten()[certain.rows]
+        return LatticeVolume(self._volume(certain, own, limits.near_bound_share), lattice, certain.rows)
 
     @cached_property
     def _seen_dipoles(self) -> tuple[Float, Float, Float]:
@@ -163,28 +219,28 @@ class CubeSpace:
         return places - self.center, moments, radii
 
     def _clear(self, x: Float, clear_disks: float, clear: float, most: float = np.inf) -> _Samples:
-        """Return the places, of shape (Q, 3), that are far enough from the data, and nearer to it than `most`.
+        """Return those of the places, of shape (Q, 3), that are far enough from the data, and nearer to it than `most`.
 
         Far enough is so many radii of the data's disks, plus a length.
         """
-        x = x[((x > self.box.lower) & (x < self.box.upper)).all(axis=1)]
-        distance, nearest = self.tree.query(x, distance_upper_bound=most)
+        rows = np.flatnonzero(((x > self.box.lower) & (x < self.box.upper)).all(axis=1))
+        distance, nearest = self.tree.query(x[rows], distance_upper_bound=most)
         # A place with no point within that distance has a row beyond the last.
         found = np.isfinite(distance)
-        x, distance, disks = x[found], distance[found], self.disks[nearest[found]]
+        rows, distance, disks = rows[found], distance[found], self.disks[nearest[found]]
         kept = distance > clear_disks * disks + clear
-        x, distance, disks = x[kept], distance[kept], disks[kept]
-        winding = winding_number(x - self.center, *self._seen_dipoles, dtype=torch.float32)
-        return _Samples(x, distance, disks, self.dipoles.sides.centred(winding, distance))
+        rows, distance, disks = rows[kept], distance[kept], disks[kept]
+        winding = winding_number(x[rows] - self.center, *self._seen_dipoles, dtype=torch.float32)
+        return _Samples(rows, x[rows], distance, disks, self.dipoles.sides.centred(winding, distance))
 
-    def _volume(self, samples: _Samples, theta: Tensor, bound_share: float) -> Volume:
-        """Return what is known at the samples; `theta` of the global field has the precision that is needed."""
-        x, distance, disks, winding = samples
+    def _volume(self, samples: _Samples, own: Tensor, bound_share: float) -> Volume:
+        """Return what is known at the samples, where the global field is `own`, of shape (Q,)."""
+        _, x, distance, disks, winding = samples
         # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
         signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
         if self.signed_by is not None:
             signed = self.signed_by(x, signed)
-        value = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
+        value = own.double().cpu().numpy()
         if self.coarser is not None:
             value += self.coarser.value(x)
         return Volume.around(x, value, signed, winding, distance, bound_share, parameters=self.parameters)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.free_space import Volume
+from gnrecon.fit.free_space import LatticeVolume
 from gnrecon.fit.parameters import LocalSolveParameters
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram_and_product
@@ -190,16 +190,16 @@ class PatchSystem:
         self,
         position: float,
         angle: float,
-        near: Volume | None = None,
+        near: LatticeVolume | None = None,
         *,
         parameters: LocalSolveParameters = LocalSolveParameters(),
     ) -> Tensor:
         """Return amplitudes, of shape (m,), as `solve` does, after which c keeps its bounds at nearly all samples.
 
         A one-sided penalty by an active set: where the corrected field has the wrong sign, or far from the data less
-        than half of its bound, a row with the bound as target is added, heavier in each pass. The others stay. Samples
-        within a length of each other say the same, as the features hardly vary there, and weigh as one together: else
-        the many of a gap in the data would outweigh its points, or the few of a wart would not suffice.
+        than half of its bound, a row with the bound as target is added, heavier in each pass. Samples within a length
+        of each other say the same and weigh as one together: else the many of a gap in the data would outweigh its
+        points, or the few of a wart would not suffice.
 
         Parameters
         ----------
@@ -207,28 +207,28 @@ class PatchSystem:
         near : samples near the data, of which the bounds alone are used
         """
         amplitudes, patch = self.solve(position, angle), self._patch
-        places, sines, distance = patch.volume, self._sines, patch.distance
-        lower, upper = patch.lower, patch.upper
+        places, distance, lower, upper = patch.volume, patch.distance, patch.lower, patch.upper
         least, most = (lower + patch.zero) / 2, (upper + patch.zero) / 2
         if near is not None:
-            points, _, low, high, zero, off = (torch.as_tensor(values).to(patch.value) for values in near.rows())
+            sums_near = near.sums(self._free, self._length)
+            points, _, low, high, zero, off = (torch.as_tensor(values).to(patch.value) for values in near.volume.rows())
             places, distance = torch.cat([places, points]), torch.cat([distance, off])
-            sines = torch.cat([sines, self._free.phase(points, patch.center, self._length).sin()])
             lower, upper = torch.cat([lower, low]), torch.cat([upper, high])
             least = torch.cat([least, torch.where(low.isfinite(), zero, low)])
             most = torch.cat([most, torch.where(high.isfinite(), zero, high)])
         share = parameters.bound_deviation_share
         for _ in range(parameters.bound_passes):
-            value = (sines @ amplitudes.to(sines)).to(lower)
+            value = self._sines @ amplitudes.to(self._sines)
+            value = (value if near is None else torch.cat([value, sums_near(amplitudes)])).to(lower)
             low, high = value < least, value > most
-            beyond = low | high
-            if not beyond.any():
+            if not (beyond := low | high).any():
                 break
             deviation = share * distance[beyond] * _crowd(places[beyond], self._length).sqrt()
-            rows = sines[beyond] / deviation[:, None].to(sines)
+            rows = self._free.phase(places[beyond], patch.center, self._length).sin_()
+            rows /= deviation[:, None].to(rows)
             wanted = torch.where(low, lower, upper)[beyond] / deviation
-            product, right = self._volume
-            self._volume = product.add_(rows.T @ rows), right.add_(rows.T @ wanted.to(rows))
+            self._volume[0].add_(rows.T @ rows)
+            self._volume[1].add_(rows.T @ wanted.to(rows))
             amplitudes = self.solve(position, angle)
             share *= parameters.bound_tightening
         return amplitudes

@@ -59,7 +59,7 @@ class FreeSpaceParameters:
 
     volume_samples: int = 400  # of a whole cube
     clearance_disk_radii: float = 3.5  # their least distance from the data: nearer, the coarse distance is none
-    near_step_lengths: float = 1 / 3  # of the lattice about the data on which wrong signs are looked for
+    near_step_lengths: float = 0.41  # of the lattice about the data on which wrong signs are looked for
     near_reach_lengths: float = 1.5  # from the noisy data to its farthest samples; beyond, corrections have faded
     near_clearance_disk_radii: float = 1.0  # their least distance; nearer, points do not tell the side
     near_clearance_noises: float = 3.0  # and so many standard deviations of the points' noise more

@@ -139,7 +139,7 @@ class _Surface:
         if "colors" in mesh.attributes:
             self._colors = to_linear(as_bytes(mesh.attributes["colors"])[:, :3]).astype(np.float32)
 
-    def cast(self, rays: Float) -> tuple[Mask, Float, Float, Float]:
+    def cast(self, rays: npt.NDArray[np.float32]) -> tuple[Mask, Float, Float, Float]:
         """Which rays, (N, 6), hit, and of the M that do the places, unit normals and colours, (M, 3), or one colour."""
         from open3d import core
 
@@ -170,7 +170,7 @@ def _draw_mesh(
     """
     surface = _Surface(mesh, color)
     image = _pixels(_background(camera), samples)
-    row, column = np.indices(image.shape[:2]).reshape(2, -1)
+    row, column = np.indices(image.shape[:2], dtype=np.float64).reshape(2, -1)
     found, places, normals, colors = surface.cast(camera.rays(samples * (column + 0.5), samples * (row + 0.5)))
     hit = found.reshape(image.shape[:2])
     sky = ambient_occlusion(surface.scene, places, normals, hit)

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
@@ -89,7 +90,7 @@ class Camera:
         offsets = [s * (high - low) / 2 for (high, low), s in zip(planes, slopes, strict=True)]
         return cls(np.array([*offsets, distance]) @ axes, axes, width, height)
 
-    def rays(self, column: Float, row: Float) -> Float:
+    def rays(self, column: Float, row: Float) -> npt.NDArray[np.float32]:
         """Origins and unit directions through places of the picture, of shape (N, 6), as the ray caster takes them.
 
         `column` and `row`, of shape (N,), count pixels from the upper left corner; pixels' middles are at halves.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.free_space import Volume
+from gnrecon.fit.free_space import CubeLattice, LatticeVolume, Volume
 from gnrecon.fit.local_solve import LocalRowSystem, Patch, PatchSystem, patch_system
 from gnrecon.fit.parameters import LocalSolveParameters
 
@@ -166,12 +166,20 @@ def test_a_sample_at_half_of_its_bound_is_left_alone(patch: Patch, features: Fea
         assert bool((system.solve_with_bounds(POSITION, ANGLE) != before).any()) == moved
 
 
+def at_nodes(patch: Patch, samples: Volume) -> LatticeVolume:
+    """Samples at all nodes of a lattice, each in a block of its own."""
+    center = patch.center.numpy()
+    return LatticeVolume(
+        samples, CubeLattice(center, samples.points - center, np.zeros((1, 3))), np.arange(len(samples.points))
+    )
+
+
 def test_samples_near_the_data_keep_their_bounds_too(patch: Patch, features: Features) -> None:
     free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
     system, loose = PatchSystem(free, features, LENGTH, patch.size), (1.0, 10.0)
     # Samples at which the corrected field must be at least 1 and is 0 where the correction is 0.5.
     points, ones = np.random.default_rng(0).standard_normal((30, 3)), np.ones(30)
-    near = Volume(points, ones, ones, np.inf * ones, 0.5 * ones, ones)
+    near = at_nodes(patch, Volume(points, ones, ones, np.inf * ones, 0.5 * ones, ones))
 
     def wrong(amplitudes: Tensor) -> int:
         return int((rows(features, torch.as_tensor(points), patch.center)[0] @ amplitudes < 0.5).sum())
@@ -187,14 +195,14 @@ def test_near_the_data_a_right_sign_is_enough(patch: Patch, features: Features) 
     before = system.solve(POSITION, ANGLE)
     value = (rows(features, patch.points[:4], patch.center)[0] @ before).numpy()
     for zero, moved in ((value - 0.01, False), (value + 0.01, True)):
-        near = Volume(points, ones, zero + 1.0, np.inf * ones, zero, ones)
+        near = at_nodes(patch, Volume(points, ones, zero + 1.0, np.inf * ones, zero, ones))
         assert bool((system.solve_with_bounds(POSITION, ANGLE, near) != before).any()) == moved
 
 
 def test_samples_that_stay_beyond_their_bounds_weigh_more_from_pass_to_pass(patch: Patch, features: Features) -> None:
     free = replace(patch, lower=torch.full((8,), -100.0).double(), upper=torch.full((8,), 100.0).double())
     ones = np.ones(4)
-    near = Volume(patch.points[:4].numpy(), ones, ones, np.inf * ones, 0.5 * ones, ones)
+    near = at_nodes(patch, Volume(patch.points[:4].numpy(), ones, ones, np.inf * ones, 0.5 * ones, ones))
 
     def misfit(**changed: float) -> float:
         """How far the correction is from the bounds where the data contradicts them."""
@@ -214,7 +222,7 @@ def test_samples_that_say_the_same_weigh_as_one(patch: Patch, features: Features
 
     def found(*places: np.ndarray) -> Tensor:
         points, ones = np.concatenate(places), np.ones(len(places))
-        samples = Volume(points, ones, 5 * ones, np.inf * ones, 5 * ones, ones)
+        samples = at_nodes(patch, Volume(points, ones, 5 * ones, np.inf * ones, 5 * ones, ones))
         once = replace(LocalSolveParameters(), bound_passes=1)
         return PatchSystem(free, features, LENGTH, patch.size).solve_with_bounds(1e-3, ANGLE, samples, parameters=once)
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.free_space import Volume
+from gnrecon.fit.free_space import LatticeVolume
 from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters, SingleNetworkParameters
@@ -163,7 +163,7 @@ class SurfacePenalties:
         reach: float,
         hyperparameters: Hyperparameters,
         system: PatchSystem,
-        near: Volume | None = None,
+        near: LatticeVolume | None = None,
         *,
         parameters: PenaltyFitParameters = PenaltyFitParameters(),
     ) -> Tensor:
