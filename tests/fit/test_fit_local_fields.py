@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from gnrecon.field.random_features import Features
-from gnrecon.fit.free_space import Volume
+from gnrecon.fit.free_space import CubeLattice, LatticeVolume, Volume
 from gnrecon.fit.local_fields import solve_cube
 from gnrecon.fit.local_solve import Hyperparameters
 from gnrecon.fit.model_selection import FieldResiduals
@@ -26,8 +26,8 @@ class NoSpace:
     def far(self) -> Volume:
         return Volume.none()
 
-    def near(self, *_: float) -> Volume:
-        return Volume.none()
+    def near(self, *_: float) -> LatticeVolume:
+        return LatticeVolume(Volume.none(), CubeLattice(*np.zeros((3, 1, 3))), np.zeros(0, dtype=np.int64))
 
 
 def sheet(wavelength: float, rng: np.random.Generator) -> FieldResiduals:
