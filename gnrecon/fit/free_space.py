@@ -110,7 +110,7 @@ class CubeLattice:
         blocks = math.ceil(2 * reach / step / block)
         step = 2 * reach / (blocks * block)
         corners, offsets = (
-            np.stack(np.meshgrid(*3 * [np.arange(count)], indexing="ij"), axis=-1).reshape(-1, 3)
+            np.stack(np.meshgrid(*3 * [np.arange(float(count))], indexing="ij"), axis=-1).reshape(-1, 3)
             for count in (blocks, block)
         )
         return cls(center, step * (block * corners + shift) - reach, step * offsets)

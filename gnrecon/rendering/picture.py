@@ -1,7 +1,7 @@
 """Pictures of meshes and scans by ray casting, so that no display and no graphics card is needed.
 
-A pixel is the mean of nine samples, one of a surface that looks the same all about is a single one. Surfaces are shaded
-by interpolated vertex normals, points as small balls. The entries are `render` and `render_sheet`.
+A pixel is the mean of nine samples, or a single one where its neighbours look the same. Surfaces are shaded by
+interpolated vertex normals, points as small balls. The entries are `render` and `render_sheet`.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from analytic_fields import UTM, Field, Function, ball_mesh, sphere, union
 from gnrecon.export import extract, project
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.rendering import render, render_sheet
+from gnrecon.rendering import picture, render, render_sheet
 from gnrecon.rendering.rays import VIEWS, Camera
 from gnrecon.rendering.rendering_parameters import SheetParameters
 from gnrecon.runtime.errors import OutputError, UsageError
@@ -110,6 +111,23 @@ def test_hollows_are_darker_than_the_open() -> None:
     mesh = project(extract(field, resolution=48), field)
     image = render(mesh, size=(180, 90), views=[(0, 0)]).astype(int).sum(axis=2)
     assert image[45, 78] < image[45, 20] - 60
+
+
+def test_pixels_of_one_sample_look_as_those_of_nine(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = Field(union(sphere(0.4, (-0.42, 0, 0)), box((0.5, 0.1, 0.6), (0.3, 0, 0))), reach=1.0)
+    mesh = project(extract(field, resolution=48), field)
+    casts: list[int] = []
+    rays = Camera.rays
+    monkeypatch.setattr(Camera, "rays", lambda self, *places: casts.append(len(places[0])) or rays(self, *places))
+    image = render(mesh, size=(240, 180)).astype(int)
+    fast = sum(casts)
+    casts.clear()
+    monkeypatch.setattr(picture, "_draw_mesh", partial(picture._draw_mesh, least_change=0.0))
+    exact = render(mesh, size=(240, 180)).astype(int)
+    assert sum(casts) == 10 * 240 * 180 > 2 * fast
+    off = np.abs(image - exact).max(axis=2)
+    assert off.max() < 12
+    assert off.mean() < 0.5
 
 
 def test_points_without_normals_fade_with_depth() -> None:
