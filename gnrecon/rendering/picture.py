@@ -176,7 +176,7 @@ def _draw_mesh(
     sky = ambient_occlusion(surface.scene, places, normals, hit)
     paper = image.reshape(-1, 3).copy()
     image[hit] = shade(normals, colors, camera.axes, sky[hit])
-    # What a pixel sees beside its middle shows in a neighbour; a margin finds what is narrower than a pixel.
+    # What a pixel has outside of its middle shows in a neighbour; a margin finds what is narrower than a pixel.
     change = maximum_filter(image, (3, 3, 1)) - minimum_filter(image, (3, 3, 1))
     edge = np.flatnonzero(maximum_filter(change.max(axis=2), 3) >= least_change)
     image = image.reshape(-1, 3)
