@@ -103,11 +103,11 @@ def _draw_panels(
         if isinstance(part, Mesh):
             strips.append(_draw_mesh(part.with_vertices(unit), camera, colors[0]))
         else:
-            strips.append(_pixels(_draw_cloud(PointCloud(unit, part.normals), camera, colors[1]), samples))
+            strips.append(_draw_cloud(PointCloud(unit, part.normals), camera, colors[1]))
     return strips
 
 
-def _pixels(light: Float, samples: int) -> Float:
+def _pixels(light: Float, samples: int = RenderingParameters.supersampling) -> Float:
     """Means over the samples, `samples` along each side of a pixel, of an image of light of shape (H, W, 3)."""
     height, width = light.shape[0] // samples, light.shape[1] // samples
     return np.asarray(light.reshape(height, samples, width, samples, 3).mean(axis=(1, 3)))
@@ -139,11 +139,11 @@ class _Surface:
         if "colors" in mesh.attributes:
             self._colors = to_linear(as_bytes(mesh.attributes["colors"])[:, :3]).astype(np.float32)
 
-    def cast(self, rays: npt.NDArray[np.float32]) -> tuple[Mask, Float, Float, Float]:
+    def cast(self, rays: Float) -> tuple[Mask, Float, Float, Float]:
         """Which rays, (N, 6), hit, and of the M that do the places, unit normals and colours, (M, 3), or one colour."""
         from open3d import core
 
-        answer = self.scene.cast_rays(core.Tensor.from_numpy(rays))
+        answer = self.scene.cast_rays(core.Tensor.from_numpy(rays.astype(np.float32)))
         distance = answer["t_hit"].numpy()
         hit = np.isfinite(distance)
         corners = self.faces[answer["primitive_ids"].numpy()[hit]]
@@ -183,10 +183,10 @@ def _draw_mesh(
     steps = np.indices((samples, samples)).reshape(2, -1) + 0.5
     for part in slices(len(edge), batch_pixels):
         pixels = edge[part]
-        places_of = [
-            (samples * place[pixels, None] + step).reshape(-1) for place, step in zip((column, row), steps, strict=True)
-        ]
-        found, _, normals, colors = surface.cast(camera.rays(*places_of))
+        across, down = (
+            samples * places[pixels, None] + step for places, step in zip((column, row), steps, strict=True)
+        )
+        found, _, normals, colors = surface.cast(camera.rays(across.ravel(), down.ravel()))
         light = paper[pixels].repeat(samples**2, 0)
         light[found] = shade(normals, colors, camera.axes, sky.reshape(-1)[pixels].repeat(samples**2)[found])
         image[pixels] = light.reshape(len(pixels), -1, 3).mean(axis=1)
@@ -203,7 +203,7 @@ def _draw_cloud(cloud: PointCloud, camera: Camera, color: Float) -> Float:
     normals = cloud.normals if cloud.has_directions else None
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    return draw_points(cloud.points, normals, min(0.55 * spacing, 0.02), camera, color, _background(camera))
+    return _pixels(draw_points(cloud.points, normals, min(0.55 * spacing, 0.02), camera, color, _background(camera)))
 
 
 def write_image(image: Image, path: Path) -> None:

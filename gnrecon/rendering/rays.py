@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
@@ -90,14 +89,14 @@ class Camera:
         offsets = [s * (high - low) / 2 for (high, low), s in zip(planes, slopes, strict=True)]
         return cls(np.array([*offsets, distance]) @ axes, axes, width, height)
 
-    def rays(self, column: Float, row: Float) -> npt.NDArray[np.float32]:
-        """Origins and unit directions through places of the picture, of shape (N, 6), as the ray caster takes them.
+    def rays(self, column: Float, row: Float) -> Float:
+        """Origins and unit directions through places of the picture, of shape (N, 6).
 
         `column` and `row`, of shape (N,), count pixels from the upper left corner; pixels' middles are at halves.
         """
         x, y = (column - self.width / 2) / self.focal, (self.height / 2 - row) / self.focal
         ways = x[:, None] * self.axes[0] + y[:, None] * self.axes[1] - self.axes[2]
-        rays = np.empty((len(x), 6), dtype=np.float32)
+        rays = np.empty((len(x), 6))
         rays[:, :3] = self.eye
         rays[:, 3:] = ways / np.sqrt(x**2 + y**2 + 1.0)[:, None]
         return rays

@@ -101,8 +101,8 @@ def test_rays_and_projection_are_inverse() -> None:
     down, across = np.indices((20, 30)).reshape(2, -1) + 0.5
     rays = camera.rays(across, down)
     column, row, _ = camera.project(rays[:, :3] + 3.7 * rays[:, 3:])
-    assert np.allclose(column, across, atol=1e-4)
-    assert np.allclose(row, down, atol=1e-4)
+    assert np.allclose(column, across)
+    assert np.allclose(row, down)
 
 
 def test_hollows_are_darker_than_the_open() -> None:
