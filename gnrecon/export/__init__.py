@@ -1,7 +1,6 @@
 """From a field to a verified mesh: extract, project, refine, repair, cut, verify, measure, draw, and attributes."""
 
 from gnrecon.export.attributes import Attribute, Neighbourhood, distances_between_points, transfer_attributes
-from gnrecon.export.curvature import curvatures, interpolate_from_samples
 from gnrecon.export.handles import remove_handles
 from gnrecon.export.marching_cubes import extract
 from gnrecon.export.mesh_statistics import MeshQuality, quality
@@ -14,6 +13,7 @@ from gnrecon.export.remeshing.sharpen import sharpen
 from gnrecon.export.repair import drop_stray_components, remove_stray, repair
 from gnrecon.export.trim import Trimming, UnsupportedArea, same_side_distances, trim, unsupported_area
 from gnrecon.export.verify import Findings, MeshFacts, examine, require_bordered, require_sound, verify, verify_file
+from gnrecon.geometry.curvature import curvatures, interpolate_from_samples
 
 __all__ = [
     "DISTANCES",

@@ -26,9 +26,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gnrecon.export.attributes import distances_between_points
-from gnrecon.export.curvature import diffuse, vertex_areas
 from gnrecon.export.export_parameters import ExportParameters, TrimParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.curvature import diffuse, vertex_areas
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import UsageError
 

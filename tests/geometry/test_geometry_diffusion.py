@@ -7,7 +7,7 @@ import pytest
 from analytic_fields import Field, sphere
 
 from gnrecon.export import extract
-from gnrecon.export.curvature import diffuse, vertex_areas
+from gnrecon.geometry.curvature import diffuse, vertex_areas
 from gnrecon.geometry.mesh import Mesh
 
 RADIUS = 0.8
