@@ -1,11 +1,12 @@
 """Boolean operations on solids by manifold3d, and the conversions to it and to pymeshlab.
 
 Unlike a surface extracted from the intersection of fields, the result keeps the vertices of the solids, its cuts are
-flat, and its rims are sharp. The entries are `crop` and `subtract`.
+flat, and its rims are sharp. The entries are `crop`, `subtract` and `unite`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,24 @@ def subtract(outer: Mesh, inner: Mesh) -> Mesh:
         np.concatenate([outer.vertex_normals(), -inner.vertex_normals()]),
     )
     return with_nearest_normals(rest, walls)
+
+
+def unite(mesh: Mesh, hulls: Sequence[Float]) -> Mesh:
+    """Return the union of a solid and the convex hulls of points, each of shape (N, 3); all in file units.
+
+    Raises
+    ------
+    MeshError
+        When manifold3d fails.
+    """
+    manifold3d = import_uninterrupted("manifold3d")
+
+    centre, size = centre_and_size(mesh)
+    parts = [manifold3d.Manifold.hull_points((points - centre) / size) for points in hulls]
+    whole = _mesh_of(
+        manifold3d.Manifold.batch_boolean([to_solid(mesh, merge=False), *parts], manifold3d.OpType.Add), mesh
+    )
+    return mesh if whole is None else with_nearest_normals(whole, mesh)
 
 
 def _mesh_of(solid: object, like: Mesh) -> Mesh | None:

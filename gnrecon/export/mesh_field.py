@@ -15,7 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, remove_stray, repair
+from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, repair
+from gnrecon.export.components import bridge, supported_components
 from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.remeshing.refine import RefineOptions
 from gnrecon.export.resolution import (
@@ -235,7 +236,7 @@ def mesh_field(
     """
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
-        mesh, fast, cells, dropped = _extract_until_accurate(field, options, data, box, advance, parameters)
+        mesh, fast, cells, dropped, gaps = _extract_until_accurate(field, options, data, box, advance, parameters)
     # The first Newton step brings nearly all vertices so near to the zero level that it is no matter next to the faces.
     with stages("project"):
         tolerance = parameters.resolution.projection_tolerance
@@ -252,12 +253,14 @@ def mesh_field(
             mesh, refined = refine(mesh, field, options.refine, advance=advance, parameters=parameters.remesh)
     with stages("repair"):
         mesh, repaired = repair(mesh)
+        # After the last Newton step, which would move a bridge to where the field is zero.
+        mesh, bridged = (mesh, []) if data is None else bridge(mesh, gaps, data)
         cut: list[str] = []
         if data is not None and not options.keep_handles:
             mesh, cut = remove_handles(mesh, data, parameters=parameters.handles, known_sound=True)
         fineness = measure_fineness(mesh, exact, cells, box, parameters=parameters.resolution)
     sentences = _resolution_sentences(fineness, options, parameters.resolution.most_refined_cells)
-    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *cut, *sentences])
+    return Meshed(mesh, fineness, [*dropped, *refined, *repaired, *bridged, *cut, *sentences])
 
 
 def _extract_until_accurate(
@@ -267,10 +270,11 @@ def _extract_until_accurate(
     box: Float,
     advance: ProgressCallback,
     parameters: ExportParameters,
-) -> tuple[Mesh, SignedDistance, int, list[str]]:
+) -> tuple[Mesh, SignedDistance, int, list[str], Float]:
     """Extract, and again with more cells until the error is small enough.
 
-    Returns the mesh, the field that was precise enough for it, the cells, and sentences on dropped components.
+    Returns the mesh, the field that was precise enough for it, the cells, sentences on dropped components, and the gaps
+    that the field does not show, of shape (B, 2, 3).
     """
     cells, begin, most_cells = options.cells(box), 0.0, parameters.resolution.most_refined_cells
     while True:
@@ -286,13 +290,16 @@ def _extract_until_accurate(
             parameters=parameters.extraction,
         )
         # Before the error is measured, so that ghost sheets do not count.
-        mesh, dropped = (mesh, []) if data is None else remove_stray(mesh, data)
+        gaps = np.empty((0, 2, 3))
+        dropped: list[str] = []
+        if data is not None:
+            mesh, dropped, gaps = supported_components(mesh, data, fast)
         if options.max_error is None or cells >= most_cells:
-            return mesh, fast, cells, dropped
+            return mesh, fast, cells, dropped, gaps
         error = projected_chord_error(mesh, field, cells, box, parameters=parameters.resolution)
         accepted = parameters.resolution.accepted_error_share * options.max_error
         if error <= accepted:
-            return mesh, fast, cells, dropped
+            return mesh, fast, cells, dropped, gaps
         cells, begin = min(refined_resolution(cells, error, accepted), most_cells), end
 
 

@@ -1,4 +1,4 @@
-"""Repairs a mesh that is not quite a solid, and removes components that no scanned point supports.
+"""Repairs a mesh that is not quite a solid.
 
 In a sound mesh, only vertices that rounding has brought to one place are joined or moved apart. For any other, three
 attempts follow, from the mildest to the strongest, and the first sound result is taken:
@@ -9,13 +9,12 @@ attempts follow, from the mildest to the strongest, and the first sound result i
 3. pymeshlab orients the faces coherently, cuts edges with more than two faces and closes small holes, and the first two
    are tried again.
 
-The entries are `repair` and `remove_stray`.
+The entry is `repair`.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gnrecon.export.boolean import (
     from_meshlab,
@@ -27,15 +26,12 @@ from gnrecon.export.boolean import (
     with_nearest_normals,
 )
 from gnrecon.export.export_parameters import ExportParameters
-from gnrecon.export.mesh_statistics import Edges, concatenated, corner_fans, face_components, split_vertices, submesh
-from gnrecon.export.metrics import nearest_on_surface
-from gnrecon.export.project import side_lengths
+from gnrecon.export.mesh_statistics import Edges, corner_fans, split_vertices, submesh
 from gnrecon.export.remeshing.edge_operators import collapse_coincident
 from gnrecon.export.verify import require_sound, verify
-from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.arrays import Mask
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.runtime.errors import MeshError, UsageError
-from gnrecon.runtime.quiet_imports import import_uninterrupted
 
 
 def repair(mesh: Mesh) -> tuple[Mesh, list[str]]:
@@ -201,148 +197,3 @@ def _patch(
         f"{before.turned_edges} disagreeing edges became {after.boundary_edges}, {after.crowded_edges} and "
         f"{after.turned_edges}."
     ]
-
-
-# Where a fitted field has no data it may cross zero by chance: ghost sheets in free space, and cavities within the
-# solid. Each input point votes for the component that its nearest face belongs to, and components with few votes are
-# dropped. Of what remains, components within an even number of others are made outer shells (positive volume), those
-# within an odd number cavities (negative volume), because dropping a shell may change which of the two a component is.
-
-
-def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
-    """Drop components that too few points lie nearest to.
-
-    A component stays when it is nearest to at least ``max(3, 0.5 % of the points)`` points, or to more than any other.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Closed, in file units.
-    points : array of shape (N, 3), file units
-        The cloud that was fitted.
-
-    Returns
-    -------
-    Mesh
-        The same mesh where nothing was dropped.
-    list of str
-        A sentence with counts for each change.
-
-    Raises
-    ------
-    UsageError
-        When there are no points.
-    """
-    labels, stays, actions = _vote(mesh, points)
-    if stays.all():
-        return mesh, []
-    parts = [submesh(mesh, labels == label) for label in np.flatnonzero(stays)]
-    oriented = [_orient_component(part, [other for other in parts if other is not part]) for part in parts]
-    turned = sum(new is not old for new, old in zip(oriented, parts, strict=True))
-    if turned:
-        actions.append(f"Reversed {turned} components, because the shell around them was dropped.")
-    return concatenated(oriented), actions
-
-
-def drop_stray_components(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
-    """Drop the same components of a mesh that may have borders; the others keep their orientation.
-
-    Parameters, return values and errors are those of `remove_stray`.
-    """
-    labels, stays, actions = _vote(mesh, points)
-    return (mesh, []) if stays.all() else (submesh(mesh, stays[labels]), actions)
-
-
-def _vote(
-    mesh: Mesh,
-    points: Float,
-    *,
-    least_points: int = ExportParameters.repair.stray_points,
-    least_share: float = ExportParameters.repair.stray_point_share,
-) -> tuple[Int, Mask, list[str]]:
-    """Return each face's component, which components stay, and a sentence about the others.
-
-    A component stays that is nearest to `least_points` points and to `least_share` of all; the largest always stays.
-    """
-    if not len(points):
-        raise UsageError("There are no points, so stray components cannot be found.")
-    labels = face_components(mesh)
-    count = int(labels.max(initial=-1)) + 1
-    if count < 2:
-        return labels, np.ones(count, dtype=bool), []
-    votes = np.bincount(_nearest_components(mesh, labels, points), minlength=count)
-    least = max(least_points, least_share * len(points))
-    stays = votes >= least
-    stays[votes.argmax()] = True
-    dropped = np.count_nonzero(~stays)
-    sentence = (
-        f"Dropped {dropped} of {count} components, with {np.count_nonzero(~stays[labels])} of {len(labels)} faces: "
-        f"fewer than {least:g} of the {len(points)} points lie nearest to each "
-        f"(at most {votes[~stays].max(initial=0)})."
-    )
-    return labels, stays, [sentence] if dropped else []
-
-
-def _nearest_components(mesh: Mesh, labels: Int, points: Float) -> Int:
-    """Return the component, of shape (N,), that each point's nearest face, of labels of shape (F,), belongs to.
-
-    Most points are so near to a vertex of the largest component that no other can be nearer; the others are few.
-    """
-    largest = int(np.bincount(labels).argmax())
-    one, others = submesh(mesh, labels == largest), submesh(mesh, labels != largest)
-    # No point of a triangle is farther from all of its corners than its longest side over the root of three.
-    reach = float(side_lengths(others).max()) / np.sqrt(3)
-    near, next_near = (cKDTree(part.vertices).query(points)[0] for part in (one, others))
-    unclear = next_near - reach <= near
-    nearest = np.full(len(points), largest, dtype=labels.dtype)
-    if unclear.any():
-        within = np.minimum(near, next_near)[unclear]
-        nearest[unclear] = labels[_nearest_faces(mesh, points[unclear], within)]
-    return nearest
-
-
-def _nearest_faces(mesh: Mesh, points: Float, within: Float, *, most_pairs: int = 300_000) -> Int:
-    """Return the nearest face of each point, of shape (N,), which is at most as far as `within`, of shape (N,).
-
-    Few points are compared with the faces about them, as the library that finds the nearest of all is slow to load.
-    """
-    corners = mesh.vertices[mesh.faces]
-    tree = cKDTree(corners.mean(axis=1))
-    # A triangle's points are no farther from its centre than two thirds of its longest side, in single precision.
-    radius = (1 + 1e-6) * (within + float(side_lengths(mesh).max()) * 2 / 3)
-    counts = tree.query_ball_point(points, radius, return_length=True)
-    if counts.sum() > most_pairs:
-        return nearest_on_surface(mesh, points)[1]
-    closest_point = import_uninterrupted("trimesh").triangles.closest_point
-    faces = np.concatenate(tree.query_ball_point(points, radius)).astype(np.int64)
-    repeated = np.repeat(points, counts, axis=0)
-    distance = np.linalg.norm(closest_point(corners[faces], repeated) - repeated, axis=1)
-    starts = np.cumsum(counts) - counts
-    order = np.lexsort([distance, np.repeat(np.arange(len(points)), counts)])
-    nearest: Int = faces[order[starts]]
-    return nearest
-
-
-def _orient_component(part: Mesh, others: list[Mesh]) -> Mesh:
-    """Reverse a component where its volume's sign does not fit the number of others around it."""
-    outer = sum(_encloses(other, part.vertices[0]) for other in others) % 2 == 0
-    if (part.volume > 0) == outer:
-        return part
-    return Mesh(part.vertices, part.faces[:, ::-1], None if part.normals is None else -part.normals)
-
-
-def _encloses(shell: Mesh, point: Float) -> bool:
-    """Whether the winding number of a closed shell, of either orientation, about a point of shape (3,) is not zero."""
-    if (point < shell.vertices.min(axis=0)).any() or (point > shell.vertices.max(axis=0)).any():
-        return False
-    a, b, c = np.moveaxis(shell.corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
-    # Half the solid angle of a triangle, by van Oosterom and Strackee (1983).
-    half = np.arctan2(
-        np.einsum("ij,ij->i", a, np.cross(b, c)),
-        la * lb * lc
-        + np.einsum("ij,ij->i", a, b) * lc
-        + np.einsum("ij,ij->i", b, c) * la
-        + np.einsum("ij,ij->i", c, a) * lb,
-    )
-    return bool(abs(half.sum() / (2 * np.pi)) > 0.5)
