@@ -192,17 +192,31 @@ def solve_cube(
     """
     patch = residuals.patch(rows, space.center, space.far(), device)
     position, angle = hyperparameters.position, hyperparameters.angle
+    size = _prior_deviation(patch, length, hyperparameters)
     if penalties is None:
-        features = precise_enough(features, patch, length, position, angle)
+        # The likelihood of lengths has a prior of its own.
+        features = precise_enough(features, len(patch.value), length, max(size, patch.size), (position, angle))
     if hyperparameters.by_place and penalties is None:
         length = _likeliest_length(patch, features, length, (position, angle), parameters)
-    system = PatchSystem(patch, features, length, hyperparameters.rms_factor * patch.rms)
+    system = PatchSystem(patch, features, length, size)
     if hyperparameters.robust:
         system = system.reweighted(position, angle)
     near = space.near(length, position)
     if penalties is None:
         return length, system.solve_with_bounds(position, angle, near)
     return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, near)
+
+
+def _prior_deviation(patch: Patch, length: float, hyperparameters: Hyperparameters) -> float:
+    """Return the prior standard deviation of a cube's correction.
+
+    One of deviation s has slopes of deviation s / length along each axis. Where the global field is flat, as in a wall
+    that it does not resolve, its values at the points are nearly right, and only their slopes ask for a correction.
+    """
+    asked = patch.rms
+    if hyperparameters.by_slopes:
+        asked = max(asked, length * float(patch.gradient.square().mean().sqrt()))
+    return hyperparameters.rms_factor * asked
 
 
 def _likeliest_length(

@@ -41,6 +41,7 @@ class Hyperparameters:
     by_place : whether the length is that of the scan on the whole, from which each cube's own may differ
     rms_factor : prior standard deviation of a cube's correction, over the RMS of the residuals there
     robust : whether points that contradict the others of their cube lose their weight
+    by_slopes : whether the prior standard deviation is wide enough for the slopes that the data ask for, too
     """
 
     length: float
@@ -49,6 +50,7 @@ class Hyperparameters:
     by_place: bool = False
     rms_factor: float = LocalSolveParameters.correction_rms_factor
     robust: bool = False
+    by_slopes: bool = False
 
 
 @dataclass(frozen=True)
@@ -279,9 +281,8 @@ class PatchSystem:
     def log_evidence(self, position: float, angle: float) -> float:
         """Return the log marginal likelihood of the data, but for a term that no length changes.
 
-        It is (|A^-1/2 b|^2 - log det A) / 2 with A = 1 + s^2 J^T D^-1 J and b = s J^T D^-1 y; of an indefinite system
-        it is -infinity. Here the prior deviation is the RMS of the values: a wide prior, which leaves amplitudes free,
-        would favour long features. Samples of free space are no data.
+        It is (|A^-1/2 b|^2 - log det A) / 2 with A = 1 + s^2 J^T D^-1 J and b = s J^T D^-1 y, or -infinity. Here the
+        prior deviation is the RMS of the values: a wide one would favour long features. Free space is no data.
         Source: Rasmussen and Williams (2006), equation 2.30 in the space of the weights.
         """
         scale = self._scale / LocalSolveParameters.correction_rms_factor
@@ -319,8 +320,8 @@ class PatchSystem:
 class LocalRowSystem:
     """The same system in the space of its rows, for a patch of few points: K + 1 with K = s^2 J J^T.
 
-    The most probable amplitudes are s^2 J^T (s^2 J J^T + 1)^-1 r. Parameters are those of `PatchSystem`, but the
-    features take the precision of the patch.
+    The most probable amplitudes are s^2 J^T (K + 1)^-1 r. Parameters are those of `PatchSystem`, but features take the
+    precision of the patch.
     Source: Rasmussen and Williams (2006), equation 2.12.
     """
 
@@ -360,12 +361,11 @@ def patch_system(patch: Patch, features: Features, length: float, size: float) -
     return (LocalRowSystem if by_rows else PatchSystem)(patch, features, length, size)
 
 
-def precise_enough(features: Features, patch: Patch, length: float, position: float, angle: float) -> Features:
-    """Return the features in the precision that a patch's noise asks for; parameters as those of `PatchSystem`."""
-    position, angle = patch.size / position, patch.size / length / angle
-    # A row of J has mean squares of one for a value and for each of a normal's three components, for features of
-    # variance one.
-    return features.precise_enough(len(patch.value) * (position**2 + 3 * angle**2))
+def precise_enough(features: Features, points: int, length: float, size: float, noise: tuple[float, float]) -> Features:
+    """Return the features in the precision that so many points need; other parameters as those of `PatchSystem`."""
+    position, angle = size / noise[0], size / length / noise[1]
+    # For features of variance one, a row of J has mean squares of one, for a value and each component of a normal.
+    return features.precise_enough(points * (position**2 + 3 * angle**2))
 
 
 def _crowd(points: Tensor, reach: float) -> Tensor:

@@ -361,7 +361,7 @@ class CrossValidation:
             rows = rows[np.sort(np.argsort(far, kind="stable")[:most])]
         patch = self.residuals.patch(rows, center, Volume.none(), self.device)
         noises = self.noises(length)
-        features = precise_enough(self.features, patch, length, *np.min(noises, axis=0))
+        features = precise_enough(self.features, len(patch.value), length, patch.size, np.min(noises, axis=0))
         system = patch_system(patch, features, length, patch.size)
         target = self.residuals.patch(predicted, center, Volume.none(), self.device)
         normals = torch.as_tensor(self.residuals.normals[predicted], device=self.device)

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 import torch
 
 from gnrecon.field.random_features import Features
@@ -60,3 +61,23 @@ def test_short_waves_get_a_shorter_length_than_long_ones(rng: np.random.Generato
 def test_the_length_of_the_scan_is_kept_where_evidence_says_nothing(rng: np.random.Generator) -> None:
     kept = Hyperparameters(NOISE.length, NOISE.position, NOISE.angle)
     assert length_of(sheet(0.6, rng), kept) == NOISE.length
+
+
+def test_a_flat_global_field_gets_its_slope_where_the_prior_leaves_room_for_it(rng: np.random.Generator) -> None:
+    # A wall, half as thick as the length: the field is zero on both sides, but has a fifth of a distance's slope.
+    count, half = 300, 0.1
+    side = np.where(np.arange(count) % 2, 1.0, -1.0)
+    points = np.column_stack([rng.uniform(-1, 1, (count, 2)), half * side])
+    normals = side[:, None] * [0.0, 0.0, 1.0]
+    flat = FieldResiduals(points, normals, np.zeros(count), 0.2 * normals)
+    features = Features.draw(400, np.random.default_rng(0), torch.zeros(0, dtype=torch.float64))
+    slopes = []
+    for by_slopes in (False, True):
+        belief = Hyperparameters(0.4, 0.01, 0.5, by_slopes=by_slopes)
+        cube = flat, np.arange(count), belief.length, NoSpace(), features
+        length, amplitudes = solve_cube(*cube, belief, "cpu")  # type: ignore[arg-type]
+        phases = features.phase(torch.as_tensor(points), torch.zeros(3, dtype=torch.float64), length)
+        along = (phases.cos() * features.frequencies[:, 2] / length) @ amplitudes
+        slopes.append(float(np.mean(0.2 + side * along.numpy())))
+    assert slopes[0] < 0.3
+    assert slopes[1] == pytest.approx(1.0, abs=0.15)

@@ -49,13 +49,17 @@ class SharpShape:
 
     @property
     def hyperparameters(self) -> Hyperparameters:
-        """Length of the features and noise of the samples."""
+        """Length of the features and noise of the samples.
+
+        Exact normals outweigh a prior that is narrow; after averaging, it must leave room for their slopes.
+        """
         radius, p = Density(self.samples.points).radius, self.parameters
         if self.averaging is None:
             length, angle = p.exact_length_radii, p.exact_angle_radians
         else:
             length, angle = p.averaged_length_radii, p.averaged_angle_radians
-        return Hyperparameters(length * radius, p.position_noise_radii * radius, angle)
+        position, averaged = p.position_noise_radii * radius, self.averaging is not None
+        return Hyperparameters(length * radius, position, angle, by_slopes=averaged)
 
     @classmethod
     def of(cls, samples: Samples, parameters: ShapePriorParameters = ShapePriorParameters()) -> SharpShape | None:
