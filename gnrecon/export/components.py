@@ -269,8 +269,9 @@ def bridge(mesh: Mesh, gaps: Float, points: Float, *, least_sides: float = 2.0) 
         np.concatenate(tree.query_ball_point(ends, radius)).astype(np.int64)
         for ends, radius in zip(gaps, reach, strict=True)
     ]
-    joined = unite(mesh, [np.concatenate([mesh.vertices[rows], ends]) for rows, ends in zip(near, gaps, strict=True)])
+    hulls = [np.concatenate([mesh.vertices[rows], ends]) for rows, ends in zip(near, gaps, strict=True)]
     try:
+        joined = unite(mesh, hulls)
         require_sound(joined)
     except MeshError:
         return mesh, []
