@@ -17,9 +17,10 @@ The entries are `remove_stray`, `supported_components` and `drop_stray_component
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -64,33 +65,50 @@ def remove_stray(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
     return mesh, actions
 
 
-def supported_components(
-    mesh: Mesh, points: Float, field: SignedDistance | None = None
-) -> tuple[Mesh, list[str], Float]:
-    """Drop the same components, but let those vote together between which the field shows no gap.
+class Supported(NamedTuple):
+    """The components of a mesh that stay.
 
-    Parameters and errors are those of `remove_stray`; without a field, each component votes for itself.
-
-    Returns
-    -------
-    Mesh, list of str
-        As `remove_stray` returns them.
-    array of shape (B, 2, 3), file units
+    Parameters
+    ----------
+    mesh : Mesh
+        The same mesh where nothing was dropped.
+    actions : list of str
+        A sentence with counts for each change.
+    gaps : array of shape (B, 2, 3), file units
         The two ends of each gap that the field does not show; see `bridge`.
     """
+
+    mesh: Mesh
+    actions: list[str]
+    gaps: Float
+
+
+def supported_components(mesh: Mesh, points: Float | None, field: SignedDistance | None = None) -> Supported:
+    """Drop the same components, but let those vote together between which the field shows no gap.
+
+    Parameters and errors are those of `remove_stray`; without a field, each component votes for itself, and with None
+    for the points all stay.
+    """
+    if points is None:
+        return Supported(mesh, [], np.empty((0, 2, 3)))
     labels, votes, least = _vote(mesh, points)
+
+    @cache
+    def part(label: int) -> Mesh:
+        return submesh(mesh, labels == label)
+
     alone = np.arange(len(votes))
-    groups, gaps = (alone, []) if field is None else _grouped(mesh, labels, votes, least, field)
+    groups, gaps = (alone, []) if field is None else _grouped(part, votes, least, field)
     stays, actions = _enough(labels, votes, least, groups, len(points))
     ends = np.array([ends for label, ends in gaps if stays[label]]).reshape(-1, 2, 3)
     if stays.all():
-        return mesh, [], ends
-    parts = [submesh(mesh, labels == label) for label in np.flatnonzero(stays)]
+        return Supported(mesh, [], ends)
+    parts = [part(int(label)) for label in np.flatnonzero(stays)]
     oriented = [_orient_component(part, [other for other in parts if other is not part]) for part in parts]
     turned = sum(new is not old for new, old in zip(oriented, parts, strict=True))
     if turned:
         actions.append(f"Reversed {turned} components, because the shell around them was dropped.")
-    return concatenated(oriented), actions, ends
+    return Supported(concatenated(oriented), actions, ends)
 
 
 def drop_stray_components(mesh: Mesh, points: Float) -> tuple[Mesh, list[str]]:
@@ -156,8 +174,7 @@ class _Gap:
 
 
 def _grouped(
-    mesh: Mesh,
-    labels: Int,
+    part: Callable[[int], Mesh],
     votes: Int,
     least: float,
     field: SignedDistance,
@@ -167,24 +184,21 @@ def _grouped(
     """Return the group of each component, of shape (C,), and the gaps within groups, which the field does not show.
 
     A gap is the label of a component and both ends, of shape (2, 3). Only solid components with some votes are asked
-    for: what lies in free space, and cavities, stay alone. `least` is the number of votes that a component needs.
+    for: what lies in free space, and cavities, stay alone. `part` returns the component of a label, and `least` is the
+    number of votes that one needs.
     """
     groups, gaps = np.arange(len(votes)), list[tuple[int, Float]]()
-    if np.count_nonzero(votes >= least_points) < 2:
+    voted = [int(label) for label in np.flatnonzero(votes >= least_points)]
+    if len(voted) < 2:
         return groups, gaps
-    parts = {int(label): submesh(mesh, labels == label) for label in np.flatnonzero(votes >= least_points)}
     # Those of few points first: they are joined to the others.
-    solid = np.array(
-        sorted((label for label in parts if parts[label].volume > 0), key=votes.__getitem__), dtype=np.int64
-    )
-    apart = _Gaps([parts[label] for label in solid])
-    everything = np.arange(len(solid))
-    few = [place for place in everything[:-1] if votes[solid[place]] < least]
-    alone = [place for place in few if apart.shortest([place], np.delete(everything, place)).is_shown(field)]
+    solid = np.array(sorted((one for one in voted if part(one).volume > 0), key=votes.__getitem__), dtype=np.int64)
+    apart, places = _Gaps([part(int(label)) for label in solid]), np.arange(len(solid))
+    few = [place for place in places[:-1] if votes[solid[place]] < least]
+    stray = [place for place in few if apart.shortest([place], np.delete(places, place)).is_shown(field)]
     # Outliers may lie on a component by chance: one with no more points than one that is surely stray is no part.
-    stray_points = max((votes[solid[place]] for place in alone), default=0)
-    waiting = [place for place in everything[:-1] if votes[solid[place]] > stray_points]
-    allowed = votes[solid] > stray_points
+    allowed = votes[solid] > max((votes[solid[place]] for place in stray), default=0)
+    waiting = [place for place in places[:-1] if allowed[place]]
     while waiting:
         group = groups[solid[waiting.pop(0)]]
         inner = allowed & (groups[solid] == group)

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from gnrecon.export import SignedDistance, curvatures, extract, project, refine, remove_handles, repair
-from gnrecon.export.components import bridge, supported_components
+from gnrecon.export.components import Supported, bridge, supported_components
 from gnrecon.export.export_parameters import ExportParameters
 from gnrecon.export.remeshing.refine import RefineOptions
 from gnrecon.export.resolution import (
@@ -236,7 +236,7 @@ def mesh_field(
     """
     box = field.bounds if bounds is None else bounds
     with stages("extract"):
-        mesh, fast, cells, dropped, gaps = _extract_until_accurate(field, options, data, box, advance, parameters)
+        (mesh, dropped, gaps), fast, cells = _extract_until_accurate(field, options, data, box, advance, parameters)
     # The first Newton step brings nearly all vertices so near to the zero level that it is no matter next to the faces.
     with stages("project"):
         tolerance = parameters.resolution.projection_tolerance
@@ -270,11 +270,10 @@ def _extract_until_accurate(
     box: Float,
     advance: ProgressCallback,
     parameters: ExportParameters,
-) -> tuple[Mesh, SignedDistance, int, list[str], Float]:
+) -> tuple[Supported, SignedDistance, int]:
     """Extract, and again with more cells until the error is small enough.
 
-    Returns the mesh, the field that was precise enough for it, the cells, sentences on dropped components, and the gaps
-    that the field does not show, of shape (B, 2, 3).
+    Returns the components that stay, the field that was precise enough for them, and the cells.
     """
     cells, begin, most_cells = options.cells(box), 0.0, parameters.resolution.most_refined_cells
     while True:
@@ -290,16 +289,13 @@ def _extract_until_accurate(
             parameters=parameters.extraction,
         )
         # Before the error is measured, so that ghost sheets do not count.
-        gaps = np.empty((0, 2, 3))
-        dropped: list[str] = []
-        if data is not None:
-            mesh, dropped, gaps = supported_components(mesh, data, fast)
+        supported = supported_components(mesh, data, fast)
         if options.max_error is None or cells >= most_cells:
-            return mesh, fast, cells, dropped, gaps
-        error = projected_chord_error(mesh, field, cells, box, parameters=parameters.resolution)
+            return supported, fast, cells
+        error = projected_chord_error(supported.mesh, field, cells, box, parameters=parameters.resolution)
         accepted = parameters.resolution.accepted_error_share * options.max_error
         if error <= accepted:
-            return mesh, fast, cells, dropped, gaps
+            return supported, fast, cells
         cells, begin = min(refined_resolution(cells, error, accepted), most_cells), end
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,6 @@ from gnrecon.export import (
 from gnrecon.geometry.mesh import Mesh
 from gnrecon.io import write_mesh
 from gnrecon.runtime.errors import MeshError
-
-repair_module = sys.modules["gnrecon.export.repair"]
-"""The package has a function of that name."""
 
 
 @pytest.fixture(scope="module")

@@ -54,12 +54,10 @@ class SharpShape:
         Exact normals outweigh a prior that is narrow; after averaging, it must leave room for their slopes.
         """
         radius, p = Density(self.samples.points).radius, self.parameters
+        position = p.position_noise_radii * radius
         if self.averaging is None:
-            length, angle = p.exact_length_radii, p.exact_angle_radians
-        else:
-            length, angle = p.averaged_length_radii, p.averaged_angle_radians
-        position, averaged = p.position_noise_radii * radius, self.averaging is not None
-        return Hyperparameters(length * radius, position, angle, by_slopes=averaged)
+            return Hyperparameters(p.exact_length_radii * radius, position, p.exact_angle_radians)
+        return Hyperparameters(p.averaged_length_radii * radius, position, p.averaged_angle_radians, by_slopes=True)
 
     @classmethod
     def of(cls, samples: Samples, parameters: ShapePriorParameters = ShapePriorParameters()) -> SharpShape | None:
