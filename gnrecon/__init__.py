@@ -17,8 +17,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gnrecon import deprecated_paths
-from gnrecon.geometry.mesh import Mesh
-from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
 from gnrecon.runtime.errors import Cancelled, FitError, GnreconError, InputError, MeshError, OutputError, UsageError
 from gnrecon.version import __version__
 
@@ -36,6 +34,8 @@ if TYPE_CHECKING:
         verify,
     )
     from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
+    from gnrecon.geometry.mesh import Mesh
+    from gnrecon.geometry.point_cloud import Frame, PointCloud, Samples
     from gnrecon.ingest import prepare, survey
     from gnrecon.io import (
         as_cloud,
@@ -73,6 +73,8 @@ _ROOMS = {
         "verify",
     ),
     "gnrecon.fit": ("FitOptions", "NeuralSDF", "Uncertainty", "fit"),
+    "gnrecon.geometry.mesh": ("Mesh",),
+    "gnrecon.geometry.point_cloud": ("Frame", "PointCloud", "Samples"),
     "gnrecon.ingest": ("prepare", "survey"),
     "gnrecon.io": (
         "as_cloud",
