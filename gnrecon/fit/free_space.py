@@ -23,7 +23,7 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.parameters import FreeSpaceParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.octree import DipoleTree
-from gnrecon.geometry.signed_distance import Box, is_sign_certain, sign_of_winding, winding_number
+from gnrecon.geometry.signed_distance import Box, film_distance, is_sign_certain, sign_of_winding, winding_number
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,8 @@ class Volume:
 
         A field that is somewhat steeper or flatter than a distance needs no correction; forcing it to the distance
         would overshoot between samples. Nor does one of the other sign where the sign is uncertain, as in a cavity of
-        which little was scanned: the smooth field closes it no worse. Above a hole the distance of the data is no
-        distance of the surface, which closes the hole as a film. A share |1 - 2 w| of it is left to the film:
-        exactly so above the middle of a round hole in a plane.
+        which little was scanned: the smooth field closes it no worse. Above a hole the least distance is that of the
+        film, see `film_distance`.
 
         Parameters
         ----------
@@ -73,7 +72,7 @@ class Volume:
         distance : array of shape (Q,), of the data
         bound_share : of the coarse distance, that the field must keep where the sign is certain
         """
-        certain, film = is_sign_certain(winding), np.minimum(np.abs(1.0 - 2.0 * winding), 1.0) * signed
+        certain, film = is_sign_certain(winding), film_distance(signed, winding)
         near, far = parameters.least_field_share * film, parameters.most_field_share * signed
         agreed = certain | (own * signed > 0)
         wanted = np.where(agreed, own.clip(np.minimum(near, far), np.maximum(near, far)) - own, 0.0)

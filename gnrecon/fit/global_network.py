@@ -2,7 +2,7 @@
 
     values       f = 0                       at the points
     normals      grad f = n                  at the points
-    free space   f between two shares of d   where the winding number is certain; d is the coarse signed distance
+    free space   f between two shares of d   d is the coarse signed distance, across holes that of a film (`_places`)
     eikonal      |grad f| = 1                near the surface, and in the whole box
 
 Each row is over its standard deviation, so that the sum of squares is a log likelihood, and no weight is left to set.
@@ -29,7 +29,7 @@ from gnrecon.fit.initialisation import WrongSignSearch
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
 from gnrecon.fit.parameters import NetworkTermParameters
 from gnrecon.geometry.arrays import Float
-from gnrecon.geometry.signed_distance import sample_near_surface
+from gnrecon.geometry.signed_distance import film_distance, is_sign_certain, sample_near_surface
 from gnrecon.residuals.constraints import Residual, eikonal, interface, normal_vector, value_range
 
 
@@ -81,6 +81,35 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class FreePlaces:
+    """Samples of free space.
+
+    Parameters
+    ----------
+    points : of shape (Q, 3)
+    signed : signed distances of the surface, of shape (Q,)
+    data : distances of the data, of shape (Q,)
+    """
+
+    points: Tensor
+    signed: Tensor
+    data: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, rows: Tensor | slice) -> FreePlaces:
+        """Return some of the samples."""
+        return FreePlaces(self.points[rows], self.signed[rows], self.data[rows])
+
+    def joined(self, others: Sequence[FreePlaces]) -> FreePlaces:
+        """Return these samples, then the others."""
+        every = (self, *others)
+        parts = ([one.points for one in every], [one.signed for one in every], [one.data for one in every])
+        return FreePlaces(*map(torch.cat, parts))
+
+
+@dataclass(frozen=True)
 class NetworkTerms:
     """The data of a global network.
 
@@ -88,7 +117,8 @@ class NetworkTerms:
     ----------
     scene : the points that it sees
     points, normals : of shape (V, 3), the validation points
-    volume, distances : samples of free space, of shape (Q, 3), and their coarse signed distances, of shape (Q,)
+    free : samples of free space where the sign is certain
+    gaps : those where it is not, as across holes, which a film closes
     near : places near the surface at which the eikonal residual is measured, of shape (E, 3)
     normal : the residual of the normals, of m components
     """
@@ -96,8 +126,8 @@ class NetworkTerms:
     scene: Scene
     points: Tensor
     normals: Tensor
-    volume: Tensor
-    distances: Tensor
+    free: FreePlaces
+    gaps: FreePlaces
     near: Tensor
     parameters: NetworkTermParameters
     normal: Residual = normal_vector
@@ -121,21 +151,19 @@ class NetworkTerms:
             points, normals = scene.samples.points, scene.samples.normals
         rows = slice(None, None, -(-len(points) // parameters.most_validation_points))
         points, normals = points[rows], normals[rows]
-        x, distance = _certain(scene, scene.places(parameters.pool_samples, rng))
+        free, gaps = _places(scene, scene.places(parameters.pool_samples, rng))
         count = parameters.eikonal_measured
         near = sample_near_surface(scene.samples.points, parameters.near_spacings * scene.coarse.spacing, count, rng)
         validation = scene.tensor(points), scene.tensor(normals)
-        return cls(scene, *validation, scene.tensor(x), scene.tensor(distance), scene.tensor(near), parameters, normal)
+        return cls(scene, *validation, free, gaps, scene.tensor(near), parameters, normal)
 
     def with_wrong_signs(self, field: Siren, theta: Tensor, rng: np.random.Generator) -> NetworkTerms:
         """Return the terms with more samples of free space where the field has the wrong sign."""
         scene = self.scene
-        known = WrongSignSearch(scene.coarse, self.volume.cpu().numpy(), self.distances.sign().cpu().numpy())
+        known = WrongSignSearch(scene.coarse, self.free.points.cpu().numpy(), self.free.signed.sign().cpu().numpy())
         trial = scene.places(self.parameters.trial_samples, rng)
         wrong, _ = known.wrong_signs(trial, lambda x: field.value(theta, scene.tensor(x)).cpu().numpy())
-        x, distance = _certain(scene, wrong)
-        volume = torch.cat([self.volume, scene.tensor(x)])
-        return replace(self, volume=volume, distances=torch.cat([self.distances, scene.tensor(distance)]))
+        return replace(self, free=self.free.joined([_places(scene, wrong)[0]]))
 
     def with_rows(self, most: int) -> NetworkTerms:
         """Return the terms with at most so many points a step."""
@@ -144,10 +172,8 @@ class NetworkTerms:
 
     def joined(self, others: Sequence[NetworkTerms]) -> NetworkTerms:
         """Return the terms with the samples that others have found in addition to these."""
-        first = len(self.volume)
-        volume = torch.cat([self.volume, *(other.volume[first:] for other in others)])
-        distances = torch.cat([self.distances, *(other.distances[first:] for other in others)])
-        return replace(self, volume=volume, distances=distances)
+        found = slice(len(self.free), None)
+        return replace(self, free=self.free.joined([other.free.take(found) for other in others]))
 
     def noise(self, field: Siren, theta: Tensor) -> Deviations:
         """Return robust deviations of the validation points from the field."""
@@ -194,7 +220,7 @@ class NetworkTerms:
 
     def _is_wrong(self, field: Siren, theta: Tensor) -> Tensor:
         """Return the samples of free space at which f is beyond half of the one-sided bound, a mask of shape (Q,)."""
-        return self._signed(field, theta) < self.parameters.least_share / 2 * self.distances.abs()
+        return self._signed(field, theta) < self.parameters.least_share / 2 * self.free.data
 
     def _signed(self, field: Siren, theta: Tensor) -> Tensor:
         """Return f at the samples of free space, of shape (Q,), positive where its sign is right.
@@ -204,7 +230,7 @@ class NetworkTerms:
         for other, at, values in self._latest:
             if other is field and at is theta:
                 return values
-        values = field.value(theta.float(), self.volume.float()) * self.distances.sign()
+        values = field.value(theta.float(), self.free.points.float()) * self.free.signed.sign()
         self._latest[:] = [(field, theta, values)]
         return values
 
@@ -228,16 +254,17 @@ class NetworkTerms:
         )
 
     def _free_space(self, field: Siren, theta: Tensor, rng: np.random.Generator) -> ObjectiveTerm:
-        """Return a random part of free space, and of the samples at which the field is wrong."""
-        count = min(len(self.scene.points), self.parameters.data_rows)
-        some = self._part(len(self.volume), count, rng)
+        """Return a random part of free space, gaps as densely as the rest, and of the samples where f is wrong."""
+        limits, most = self.parameters, min(len(self.scene.points), self.parameters.data_rows)
+        some = self._part(len(self.free), most, rng)
         wrong = self._is_wrong(field, theta).nonzero()[:, 0]
-        rows = torch.cat([some, wrong[self._part(len(wrong), count // 2, rng)]])
-        distance = self.distances[rows]
-        near, far = self.parameters.least_share * distance, self.parameters.most_share * distance
-        ends = torch.stack([torch.minimum(near, far), torch.maximum(near, far)], 1)
-        weight = len(rows) / (self.parameters.free_space_deviation_share * distance).square()
-        return ObjectiveTerm("free space", value_range, self.volume[rows], ends, weight)
+        rows = torch.cat([some, wrong[self._part(len(wrong), most // 2, rng)]])
+        share = len(self.gaps) / max(len(self.free) + len(self.gaps), 1)
+        gaps = self.gaps.take(self._part(len(self.gaps), round(share * most), rng))
+        places = self.free.take(rows).joined([gaps])
+        ends = places.signed[:, None] * places.signed.new_tensor([limits.least_share, limits.most_share])
+        weight = len(places) / (limits.free_space_deviation_share * places.data).square()
+        return ObjectiveTerm("free space", value_range, places.points, ends.sort(dim=1).values, weight)
 
     def _eikonal(self, rng: np.random.Generator) -> ObjectiveTerm:
         """Return eikonal rows near the surface and in the box."""
@@ -255,7 +282,13 @@ class NetworkTerms:
         return torch.as_tensor(np.sort(rng.permutation(count)[:most])).to(self.points.device)
 
 
-def _certain(scene: Scene, x: Float) -> tuple[Float, Float]:
-    """Return the places among x, of shape (Q, 3), where distance and sign are known, and the signed distances."""
-    known, distance, _, certain = scene.coarse.at(x)
-    return x[known][certain], distance[certain]
+def _places(scene: Scene, x: Float) -> tuple[FreePlaces, FreePlaces]:
+    """Return those of the places x, of shape (Q, 3), that are clear of the data: where the sign is certain, and others.
+
+    Where it is not, the surface is that of a film across the hole; the network would bulge there, as it likes.
+    """
+    known, signed, _, winding = scene.coarse.at(x)
+    certain = is_sign_certain(winding)
+    surface = np.where(certain, signed, film_distance(signed, winding))
+    places = FreePlaces(*map(scene.tensor, (x[known], surface, np.abs(signed))))
+    return places.take(torch.as_tensor(certain)), places.take(torch.as_tensor(~certain))

@@ -202,7 +202,7 @@ class CoarseDistance:
         known, signed, *_ = self.at(x)
         return x[known], signed
 
-    def at(self, x: Float, clear: float = 2.0) -> tuple[Mask, Float, Float, Mask]:
+    def at(self, x: Float, clear: float = 2.0) -> tuple[Mask, Float, Float, Float]:
         """Return signed distances at those points x, of shape (Q, 3), where they are known.
 
         Parameters
@@ -213,11 +213,11 @@ class CoarseDistance:
         Returns
         -------
         The mask, of shape (Q,), of these points; and for them the signed distances, the distances to the nearest data
-        point, and whether the sign is certain.
+        point, and the winding numbers.
         """
         known, size, nearest = self.size(x, clear)
         winding = self.winding_number(x[known])
-        return known, sign_of_winding(winding) * size, nearest, is_sign_certain(winding)
+        return known, sign_of_winding(winding) * size, nearest, winding
 
     def size(self, x: Float, clear: float = 2.0) -> tuple[Mask, Float, Float]:
         """Return the first three results of `at` with unsigned distances, which is much faster."""
@@ -270,6 +270,15 @@ def is_sign_certain(winding: Float, *, margin: float = 0.25) -> Mask:
     Across a hole the winding number passes through 1/2 slowly; the margin is half of the way to 0 or 1.
     """
     return np.asarray(np.abs(winding - 0.5) > margin)
+
+
+def film_distance(signed: Float, winding: Float) -> Float:
+    """Return signed distances of the surface that closes holes as a film, of shape (Q,), from those of the data.
+
+    Next to a hole the data is farther away than the film, on which the winding number w is 1/2. The film is at a share
+    |1 - 2 w| of the data's distance: exactly so above the middle of a round hole in a plane, and on the film.
+    """
+    return np.minimum(np.abs(1.0 - 2.0 * winding), 1.0) * signed
 
 
 def winding_number(

@@ -152,15 +152,15 @@ def test_free_space_is_drawn_where_the_field_is_wrong(rng: np.random.Generator) 
     (free,) = (term for term in problem.terms if term.name == "free space")
     x = free.points.numpy()
     inside = distance(x) < 0
-    wrong = len(x) - min(len(terms.scene.points), len(terms.volume))
+    wrong = len(x) - min(len(terms.scene.points), len(terms.free.points))
     assert 0 < wrong <= inside.sum()
-    assert inside.mean() > 1.3 * (terms.distances < 0).double().mean().item()
+    assert inside.mean() > 1.3 * (terms.free.signed < 0).double().mean().item()
     least, most = free.target.T.numpy()  # type: ignore[union-attr]
     assert (least < most).all()
     assert (np.sign(least) == np.sign(distance(x))).all()
     again = terms.with_wrong_signs(field, flat, rng)
-    assert len(again.volume) > len(terms.volume)
-    assert (distance(again.volume[len(terms.volume) :].numpy()) < 0).all()
+    assert len(again.free.points) > len(terms.free.points)
+    assert (distance(again.free.points[len(terms.free.points) :].numpy()) < 0).all()
 
 
 def test_the_noise_of_the_data_is_that_of_the_validation_points(rng: np.random.Generator) -> None:

@@ -31,7 +31,7 @@ from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters, SingleNetworkParameters
 from gnrecon.fit.penalties.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised
 from gnrecon.geometry.arrays import Float, Mask
-from gnrecon.geometry.signed_distance import Density, free_space_bounds
+from gnrecon.geometry.signed_distance import Density, free_space_bounds, is_sign_certain
 from gnrecon.least_squares.direct import damped_factor
 from gnrecon.level_set import LevelSet, sample_surface
 from gnrecon.residuals import SecondOrder, free_space
@@ -57,8 +57,8 @@ class FreeSpace:
     ) -> FreeSpace:
         """Draw points of a scan's box."""
         x = scene.places(parameters.free_space_factor * scene.volume_count, rng)
-        known, distance, _, certain = scene.coarse.at(x)
-        kept = certain & (np.abs(distance) > parameters.free_space_clearance_radii)
+        known, distance, _, winding = scene.coarse.at(x)
+        kept = is_sign_certain(winding) & (np.abs(distance) > parameters.free_space_clearance_radii)
         return cls(x[known][kept], free_space_bounds(distance[kept], parameters.most_free_space_distance_radii))
 
     def terms(
