@@ -263,7 +263,9 @@ class NetworkTerms:
         gaps = self.gaps.take(self._part(len(self.gaps), round(share * most), rng))
         places = self.free.take(rows).joined([gaps])
         ends = places.signed[:, None] * places.signed.new_tensor([limits.least_share, limits.most_share])
-        weight = len(places) / (limits.free_space_deviation_share * places.data).square()
+        shares = ends.new_tensor([limits.free_space_deviation_share, limits.film_deviation_share])
+        shares = shares.repeat_interleave(torch.tensor([len(rows), len(gaps)]).to(shares.device))
+        weight = len(places) / (shares * places.data).square()
         return ObjectiveTerm("free space", value_range, places.points, ends.sort(dim=1).values, weight)
 
     def _eikonal(self, rng: np.random.Generator) -> ObjectiveTerm:

@@ -112,6 +112,7 @@ class NetworkTermParameters:
     least_share: float = 0.5
     most_share: float = 1.5
     free_space_deviation_share: float = 0.15  # standard deviation of these bounds, as a share of the distance
+    film_deviation_share: float = 0.05  # likewise across holes, of the data's distance; exact points outweigh 0.15
     near_spacings: float = 2.0  # standard deviation of the places near the surface
     near_eikonal_deviation: float = 0.1  # of |grad f| there
     far_eikonal_deviation: float = 0.3  # of |grad f| in the box, where a distance has kinks

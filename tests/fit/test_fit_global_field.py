@@ -163,6 +163,45 @@ def test_free_space_is_drawn_where_the_field_is_wrong(rng: np.random.Generator) 
     assert (distance(again.free.points[len(terms.free.points) :].numpy()) < 0).all()
 
 
+def test_an_open_end_is_closed_by_a_film(rng: np.random.Generator) -> None:
+    axis = np.ones(3) / np.sqrt(3)
+    normals = rng.standard_normal((900, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # The ball ends oblique to its box, which leaves the network room to go on beyond the cut, as a ball does.
+    normals = normals[0.8 * normals @ axis < 0.15]
+    points = (0.8 + 0.005 * rng.standard_normal((len(normals), 1))) * normals
+    heights = np.linspace(-0.3, 0.9, 241)
+
+    def end(film_share: float) -> float:
+        """The height at which the field ends."""
+        terms = NetworkTermParameters(film_deviation_share=film_share)
+        sdf = fitted(Samples(points, normals, FRAME), replace(TWO_WIDTHS, terms=terms)).sdf
+        return float(heights[sdf.sdf(FRAME.to_world(heights[:, None] * axis)) < 0].max())
+
+    assert abs(end(NetworkTermParameters.film_deviation_share) - 0.15) < 0.15
+    assert end(1e6) > 0.4, "without the rows of gaps the network goes on as a ball"
+
+
+def test_samples_of_gaps_are_near_a_film_and_no_score_counts_them(rng: np.random.Generator) -> None:
+    whole = capsule(1200, 0)
+    kept = whole.points[:, 2] < 0.2
+    terms = terms_of(replace(whole, points=whole.points[kept], normals=whole.normals[kept]), rng)
+    x = terms.gaps.points.numpy()
+    across = (np.hypot(x[:, 0], x[:, 1]) < 0.15) & (x[:, 2] > 0)
+    heights = x[across, 2] - 0.2
+    assert len(heights) > 30
+    # The lid is at 0.2: inside below, and outside above.
+    assert np.corrcoef(terms.gaps.signed.numpy()[across], heights)[0, 1] > 0.8
+    assert (np.abs(terms.gaps.signed.numpy()) <= 0.5 * terms.gaps.data.numpy() + 1e-9).all()
+    field = Siren((8, 8))
+    theta = random_network(field, rng, terms.scene.points)
+    without = replace(terms, gaps=terms.gaps.take(slice(0)))
+    assert without.score(field, theta) == terms.score(field, theta)
+    rows = [len(one.problem(field, theta, Deviations(0.01, 0.1), rng).terms[2]) for one in (terms, without)]
+    expected = len(terms.gaps) / (len(terms.free) + len(terms.gaps)) * len(terms.scene.points)
+    assert rows[0] - rows[1] == pytest.approx(expected, abs=1.0)
+
+
 def test_the_noise_of_the_data_is_that_of_the_validation_points(rng: np.random.Generator) -> None:
     exact = capsule(1500, 0)
     noisy = replace(exact, points=exact.points + 0.02 * rng.standard_normal((1500, 1)) * exact.normals)

@@ -10,7 +10,14 @@ from made_shapes import sphere
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnrecon.geometry.signed_distance import Box, CoarseDistance, kd_tree_order, sample_near_surface, winding_number
+from gnrecon.geometry.signed_distance import (
+    Box,
+    CoarseDistance,
+    film_distance,
+    kd_tree_order,
+    sample_near_surface,
+    winding_number,
+)
 
 Float = NDArray[np.float64]
 Shape = Callable[[int], tuple[Float, Float]]
@@ -141,6 +148,18 @@ def test_an_open_hemisphere_holds_what_its_cap_holds() -> None:
     assert np.all(coarse.sample(outside)[1] > 0)
     # At the centre of its rim a hemisphere fills half of all directions.
     assert coarse.winding_number(np.zeros((1, 3))) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_film_closes_an_open_hemisphere_flat() -> None:
+    points, normals = sphere(4000)
+    upper = points[:, 2] > 0
+    coarse = CoarseDistance(points[upper], normals[upper], np.random.default_rng(0))
+    heights = np.linspace(0.05, 0.8, 16)
+    known, signed, _, winding = coarse.at(np.column_stack([np.zeros((16, 2)), -heights]))
+    # The rim is at a distance of one and more.
+    assert known.all()
+    assert (signed > 0.9).all()
+    np.testing.assert_allclose(film_distance(signed, winding), heights, atol=0.045)
 
 
 @pytest.mark.parametrize(("shape", "distance"), [(sphere, sphere_distance), (torus, torus_distance)])
