@@ -36,7 +36,7 @@ from gnrecon.runtime.preload import preload
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FEW: dict[str, Any] = {"widths": (150,), "steps": 2, "resolution": 24}
-HEAVY = ("torch", "open3d", "scipy", "trimesh", "pymeshlab", "skimage", "rich", "typer", "matplotlib")
+HEAVY = ("torch", "numpy", "open3d", "scipy", "trimesh", "pymeshlab", "skimage", "rich", "typer", "matplotlib")
 
 
 class Together(Progress):
