@@ -51,6 +51,7 @@ MALFORMED: list[tuple[str, str | bytes, str]] = [
     ("a.xyz", "0 0 0\n1 1\n", "row 2 holds 2 numbers, but the rows before it hold 3"),
     ("a.xyz", "0 0 0\n1 one 1\n", "'one' in row 2 is not a number"),
     ("a.xyz", "0 0\n1 1\n", "at least 3 columns"),
+    ("a.xyz", "x y z\n0 0\n", "at least 3 columns \\(x, y, z\\), but found 2"),
     ("a.xyz", "# nothing here\n", "no points"),
     ("a.xyz", "x y z\n", "no points"),
     ("a.txt", "Dear reader,\nthis is a letter.\n", "neither numbers nor columns"),

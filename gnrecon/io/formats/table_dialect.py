@@ -179,8 +179,9 @@ def _best(texts: list[str]) -> tuple[Dialect, list[tuple[int, list[str]]]]:
     header = len(words) == 1 and columns_of_role(words[0], POSITION)
     if header or all(len(row) == 1 and row[0].isdecimal() for row in words):
         raise InputError("the file holds no points.")
-    if any(all(map(best.is_value, row)) for row in words):
-        raise InputError(f"expected at least 3 columns (x, y, z), but found {max(map(len, words))}.")
+    counts = [len(row) for row in words if all(map(best.is_value, row))]
+    if counts:
+        raise InputError(f"expected at least 3 columns (x, y, z), but found {max(counts)}.")
     raise InputError(f"the first line {body[0][:60]!r} holds neither numbers nor columns named x, y and z.")
 
 
