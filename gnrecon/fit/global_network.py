@@ -88,24 +88,24 @@ class FreePlaces:
     ----------
     points : of shape (Q, 3)
     signed : signed distances of the surface, of shape (Q,)
-    data : distances of the data, of shape (Q,)
+    deviation : standard deviation of f beyond its bounds, of shape (Q,)
     """
 
     points: Tensor
     signed: Tensor
-    data: Tensor
+    deviation: Tensor
 
     def __len__(self) -> int:
         return len(self.points)
 
     def take(self, rows: Tensor | slice) -> FreePlaces:
         """Return some of the samples."""
-        return FreePlaces(self.points[rows], self.signed[rows], self.data[rows])
+        return FreePlaces(self.points[rows], self.signed[rows], self.deviation[rows])
 
     def joined(self, others: Sequence[FreePlaces]) -> FreePlaces:
         """Return these samples, then the others."""
         every = (self, *others)
-        parts = ([one.points for one in every], [one.signed for one in every], [one.data for one in every])
+        parts = ([one.points for one in every], [one.signed for one in every], [one.deviation for one in every])
         return FreePlaces(*map(torch.cat, parts))
 
 
@@ -151,7 +151,7 @@ class NetworkTerms:
             points, normals = scene.samples.points, scene.samples.normals
         rows = slice(None, None, -(-len(points) // parameters.most_validation_points))
         points, normals = points[rows], normals[rows]
-        free, gaps = _places(scene, scene.places(parameters.pool_samples, rng))
+        free, gaps = _places(scene, scene.places(parameters.pool_samples, rng), parameters)
         count = parameters.eikonal_measured
         near = sample_near_surface(scene.samples.points, parameters.near_spacings * scene.coarse.spacing, count, rng)
         validation = scene.tensor(points), scene.tensor(normals)
@@ -163,7 +163,7 @@ class NetworkTerms:
         known = WrongSignSearch(scene.coarse, self.free.points.cpu().numpy(), self.free.signed.sign().cpu().numpy())
         trial = scene.places(self.parameters.trial_samples, rng)
         wrong, _ = known.wrong_signs(trial, lambda x: field.value(theta, scene.tensor(x)).cpu().numpy())
-        return replace(self, free=self.free.joined([_places(scene, wrong)[0]]))
+        return replace(self, free=self.free.joined([_places(scene, wrong, self.parameters)[0]]))
 
     def with_rows(self, most: int) -> NetworkTerms:
         """Return the terms with at most so many points a step."""
@@ -220,7 +220,7 @@ class NetworkTerms:
 
     def _is_wrong(self, field: Siren, theta: Tensor) -> Tensor:
         """Return the samples of free space at which f is beyond half of the one-sided bound, a mask of shape (Q,)."""
-        return self._signed(field, theta) < self.parameters.least_share / 2 * self.free.data
+        return self._signed(field, theta) < self.parameters.least_share / 2 * self.free.signed.abs()
 
     def _signed(self, field: Siren, theta: Tensor) -> Tensor:
         """Return f at the samples of free space, of shape (Q,), positive where its sign is right.
@@ -263,9 +263,7 @@ class NetworkTerms:
         gaps = self.gaps.take(self._part(len(self.gaps), round(share * most), rng))
         places = self.free.take(rows).joined([gaps])
         ends = places.signed[:, None] * places.signed.new_tensor([limits.least_share, limits.most_share])
-        shares = ends.new_tensor([limits.free_space_deviation_share, limits.film_deviation_share])
-        shares = shares.repeat_interleave(torch.tensor([len(rows), len(gaps)]).to(shares.device))
-        weight = len(places) / (shares * places.data).square()
+        weight = len(places) / places.deviation.square()
         return ObjectiveTerm("free space", value_range, places.points, ends.sort(dim=1).values, weight)
 
     def _eikonal(self, rng: np.random.Generator) -> ObjectiveTerm:
@@ -284,7 +282,7 @@ class NetworkTerms:
         return torch.as_tensor(np.sort(rng.permutation(count)[:most])).to(self.points.device)
 
 
-def _places(scene: Scene, x: Float) -> tuple[FreePlaces, FreePlaces]:
+def _places(scene: Scene, x: Float, parameters: NetworkTermParameters) -> tuple[FreePlaces, FreePlaces]:
     """Return those of the places x, of shape (Q, 3), that are clear of the data: where the sign is certain, and others.
 
     Where it is not, the surface is that of a film across the hole; the network would bulge there, as it likes.
@@ -292,5 +290,6 @@ def _places(scene: Scene, x: Float) -> tuple[FreePlaces, FreePlaces]:
     known, signed, _, winding = scene.coarse.at(x)
     certain = is_sign_certain(winding)
     surface = np.where(certain, signed, film_distance(signed, winding))
-    places = FreePlaces(*map(scene.tensor, (x[known], surface, np.abs(signed))))
+    share = np.where(certain, parameters.free_space_deviation_share, parameters.film_deviation_share)
+    places = FreePlaces(*map(scene.tensor, (x[known], surface, share * np.abs(signed))))
     return places.take(torch.as_tensor(certain)), places.take(torch.as_tensor(~certain))

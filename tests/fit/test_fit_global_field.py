@@ -192,7 +192,8 @@ def test_samples_of_gaps_are_near_a_film_and_no_score_counts_them(rng: np.random
     assert len(heights) > 30
     # The lid is at 0.2: inside below, and outside above.
     assert np.corrcoef(terms.gaps.signed.numpy()[across], heights)[0, 1] > 0.8
-    assert (np.abs(terms.gaps.signed.numpy()) <= 0.5 * terms.gaps.data.numpy() + 1e-9).all()
+    data = terms.gaps.deviation.numpy() / NetworkTermParameters.film_deviation_share
+    assert (np.abs(terms.gaps.signed.numpy()) <= 0.5 * data + 1e-9).all()
     field = Siren((8, 8))
     theta = random_network(field, rng, terms.scene.points)
     without = replace(terms, gaps=terms.gaps.take(slice(0)))
