@@ -16,6 +16,7 @@ homotopy and homology generators (2005).
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -97,7 +98,7 @@ def short_loops(
     rng: np.random.Generator,
     *,
     source_spacing: float = 1 / 5,
-    sources_at_once: int = 200,
+    sources_at_once: int = 100,
 ) -> list[Loop]:
     """Return loops that do not separate the surface, shortest first.
 
@@ -110,18 +111,18 @@ def short_loops(
     sought : mask of shape (V,), of the vertices through which loops are searched
     rng : source of the random words
     source_spacing : between vertices that are searched from, in longest lengths: a loop near one is found from it
-    sources_at_once : vertices that are searched from at once, which bounds the memory
+    sources_at_once : vertices that a thread searches from at once, which bounds the memory
     """
+    # It imports torch, which checking a mesh does not need.
+    from gnrecon.runtime.parallel import map_in_threads
+
     graph = _Graph.of(mesh, rng)
     crossed = np.unique(graph.ends[graph.signatures != 0])
     sources = _thin(graph.vertices, crossed[sought[crossed]], longest, source_spacing)
     tree = cKDTree(graph.vertices)
-    found = [
-        loop
-        for some in slices(len(sources), sources_at_once)
-        for loop in _shortest_through(graph, tree, sources[some], longest)
-    ]
-    return sorted(found, key=lambda loop: loop.length)
+    batches = [sources[some] for some in slices(len(sources), sources_at_once)]
+    found = map_in_threads(lambda some: _shortest_through(graph, tree, some, longest), batches)
+    return sorted(itertools.chain.from_iterable(found), key=lambda loop: loop.length)
 
 
 def _edge_signatures(mesh: Mesh, ends: Int, faces: Int, rng: np.random.Generator) -> Signatures:
