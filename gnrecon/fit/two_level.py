@@ -32,7 +32,7 @@ from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import FitParameters
 from gnrecon.fit.penalties.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.fit.shape_priors.ball_fit import BallFit
-from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
+from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, are_in_a_hole, complete_holes
 from gnrecon.fit.shape_priors.prior_parameters import HoleCompletionParameters
 from gnrecon.fit.shape_priors.sharp_shape import SharpShape
 from gnrecon.geometry.arrays import Int, Mask
@@ -151,12 +151,12 @@ class _Data:
         return _Data(self.scan, samples, held_out, np.concatenate([self.seen, added]), None, across)
 
     def without(self, outliers: Mask) -> _Data:
-        """Return the data without some points, of a scan to which no samples were added."""
-        kept = ~outliers
-        seen = np.zeros(len(outliers), dtype=bool)
-        seen[self.seen] = True
-        rest = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
-        return _Data(rest, rest, self.held_out[kept], np.flatnonzero(seen[kept]), None, HoleCompletion.none())
+        """Return the data without some points of the scan, by a mask; its faces were not extended to their edges."""
+        scan = replace(self.scan, points=self.scan.points[~outliers], normals=self.scan.normals[~outliers])
+        kept = ~np.concatenate([outliers, np.zeros(len(self.across), dtype=bool)])
+        samples = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
+        seen = np.isin(np.flatnonzero(kept), self.seen)
+        return _Data(scan, samples, self.held_out[kept], np.flatnonzero(seen), None, self.across)
 
 
 @dataclass(frozen=True)
@@ -192,26 +192,22 @@ class _Steps:
 
     def fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField, int]:
         """Return the completed data, the global field, and the number of outliers that were left out of both."""
-        completed, first = self._fit_global(data, subrange(advance, 0.0, 0.5))
+        completed = self._completed(data)
+        first = self._fit_global(completed, subrange(advance, 0.0, 0.5))
         # Of large scans, the distances of ingest have found the outliers.
         if self.by_blocks:
             return completed, first, 0
-        scan = data.scan
-        density, limits = Density(scan.points), self.parameters.outliers
+        density, limits = Density(data.scan.points), self.parameters.outliers
         # One field alone may miss a thin part; a point that no field explains is none of the surface.
-        found = [find_outliers(value, density, parameters=limits) for value in first.values(scan)]
+        found = [find_outliers(value, density, parameters=limits) for value in first.values(data.scan)]
         outliers: Mask = np.logical_and.reduce(found)
         if first.solution.interrupted or not outliers.any():
             return completed, first, 0
-        if data.sharp is None:
-            data = data.without(outliers)
-        else:
-            scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
-            data = self._draw(scan, SharpShape.of(scan, self.parameters.shape_priors))
-        if first.ladder is not None:
-            # Robust weights have kept the network from them already, so that it need not be fitted again.
-            return self._completed(data), first, int(outliers.sum())
-        return *self._fit_global(data, subrange(advance, 0.5, 1.0)), int(outliers.sum())
+        completed = self._without(outliers, data, completed)
+        if first.ladder is None:
+            # Robust weights have kept a network from them already, so that it need not be fitted again.
+            first = self._fit_global(completed, subrange(advance, 0.5, 1.0))
+        return completed, first, int(outliers.sum())
 
     def apply_penalties(self, first: GlobalField, data: _Data) -> tuple[NeuralSDF, PenaltiesFor | None]:
         """Return the global field after curvature penalties, and what gives those of a local length scale, if any."""
@@ -254,12 +250,12 @@ class _Steps:
         fitted = (sdf, residuals, hyperparameters, options.features, rng, options.device, advance, penalties)
         return sdf, fit_detail(*fitted, parameters=cubes)
 
-    def _fit_global(self, data: _Data, advance: ProgressCallback) -> tuple[_Data, GlobalField]:
-        """Return the data with samples across holes, and the global field that is fitted to them."""
-        completed = self._completed(data)
-        seen = completed.samples, completed.held_out, completed.seen
-        return completed, fit_global(
-            *seen,
+    def _fit_global(self, completed: _Data, advance: ProgressCallback) -> GlobalField:
+        """Return the global field that is fitted to completed data."""
+        return fit_global(
+            completed.samples,
+            completed.held_out,
+            completed.seen,
             self.options,
             self.rng,
             advance,
@@ -267,6 +263,16 @@ class _Steps:
             linear_only=not self.options.fits_network or completed.sharp is not None,
             parameters=self.parameters.global_field,
         )
+
+    def _without(self, outliers: Mask, data: _Data, completed: _Data) -> _Data:
+        """Return the completed data without outliers of the scan; `data` was there before its holes were completed."""
+        scan, priors = data.scan, self.parameters.shape_priors
+        if data.sharp is not None:
+            scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
+            return self._completed(self._draw(scan, SharpShape.of(scan, priors)))
+        left = completed.without(outliers)
+        hidden = are_in_a_hole(scan.points[outliers], left.samples.points, left.samples.normals, priors.holes)
+        return self._completed(data.without(outliers)) if hidden else left
 
     def _completed(self, data: _Data) -> _Data:
         """Return the data with samples across holes; a fit with curvature penalties closes holes by them."""

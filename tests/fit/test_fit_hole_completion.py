@@ -8,9 +8,9 @@ import pytest
 from made_shapes import bored_plate
 from scipy import ndimage
 
-from gnrecon.fit import FitOptions, fit
+from gnrecon.fit import FitOptions, fit, two_level
 from gnrecon.fit.shape_priors.bores import in_bore_opening
-from gnrecon.fit.shape_priors.hole_completion import complete_holes, encloses
+from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, are_in_a_hole, complete_holes, encloses
 from gnrecon.fit.shape_priors.min_cut import minimal_inside
 from gnrecon.fit.shape_priors.primitive_detection import detect_primitives, planar_share
 from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, is_inlier
@@ -230,6 +230,39 @@ def test_the_side_of_a_can_goes_on() -> None:
     assert len(across) > 20
     np.testing.assert_allclose(np.hypot(across.points[:, 0], across.points[:, 1]), 0.4, atol=1e-9)
     assert np.abs(across.points[:, 2]).max() < 0.4
+
+
+def test_a_place_is_in_a_hole_until_that_is_closed() -> None:
+    points, normals = without(*cube(2500), [SIDE, SIDE, 0.0], 0.35)
+    places = np.array([[SIDE, SIDE, 0.0], [0.0, 0.0, 0.0], [0.0, SIDE + 0.3, 0.0], [0.0, SIDE + 0.02, 0.0]])
+    assert [are_in_a_hole(place[None], points, normals) for place in places] == [True, False, False, False]
+    assert are_in_a_hole(places, points, normals)
+    assert not are_in_a_hole(places, *complete_holes(points, normals).appended_to(points, normals))
+
+
+@pytest.mark.parametrize("hides", [False, True])
+def test_holes_are_completed_again_where_an_outlier_was_in_one(monkeypatch: pytest.MonkeyPatch, hides: bool) -> None:
+    points, normals = without(*cube(1500), [SIDE, SIDE, SIDE], 0.4)
+    shift = 0.8 if hides else 1.2  # in the missing corner, or outside
+    outliers = SIDE * np.array([[shift, shift, shift], [shift, shift, 1.0], [shift, 1.0, shift], [1.0, shift, shift]])
+    points, normals = np.concatenate([points, outliers]), np.concatenate([normals, -normals[:4]])
+    searched: list[int] = []
+
+    def counted(points: Float, *arguments: object) -> HoleCompletion:
+        searched.append(len(points))
+        return complete_holes(points, *arguments)
+
+    monkeypatch.setattr(two_level, "complete_holes", counted)
+    monkeypatch.setattr(two_level.SharpShape, "of", lambda *_: None)
+    monkeypatch.setattr(two_level, "find_outliers", lambda value, *_, **__: np.arange(len(value)) >= len(value) - 4)
+    scan = Samples(points, normals, Frame(np.zeros(3), 1.0))
+    sdf, solution = fit(scan, FitOptions(quality="draft"))
+    assert searched == ([len(points), len(points) - 4] if hides else [len(points)])
+    assert sdf.support is not None
+    support = sdf.support.astype(np.float64)
+    corner = support[np.linalg.norm(support - SIDE, axis=1) < 0.35]
+    assert (off_cube(corner) < 1e-6).sum() > 30
+    assert "4 outliers" in solution.status
 
 
 @pytest.mark.parametrize("scan", [cube(2500), ball(2000), without(*ball(2000), [SIDE, 0.0, 0.0], 0.3), cube(40)])

@@ -11,7 +11,6 @@ A hole is where the winding number is near one half although no point is near. E
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -76,14 +75,13 @@ def complete_holes(
     # Generators of its own, so that later draws are the same whether there are holes or not.
     rng = np.random.default_rng(0)
     scan = _HoleScan.of(points, normals, exact, rng, parameters)
-    # Asked first: holes are looked for in the whole box, which takes most of the time.
     if not scan.is_machine_part(rng):
         return HoleCompletion.none()
     # First, as the walls of bores show what is around other holes.
     bores, total = HoleCompletion.joined(scan.samples_in_bores()), HoleCompletion.none()
     known, rng = bores.appended_to(points, normals), np.random.default_rng(0)
     for _ in range(parameters.passes):
-        more = _one_pass(*total.appended_to(*known), exact, rng, parameters)
+        more = _one_pass(*total.appended_to(*known), scan.roughness, exact, rng, parameters)
         finished = len(more) <= parameters.min_gain_share * len(total)
         total = HoleCompletion(*total.appended_to(more.points, more.normals), max(total.holes, more.holes))
         if finished:
@@ -91,16 +89,32 @@ def complete_holes(
     return HoleCompletion(*total.appended_to(bores.points, bores.normals), total.holes + bores.holes)
 
 
+def are_in_a_hole(
+    places: Float,
+    points: Float,
+    normals: Float,
+    parameters: HoleCompletionParameters = HoleCompletionParameters(),
+) -> bool:
+    """Return whether any of some places, of shape (Q, 3), is in a hole of a scan.
+
+    The other parameters are those of `complete_holes`.
+    """
+    scan = _HoleScan.of(points, normals, True, np.random.default_rng(0), parameters, roughness=0.0)
+    return bool((np.abs(scan.winding_offset(places)) < parameters.max_winding_offset).any())
+
+
 def _one_pass(
-    points: Float, normals: Float, exact: bool, rng: np.random.Generator, parameters: HoleCompletionParameters
+    points: Float,
+    normals: Float,
+    roughness: float,
+    exact: bool,
+    rng: np.random.Generator,
+    parameters: HoleCompletionParameters,
 ) -> HoleCompletion:
-    """Return the samples of one pass; the parameters are those of `complete_holes`."""
-    scan = _HoleScan.of(points, normals, exact, rng, parameters)
+    """Return the samples of one pass; `roughness` is that of the scan, the others are those of `complete_holes`."""
+    scan = _HoleScan.of(points, normals, exact, rng, parameters, roughness)
     spacing = parameters.sample_spacing_radii * scan.density.radius * np.sqrt(len(scan.points) / len(points))
-    holes = scan.holes()
-    if not holes or not scan.is_machine_part(rng):
-        return HoleCompletion.none()
-    found = HoleCompletion.joined([scan.samples_across(cells, spacing, rng) for cells in holes])
+    found = HoleCompletion.joined([scan.samples_across(cells, spacing, rng) for cells in scan.holes()])
     kept = ~in_bore_opening(found.points, found.normals, points, normals)
     return HoleCompletion(found.points[kept], found.normals[kept], found.holes)
 
@@ -114,6 +128,7 @@ class _HoleScan:
     points, normals : arrays of shape (N, 3), in which holes are looked for
     dense_points, dense_normals : arrays of shape (K, 3), in which primitives are looked for
     density, coarse : of the former
+    roughness : noise of the scan's positions, in radii of the dense points' disks
     exact, parameters : as in `complete_holes`
     """
 
@@ -123,6 +138,7 @@ class _HoleScan:
     dense_normals: Float
     density: Density
     coarse: CoarseDistance
+    roughness: float
     exact: bool
     parameters: HoleCompletionParameters
 
@@ -134,18 +150,17 @@ class _HoleScan:
         exact: bool,
         rng: np.random.Generator,
         parameters: HoleCompletionParameters,
+        roughness: float | None = None,
     ) -> _HoleScan:
-        """Draw the points in which holes and primitives are looked for; as in `complete_holes`."""
+        """Draw the points in which holes and primitives are looked for; by default, the roughness is measured."""
         drawn = rng.permutation(len(points))
         rows, dense = np.sort(drawn[: parameters.hole_points]), np.sort(drawn[: parameters.surface_points])
         density = Density(points[rows])
         coarse = CoarseDistance(points[rows], normals[rows], rng, density)
-        return cls(points[rows], normals[rows], points[dense], normals[dense], density, coarse, exact, parameters)
-
-    @cached_property
-    def roughness(self) -> float:
-        """Noise of the dense points' positions, in radii of their disks."""
-        return EdgeCompletion(self.dense_points, self.dense_normals).roughness
+        drawn_points = points[rows], normals[rows], points[dense], normals[dense]
+        if roughness is None:
+            roughness = EdgeCompletion(*drawn_points[2:]).roughness
+        return cls(*drawn_points, density, coarse, roughness, exact, parameters)
 
     def is_machine_part(self, rng: np.random.Generator) -> bool:
         """Return whether a large share of the points lies on planes, more than on a free-form shape by chance."""
@@ -164,14 +179,26 @@ class _HoleScan:
         # Where most points crowd in a small place, disks are tiny: the number of cells is bounded.
         least = float(np.prod(box.upper - box.lower) / p.max_lattice_cells) ** (1 / 3)
         lattice = _lattice(box.lower, box.upper, max(p.lattice_step_radii * self.density.radius, least))
-        cells = lattice.reshape(-1, 3)
-        far, _, _ = self.coarse.size(cells, p.hole_distance_radii)
-        open_ = np.zeros(len(cells), dtype=bool)
-        open_[far] = np.abs(self.coarse.winding_number(cells[far]) - 0.5) < p.max_winding_offset
-        number, count = ndimage.label(open_.reshape(lattice.shape[:3]), structure=np.ones((3, 3, 3)))
+        # First at every other node. Away from the points the winding number is harmonic, so that where all nodes around
+        # are certain of one side, there is no hole between them.
+        offset = self.winding_offset(lattice[::2, ::2, ::2])
+        sides = np.where(np.abs(offset) > p.max_winding_offset + p.winding_slack, np.sign(offset), 0)
+        certain = (ndimage.minimum_filter(sides, 3) == ndimage.maximum_filter(sides, 3)) & (sides != 0)
+        rest = ~certain.repeat(2, 0).repeat(2, 1).repeat(2, 2)[tuple(map(slice, lattice.shape[:3]))]
+        open_ = np.zeros(lattice.shape[:3], dtype=bool)
+        open_[rest] = np.abs(self.winding_offset(lattice[rest])) < p.max_winding_offset
+        number, count = ndimage.label(open_, structure=np.ones((3, 3, 3)))
         found = [lattice[number == one] for one in range(1, count + 1)]
         found = [h for h in found if len(h) >= p.min_hole_cells and np.ptp(h, axis=0).max() <= p.max_hole_units]
         return sorted(found, key=len, reverse=True)[: p.max_holes]
+
+    def winding_offset(self, cells: Float) -> Float:
+        """Return the winding number minus 1/2 at cells, of shape (..., 3); not a number where a point is near."""
+        at = cells.reshape(-1, 3)
+        far, *_ = self.coarse.size(at, self.parameters.hole_distance_radii)
+        offset = np.full(len(at), np.nan)
+        offset[far] = self.coarse.winding_number(at[far]) - 0.5
+        return offset.reshape(cells.shape[:-1])
 
     @property
     def _dense_radius(self) -> float:

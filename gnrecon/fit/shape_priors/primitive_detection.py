@@ -79,9 +79,7 @@ def detect_cylinders(
     for _ in range(parameters.rounds):
         pairs = pairs[np.isin(pairs, left).all(axis=1)]
         some = pairs if len(pairs) <= parameters.proposals else rng.choice(pairs, parameters.proposals, replace=False)
-        proposed = detector.cylinders(some)
-        closed = [one for one in proposed if detector.open_degrees(one, left) <= max_open_degrees]
-        accepted, left = detector.accepted(left, closed)
+        accepted, left = detector.accepted(left, detector.cylinders(some), max_open_degrees)
         found += accepted
     return found
 
@@ -149,11 +147,6 @@ class _Detector:
         pairs = points[first[kept]], n[kept], m[kept], offset[kept]
         return [*self._cylinders(*pairs), *(self._spheres(*pairs) if p.spheres else [])]
 
-    def open_degrees(self, cylinder: Cylinder, rows: Int) -> float:
-        """Return the widest angle around a cylinder without one of its inliers among some rows."""
-        points = self.points[rows][self._inliers(cylinder, self.points[rows], self.normals[rows])]
-        return float(np.degrees(widest_gap(points - cylinder.center, cylinder.axis))) if len(points) else 360.0
-
     def cylinders(self, pairs: Int) -> list[Cylinder]:
         """Return the cylinders of pairs of rows, of shape (K, 2)."""
         one, other = pairs.T
@@ -181,8 +174,13 @@ class _Detector:
         proper = np.flatnonzero((size > p.min_round_radii * self.radius) & (missed < p.max_center_miss * size))
         return [Sphere(points[k] + reach[k] * n[k], float(size[k]), float(-np.sign(reach[k]))) for k in proper]
 
-    def accepted(self, rows: Int, proposed: Sequence[Primitive]) -> tuple[list[DetectedPrimitive], Int]:
-        """Return the proposals that pass, those with most inliers first, and which of the rows are left."""
+    def accepted(
+        self, rows: Int, proposed: Sequence[Primitive], max_open_degrees: float = 360.0
+    ) -> tuple[list[DetectedPrimitive], Int]:
+        """Return the proposals that pass, those with most inliers first, and which of the rows are left.
+
+        Cylinders with a wider angle around the axis without an inlier are passed over.
+        """
         p = self.parameters
         found: list[DetectedPrimitive] = []
         points, normals = self.points[rows], self.normals[rows]
@@ -196,6 +194,9 @@ class _Detector:
             best = int(np.argmax(count))
             if count[best] < p.min_points:
                 break
+            if max_open_degrees < 360.0 and _open_degrees(proposed[best], points[inliers[best]]) > max_open_degrees:
+                open_[best] = False
+                continue
             surface, on = self._refitted(proposed[best], points, normals, inliers[best] & free, free)
             passes = self._ends_at_its_rim(surface, points[free], normals[free], on[free])
             # Proposals that share most inliers with this one are settled; what is no cylinder may still be a plane.
@@ -248,6 +249,13 @@ class _Detector:
     @cached_property
     def _density(self) -> Density:
         return Density(self.points)
+
+
+def _open_degrees(surface: Primitive, points: Float) -> float:
+    """Return the widest angle around a cylinder without one of some points; of other primitives, nothing is open."""
+    if not isinstance(surface, Cylinder):
+        return 0.0
+    return float(np.degrees(widest_gap(points - surface.center, surface.axis)))
 
 
 def meets_on_an_axis(offset: Float, n: Float, m: Float, tolerance: float, *, tilt: float = 0.1) -> Mask:

@@ -113,6 +113,7 @@ class HoleCompletionParameters:
     margin_units: float = 0.1  # of the lattice around the points, in unit coordinates
     hole_distance_radii: float = 3.0  # from a hole's cells to all points
     max_winding_offset: float = 0.3  # of the winding number in a hole from one half
+    winding_slack: float = 0.05  # by which it is farther off at all nodes around a place that is not looked at
     min_hole_cells: int = 12  # of a hole; fewer are chance
     max_holes: int = 16  # the largest ones, for time
     max_hole_units: float = 1.2  # width of a hole, unit coordinates: a wider one is a side that was not scanned
