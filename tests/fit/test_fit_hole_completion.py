@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import made_shapes
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from gnrecon.fit.shape_priors.bores import in_bore_opening
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, are_in_a_hole, complete_holes, encloses
 from gnrecon.fit.shape_priors.min_cut import minimal_inside
 from gnrecon.fit.shape_priors.primitive_detection import detect_primitives, planar_share
-from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, is_inlier
+from gnrecon.fit.shape_priors.primitives import Cylinder, Plane, Sphere, is_inlier, project
 from gnrecon.fit.shape_priors.prior_parameters import DetectionParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -230,6 +232,29 @@ def test_the_side_of_a_can_goes_on() -> None:
     assert len(across) > 20
     np.testing.assert_allclose(np.hypot(across.points[:, 0], across.points[:, 1]), 0.4, atol=1e-9)
     assert np.abs(across.points[:, 2]).max() < 0.4
+
+
+@pytest.mark.parametrize("surface", [Cylinder(np.zeros(3), np.eye(3)[2], 0.5, -1.0), Sphere(np.zeros(3), 0.5, 1.0)])
+def test_a_round_primitive_is_fitted_where_no_step_comes_nearer(surface: Cylinder | Sphere) -> None:
+    rng, size = np.random.default_rng(3), 0.05
+
+    def cost(one: Cylinder | Sphere) -> float:
+        heights, turns = one.signed_distance(points) / size, 0.3 * (one.normal(points) - normals)
+        return float(np.square(heights).sum() + np.square(turns).sum())
+
+    def moved(one: Cylinder | Sphere, by: float) -> Cylinder | Sphere:
+        center, radius = one.center + by * rng.standard_normal(3), one.radius + by * rng.standard_normal()
+        if isinstance(one, Sphere):
+            return replace(one, center=center, radius=radius)
+        axis = one.axis + by * rng.standard_normal(3)
+        return replace(one, center=center, radius=radius, axis=axis / np.linalg.norm(axis))
+
+    points = project(surface, rng.uniform(-0.6, 0.6, (60, 3)))
+    points, normals = noisy(points, surface.normal(points), 0.01, 0.1)
+    found = moved(surface, 0.05).refitted(points, normals, size, 0.3)
+    assert found.side == surface.side
+    assert cost(found) < cost(surface)
+    assert min(cost(moved(found, by)) for by in (1e-4, 1e-3, 1e-2) for _ in range(50)) > cost(found)
 
 
 def test_a_place_is_in_a_hole_until_that_is_closed() -> None:

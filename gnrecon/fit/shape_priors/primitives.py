@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import leastsq
 
 from gnrecon.fit.shape_priors.prior_parameters import DetectionParameters
 from gnrecon.geometry.arrays import Float, Mask
@@ -91,12 +91,24 @@ class Cylinder:
             center = self.center + step[2] * aside + step[3] * upward
             return Cylinder(center, turned / np.linalg.norm(turned), step[4], self.side)
 
-        def residuals(step: Float) -> Float:
-            trial = moved(step)
-            turn = normal_weight * (trial.normal(points) - normals)
-            return np.concatenate([trial.signed_distance(points) / radius, turn.ravel()])
+        fit = _RoundFit(points, normals, self.side, radius, normal_weight)
 
-        return moved(_minimised(residuals, [0.0, 0.0, 0.0, 0.0, self.radius]))
+        def residuals(step: Float) -> Float:
+            return fit.residuals(moved(step)._off_axis(points), step[4])
+
+        def jacobian(step: Float) -> Float:
+            trial = moved(step)
+            size = np.linalg.norm(axis + step[0] * aside + step[1] * upward)
+            off, moves = points - trial.center, []
+            for along in (aside, upward):
+                # How the axis turns; what is along it moves across.
+                turn = (along - (along @ trial.axis) * trial.axis) / size
+                moves.append(-(off @ turn)[:, None] * trial.axis - (off @ trial.axis)[:, None] * turn)
+            for along in (aside, upward):
+                moves.append(np.broadcast_to((along @ trial.axis) * trial.axis - along, off.shape))
+            return fit.jacobian(trial._off_axis(points), np.stack(moves))
+
+        return moved(_minimised(residuals, jacobian, [0.0, 0.0, 0.0, 0.0, self.radius]))
 
     def _off_axis(self, x: Float) -> Float:
         """Return the vectors from the axis to x, both of shape (Q, 3)."""
@@ -140,13 +152,59 @@ class Sphere:
     ) -> Sphere:
         """Return the least-squares sphere of points and normals; the parameters are those of `Cylinder.refitted`."""
 
-        def residuals(step: Float) -> Float:
-            trial = Sphere(self.center + step[:3], step[3], self.side)
-            turn = normal_weight * (trial.normal(points) - normals)
-            return np.concatenate([trial.signed_distance(points) / radius, turn.ravel()])
+        fit = _RoundFit(points, normals, self.side, radius, normal_weight)
+        moves = np.broadcast_to(-np.eye(3)[:, None], (3, *points.shape))
 
-        found = _minimised(residuals, [0.0, 0.0, 0.0, self.radius])
+        def residuals(step: Float) -> Float:
+            return fit.residuals(points - self.center - step[:3], step[3])
+
+        def jacobian(step: Float) -> Float:
+            return fit.jacobian(points - self.center - step[:3], moves)
+
+        found = _minimised(residuals, jacobian, [0.0, 0.0, 0.0, self.radius])
         return Sphere(self.center + found[:3], float(found[3]), self.side)
+
+
+@dataclass(frozen=True)
+class _RoundFit:
+    """Heights of oriented points over a round primitive, and the differences of its normals from theirs.
+
+    Parameters
+    ----------
+    points, normals, side, radius, normal_weight : as in `Cylinder` and `Cylinder.refitted`
+    """
+
+    points: Float
+    normals: Float
+    side: float
+    radius: float
+    normal_weight: float
+
+    def residuals(self, away: Float, size: float) -> Float:
+        """Return the residuals, of shape (4 N,), of points at `away`, of shape (N, 3), from the axis or centre."""
+        distance, outward = self._outward(away)
+        turn = self.normal_weight * (self.side * outward - self.normals)
+        return np.concatenate([self.side * (distance - size) / self.radius, turn.ravel()])
+
+    def jacobian(self, away: Float, moves: Float) -> Float:
+        """Return their derivatives, of shape (K + 1, 4 N): by K unknowns, and by the primitive's radius.
+
+        `moves` are the derivatives of `away` by the unknowns, of shape (K, N, 3).
+        """
+        distance, outward = self._outward(away)
+        along = np.einsum("knd,nd->kn", moves, outward)
+        turn = (moves - along[:, :, None] * outward) / distance[:, None]
+        found = np.zeros((len(moves) + 1, 4 * len(away)))
+        found[:-1, : len(away)] = self.side / self.radius * along
+        found[:-1, len(away) :] = self.side * self.normal_weight * turn.reshape(len(moves), -1)
+        found[-1, : len(away)] = -self.side / self.radius
+        return found
+
+    @staticmethod
+    def _outward(away: Float) -> tuple[Float, Float]:
+        distance = np.sqrt(np.einsum("nd,nd->n", away, away))
+        distance = np.maximum(distance, 1e-12)
+        return distance, away / distance[:, None]
 
 
 Primitive = Plane | Cylinder | Sphere
@@ -177,12 +235,28 @@ def cosine_of(degrees: float) -> float:
     return float(np.cos(np.radians(degrees)))
 
 
-def _minimised(residuals: Callable[[Float], Float], start: list[float], *, max_evaluations: int = 60) -> Float:
-    """Return where the sum of squared residuals is least, by Levenberg-Marquardt.
+def _minimised(
+    residuals: Callable[[Float], Float],
+    jacobian: Callable[[Float], Float],
+    start: list[float],
+    *,
+    max_evaluations: int = 60,
+    tolerance: float = 1e-8,
+) -> Float:
+    """Return where the sum of squared residuals, of shape (M,), is least, by Levenberg-Marquardt.
 
-    `max_evaluations` bounds the time of a proposal that fits badly.
+    Parameters
+    ----------
+    residuals, jacobian : of the unknowns, of shape (K,); the latter has the shape (K, M)
+    start : the unknowns to start from
+    max_evaluations : bounds the time of a proposal that fits badly
+    tolerance : of the sum of squares, the unknowns and the gradient, relative
     """
-    found: Float = least_squares(residuals, start, method="lm", max_nfev=max_evaluations).x
+    # Points are few, so that `least_squares`, which checks each evaluation, would take several times as long.
+    tolerances = {"ftol": tolerance, "xtol": tolerance, "gtol": tolerance, "diag": np.ones(len(start))}
+    found: Float = leastsq(
+        residuals, start, Dfun=jacobian, col_deriv=True, full_output=True, maxfev=max_evaluations, **tolerances
+    )[0]
     return found
 
 
