@@ -163,13 +163,21 @@ def _two_sided(
     """
     areas = np.concatenate([areas, np.pi * disks**2])
     sources, directions = np.concatenate([samples, rest]), np.concatenate([sample_normals, normals])
-    kept = kept.copy()
+    dipoles, radii = directions * (areas / (4 * np.pi))[:, None], np.sqrt(areas / np.pi)
+
+    def seen(at: Int, some: Int) -> Float:
+        """Return the winding number of some sources at some samples."""
+        return winding_number(samples[at], sources[some], dipoles[some], radii[some], torch.float32)
+
+    at = np.flatnonzero(kept)
+    winding = seen(at, np.concatenate([at, np.arange(len(samples), len(sources))]))
     for _ in range(rounds):
-        some = np.concatenate([kept, np.ones(len(rest), dtype=bool)])
-        dipoles = directions[some] * (areas[some] / (4 * np.pi))[:, None]
-        winding = winding_number(samples[kept], sources[some], dipoles, np.sqrt(areas[some] / np.pi), torch.float32)
-        kept[kept] = np.abs(winding - 0.5) < max_winding_offset
-    return kept
+        stays = np.abs(winding - 0.5) < max_winding_offset
+        gone, at, winding = at[~stays], at[stays], winding[stays]
+        if not len(gone):
+            break
+        winding -= seen(at, gone)
+    return np.isin(np.arange(len(samples)), at)
 
 
 def _with_small_planes(
