@@ -262,6 +262,7 @@ def test_a_place_is_in_a_hole_until_that_is_closed() -> None:
     places = np.array([[SIDE, SIDE, 0.0], [0.0, 0.0, 0.0], [0.0, SIDE + 0.3, 0.0], [0.0, SIDE + 0.02, 0.0]])
     assert [are_in_a_hole(place[None], points, normals) for place in places] == [True, False, False, False]
     assert are_in_a_hole(places, points, normals)
+    assert not are_in_a_hole(places, points[:1], normals[:1])
     assert not are_in_a_hole(places, *complete_holes(points, normals).appended_to(points, normals))
 
 

@@ -135,11 +135,11 @@ def test_a_fit_keeps_the_parameters_of_the_least_held_out_residuals() -> None:
     noise = 0.02 * np.random.default_rng(1).standard_normal((1000, 1))
     samples = sphere(1000)
     noisy = Samples(samples.points * (1 + noise), samples.normals, FRAME)
-    sdf, solution = fit(noisy, FitOptions(widths=(16, 16), steps=40))
+    sdf, solution = fit(noisy, FitOptions(widths=(16, 16), steps=80))
     values = [record.held_out for record in solution.history]
     assert all(value is not None for value in values)
     assert "held-out" in solution.status
-    assert len(values) < 40
+    assert len(values) < 80  # 36 to 43, by the rounding of the processor and its threads
     assert np.abs(sdf.sdf(FRAME.to_world(RADIUS * directions(200, 2)))).mean() < 0.01 * FRAME.scale
 
 

@@ -95,10 +95,12 @@ def are_in_a_hole(
     normals: Float,
     parameters: HoleCompletionParameters = HoleCompletionParameters(),
 ) -> bool:
-    """Return whether any of some places, of shape (Q, 3), is in a hole of a scan.
+    """Return whether any of some places, of shape (Q, 3), is in a hole of a scan that is not too small to have any.
 
     The other parameters are those of `complete_holes`.
     """
+    if len(points) < parameters.min_points:
+        return False
     scan = _HoleScan.of(points, normals, True, np.random.default_rng(0), parameters, roughness=0.0)
     return bool((np.abs(scan.winding_offset(places)) < parameters.max_winding_offset).any())
 

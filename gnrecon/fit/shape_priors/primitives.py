@@ -202,8 +202,8 @@ class _RoundFit:
 
     @staticmethod
     def _outward(away: Float) -> tuple[Float, Float]:
-        distance = np.sqrt(np.einsum("nd,nd->n", away, away))
-        distance = np.maximum(distance, 1e-12)
+        """Return the distances, of shape (N,), and the directions, of shape (N, 3)."""
+        distance = np.maximum(np.sqrt(np.einsum("nd,nd->n", away, away)), 1e-12)
         return distance, away / distance[:, None]
 
 
