@@ -124,11 +124,10 @@ def test_the_first_command_makes_what_the_first_screen_shows(scratch: dict[Path,
         assert run(first, folder).returncode == 0
     truth = read_mesh(folder / "sample_data" / "bracket_reference.ply")
     found = measure(read_mesh(mesh), truth, samples=20_000)
-    for title, value, room in (("mean distance", found.chamfer_mean, 1.2), ("largest distance", found.hausdorff, 2.5)):
+    for title, value, room in (("mean distance", found.chamfer_mean, 1.2), ("largest distance", found.hausdorff, 1.5)):
         stated = re.search(rf"^\| {title}.*? \| ([0-9.]+) mm", DOCUMENTS[0].read_text(), re.MULTILINE)
         assert stated is not None
-        # Another processor rounds differently, which moved the largest distance from 0.55 to 1.06 mm; beyond that,
-        # scripts/make_first_screen.py makes the figures again.
+        # Another processor rounds differently; beyond that, scripts/make_first_screen.py makes the figures again.
         assert value < room * float(stated[1]), title
 
 

@@ -10,7 +10,7 @@ default those of the small bracket in the repository's `sample_data`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +83,7 @@ class ScanFiles:
             return scanned(every, name=name, seed=seed), every.frame
         count = max(fewest_points, round(self.share * len(every)))
         rows = np.sort(np.random.default_rng(seed).permutation(len(every))[:count])
-        kept = replace(every, points=every.points[rows], normals=every.normals[rows])
+        kept = every.select(rows)
         return scanned(kept, every, name, seed), every.frame
 
 

@@ -87,7 +87,7 @@ def without_smooth_patches(samples: Samples, against: Mask, *, neighbours: int =
 
 def _slopes(samples: Samples, rows: Int, options: FitOptions, rng: np.random.Generator, units: int) -> Float:
     """Return how steeply a field that is fitted without normals rises along them, of shape (N,)."""
-    seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
+    seen = samples.select(rows)
     scene, field = Scene.of(seen, options.device, rng), Siren((units,))
 
     data = [ObjectiveTerm("interface", interface, scene.points)]

@@ -96,7 +96,7 @@ def fit_global(
     FitError
         When the linear system cannot be solved.
     """
-    seen = replace(samples, points=samples.points[rows], normals=samples.normals[rows])
+    seen = samples.select(rows)
     scene = Scene.of(seen, options.device, rng)
 
     def solved(advance: ProgressCallback) -> GlobalField:

@@ -152,11 +152,10 @@ class _Data:
 
     def without(self, outliers: Mask) -> _Data:
         """Return the data without some points of the scan, by a mask; its faces were not extended to their edges."""
-        scan = replace(self.scan, points=self.scan.points[~outliers], normals=self.scan.normals[~outliers])
         kept = ~np.concatenate([outliers, np.zeros(len(self.across), dtype=bool)])
-        samples = replace(self.samples, points=self.samples.points[kept], normals=self.samples.normals[kept])
-        seen = np.isin(np.flatnonzero(kept), self.seen)
-        return _Data(scan, samples, self.held_out[kept], np.flatnonzero(seen), None, self.across)
+        seen = np.flatnonzero(np.isin(np.flatnonzero(kept), self.seen))
+        scan, samples = self.scan.select(~outliers), self.samples.select(kept)
+        return _Data(scan, samples, self.held_out[kept], seen, None, self.across)
 
 
 @dataclass(frozen=True)
@@ -268,8 +267,8 @@ class _Steps:
         """Return the completed data without outliers of the scan; `data` was there before its holes were completed."""
         scan, priors = data.scan, self.parameters.shape_priors
         if data.sharp is not None:
-            scan = replace(scan, points=scan.points[~outliers], normals=scan.normals[~outliers])
-            return self._completed(self._draw(scan, SharpShape.of(scan, priors)))
+            rest = scan.select(~outliers)
+            return self._completed(self._draw(rest, SharpShape.of(rest, priors)))
         left = completed.without(outliers)
         hidden = are_in_a_hole(scan.points[outliers], left.samples.points, left.samples.normals, priors.holes)
         return self._completed(data.without(outliers)) if hidden else left

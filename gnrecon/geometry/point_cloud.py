@@ -159,6 +159,10 @@ class Samples:
     def __len__(self) -> int:
         return len(self.points)
 
+    def select(self, rows: Mask | Int) -> Samples:
+        """Return the samples of the given rows (a mask of shape (N,), or indices), with all else as it is."""
+        return replace(self, points=self.points[rows], normals=self.normals[rows])
+
 
 BoxCorners = tuple[Sequence[float], Sequence[float]]
 

@@ -87,7 +87,7 @@ def scanned(
     parameters : weights, points and distances
     """
     order = kd_tree_order(samples.points)
-    samples = replace(samples, points=samples.points[order], normals=samples.normals[order])
+    samples = samples.select(order)
     box = Box.around(samples.points, parameters.box_margin_radii)
     network = Network(parameters.widths, SINE, (parameters.first_layer_frequency,))
     # A point with a normal has two residuals.

@@ -97,6 +97,7 @@ class Cylinder:
             return fit.residuals(moved(step)._off_axis(points), step[4])
 
         def jacobian(step: Float) -> Float:
+            """Return the derivatives of the residuals by the step."""
             trial = moved(step)
             size = np.linalg.norm(axis + step[0] * aside + step[1] * upward)
             off, moves = points - trial.center, []
