@@ -58,6 +58,7 @@ from gnrecon.report.run_report import FinishedMesh, Fitted, Ingested, MeshedScan
 from gnrecon.report.scan_limits import coarse_parts_remark, few_points_remark, thin_sheet_remark
 from gnrecon.runtime.compute_limits import limited, require_device
 from gnrecon.runtime.logs import ALREADY_SHOWN
+from gnrecon.runtime.parallel import in_background
 from gnrecon.version import __version__
 from gnrecon.vertex_attributes import AttributeSources, compute_attributes, requested_names, without_unsupported
 
@@ -272,11 +273,11 @@ def _read(run: _PipelineRun, source: Any, normals: Any, format: str | None, refe
 
 def _ingest(run: _PipelineRun, scan: ScanRead) -> tuple[Ingested, ScanRead]:
     """Clean and thin the points, orient their normals, choose a resolution; return the scan without garbage, too."""
-    with run.stages("ingest"):
+    with run.stages("ingest"), in_background(lambda: survey(scan.cloud)) as surveyed:
         samples, counts = prepare(scan.cloud, **run.options.ingest(), advance=run.progress.advance)
         points, noise = samples.frame.to_world(samples.points), (samples.noise or 0.0) * samples.frame.scale
         sheet = sheet_thickness(points, samples.normals, noise)
-        ingested = Ingested(samples, counts, survey(scan.cloud), layers_of(samples, counts.normals), sheet)
+        ingested = Ingested(samples, counts, surveyed(), layers_of(samples, counts.normals), sheet)
     bounds = bounds_of(samples)
     run.options = run.options.for_scan(points, bounds, sheet)
     run.options.require_reachable(bounds)
@@ -351,11 +352,10 @@ def _finish(
     with run.stages("verify"):
         facts = require_bordered(mesh) if trimming is not None and trimming.area_share else require_sound(mesh)
     with run.stages("attributes"):
-        distances = surface.neighbourhood.distances(mesh.vertices)
+        near, samples = surface.neighbourhood, ingested.samples
+        distances = near.distances(mesh.vertices)
         unsupported = unsupported_area(mesh, distances, surface.spacing)
-        sources = AttributeSources(
-            mesh, fitted.sdf, scan.cloud, surface.neighbourhood, distances, ingested.samples, run.options
-        )
+        sources = AttributeSources(mesh, fitted.sdf, scan.cloud, near, distances, samples, run.options)
         mesh, attributes, remarks = compute_attributes(sources, run.progress.advance)
     run.remark([*(unsupported.describe() if trimming is None else []), *remarks])
     finished = FinishedMesh(mesh, facts, unsupported, attributes, None)

@@ -6,7 +6,6 @@ stderr. Each foreseen failure ends in one sentence and the exit code of `gnrecon
 
 from __future__ import annotations
 
-import gc
 import os
 import shlex
 import sys
@@ -36,6 +35,7 @@ from gnrecon.runtime.errors import ExitCode, failure
 from gnrecon.runtime.files import one_line
 from gnrecon.runtime.interrupts import ignore_interrupts, polite_ends, reraised
 from gnrecon.runtime.memory_budget import is_capped, require_room_for_libraries
+from gnrecon.runtime.process import end_process, settle_process
 from gnrecon.version import __version__
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -78,8 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         if is_capped():
             continue_in_child()
         if arguments is None:
-            # Imports make many objects and no garbage, for which Python would look five hundred times.
-            gc.set_threshold(50_000)
+            settle_process(os.environ)
         words = list(sys.argv[1:] if arguments is None else arguments)
         try:
             code = _run(words)
@@ -88,8 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         ignore_interrupts()
         code = streams.exit_code(code)
     if arguments is None:
-        # Python would look for garbage among all objects of the libraries, several times, before it ends.
-        gc.freeze()
+        end_process(code)
     sys.exit(code)
 
 
@@ -102,8 +100,6 @@ def _run(words: list[str]) -> int:
     # Warnings of libraries are for programmers; -W and PYTHONWARNINGS show them.
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
-    # On a busy machine, threads that spin while they wait slow the run down several times.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         if words or "_GNRECON_COMPLETE" in os.environ:  # a shell that completes a line gives no words
             return _guarded(words, command)

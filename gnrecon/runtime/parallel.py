@@ -178,6 +178,20 @@ def map_in_threads(
                 workers.close()
 
 
+@contextmanager
+def in_background(work: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+    """Do some work in a thread of its own while the block runs, and give it a function that returns the result.
+
+    Where there is one worker, the work is done when its result is wanted. It has one thread of torch either way, and is
+    waited for at the end of the block.
+    """
+    if worker_count() < 2:
+        yield work
+        return
+    with ThreadPoolExecutor(1, initializer=set_threads, initargs=(1,)) as pool:
+        yield pool.submit(work).result
+
+
 class _Runs:
     """What runs that share the time of a caller have in common: its request that they end, and calls that it makes."""
 

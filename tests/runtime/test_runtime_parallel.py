@@ -27,6 +27,7 @@ from gnrecon.runtime.parallel import (
     call_outside,
     end_if_asked,
     fixed_sums,
+    in_background,
     map_in_threads,
     run_in_threads,
     set_threads,
@@ -284,3 +285,34 @@ def test_an_interrupt_that_no_run_has_seen_is_not_lost() -> None:
 def test_a_run_that_fails_fails_the_call() -> None:
     with fixed_sums(2), pytest.raises(ZeroDivisionError):
         run_in_threads(lambda number: 1 / number, [1, 0])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_background_work_has_one_torch_thread_and_gives_its_result(threads: int) -> None:
+    begun = Event()
+
+    def work() -> tuple[int, int]:
+        begun.set()
+        return torch.get_num_threads(), get_ident()
+
+    with fixed_sums(threads), in_background(work) as result:
+        # With two workers it runs beside the block; with one, not before it is asked for.
+        assert begun.wait(10.0 if threads == 2 else 0.0) == (threads == 2)
+        of_torch, thread = result()
+    assert of_torch == 1
+    assert (thread != get_ident()) == (threads == 2)
+
+
+def test_background_work_ends_with_the_block_and_fails_where_its_result_is_wanted() -> None:
+    ended = Event()
+
+    def work() -> None:
+        time.sleep(0.1)
+        ended.set()
+        raise ZeroDivisionError
+
+    with fixed_sums(2), pytest.raises(OSError, match="of the block"), in_background(work):
+        raise OSError("of the block")
+    assert ended.is_set()
+    with fixed_sums(2), in_background(work) as result, pytest.raises(ZeroDivisionError):
+        result()
