@@ -11,10 +11,10 @@ import pytest
 
 
 def run_python(program: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a program without this process's variable for heaps, and with the given ones."""
-    kept = {name: value for name, value in os.environ.items() if name not in ("MALLOC_ARENA_MAX", "PYTHONPATH")}
-    path = os.pathsep.join(entry for entry in sys.path if entry)
-    environment = {**kept, "PYTHONPATH": path, **variables}
+    """Run a program without this process's variables for threads and heaps, and with the given ones."""
+    settled = ("MALLOC_ARENA_MAX", "OMP_WAIT_POLICY")
+    kept = {name: value for name, value in os.environ.items() if name not in settled}
+    environment = {**kept, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables}
     return subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=60)
 
 
