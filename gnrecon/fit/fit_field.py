@@ -27,9 +27,11 @@ from gnrecon.fit.two_level import fit_two_level
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.errors import FitError, UsageError
+from gnrecon.runtime.parallel import fixed_sums
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
+@fixed_sums(None)
 def fit(
     samples: Samples,
     options: FitOptions | None = None,
@@ -42,7 +44,8 @@ def fit(
 ) -> tuple[NeuralSDF, Solution]:
     """Fit a sine network to the signed distance of oriented points.
 
-    An interrupt (Ctrl-C) during the steps keeps the best field so far; `Solution.interrupted` then says so.
+    The field does not depend on the number of threads. An interrupt (Ctrl-C) during the steps keeps the best field so
+    far; `Solution.interrupted` then says so.
 
     Parameters
     ----------

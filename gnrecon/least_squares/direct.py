@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from gnrecon.least_squares.blocked_cholesky import lower_factor
 from gnrecon.least_squares.jacobian import Jacobian
 from gnrecon.least_squares.system import Equations, Linearisation, Metric, Step
 
@@ -54,14 +55,13 @@ class Cholesky:
 
 
 def damped_factor(product: Tensor, diagonal: Tensor, overwrite: bool = False) -> Tensor | None:
-    """Return the lower Cholesky factor of `product` + diag(`diagonal`), or None where that is not positive definite.
+    """Return the Cholesky factor of `product` + diag(`diagonal`), or None where that is not positive definite.
 
-    With `overwrite`, `product` is changed in place, which saves a copy.
+    The lower triangles of both matrices are valid. With `overwrite`, `product` is changed in place, which saves a copy.
     """
     damped = product if overwrite else product.clone()
     damped.diagonal().add_(diagonal)
-    factor, failed = torch.linalg.cholesky_ex(damped)
-    return None if int(failed) or not bool(torch.isfinite(factor.diagonal()).all()) else factor
+    return lower_factor(damped)
 
 
 def rounded_factor(product: Tensor, diagonal: Tensor, stored: torch.dtype) -> Tensor | None:

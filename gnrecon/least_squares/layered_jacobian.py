@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -17,6 +18,8 @@ from torch import Tensor
 from gnrecon.least_squares.jacobian import Block, column_slices
 from gnrecon.least_squares.layer_products import gram
 from gnrecon.runtime.parallel import map_in_threads
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -64,28 +67,38 @@ class LayeredJacobian:
 
     def mv(self, v: Tensor) -> Tensor:
         """Return J v, of shape (M,)."""
-        product, start = self._zeros(self.rows), 0
-        parts: dict[torch.dtype, list[Tensor]] = {}
-        for block in self.blocks():
+
+        def rows_of(block: Block) -> Tensor:
             stored = _stored(block)
-            if stored not in parts:
-                parts[stored] = [v[group].to(stored) for group in self.groups]
-            stop = start + len(block[0])
-            for layer, part in zip(block, parts[stored], strict=True):
-                product[start:stop] += layer.mv(part)
-            start = stop
-        return product
+            product = self._zeros(len(block[0]))
+            for layer, group in zip(block, self.groups, strict=True):
+                product += layer.mv(v[group].to(stored))
+            return product
+
+        return torch.cat([self._zeros(0), *self._of_blocks(rows_of, self.blocks())])
 
     def tmv(self, u: Tensor) -> Tensor:
         """Return J^T u, of shape (p,)."""
-        product, start = self._zeros(self.columns), 0
-        for block in self.blocks():
-            stop = start + len(block[0])
-            part = u[start:stop].to(_stored(block))
-            for layer, group in zip(block, self.groups, strict=True):
-                product[group] += layer.tmv(part)
-            start = stop
-        return product
+
+        def sums_of(placed: tuple[Block, slice]) -> Tensor:
+            block, rows = placed
+            part = u[rows].to(_stored(block))
+            return torch.cat([layer.tmv(part) for layer in block])
+
+        return self._sum(sums_of, _placed(self.blocks()))
+
+    def _sum(self, work: Callable[[Item], Tensor], blocks: Iterable[Item]) -> Tensor:
+        """Return the sum of what a function makes of the blocks, of shape (p,), added in their order."""
+        total = self._zeros(self.columns)
+        for part in self._of_blocks(work, blocks):
+            total += part
+        return total
+
+    def _of_blocks(self, work: Callable[[Item], Tensor], blocks: Iterable[Item]) -> Iterable[Tensor]:
+        """Return what a function makes of each block: in threads where they are kept, else one after the other."""
+        if self.kept:
+            return map_in_threads(work, list(blocks), self.device, brief=True)
+        return map(work, blocks)
 
     def dense(self) -> Iterator[Tensor]:
         """Yield chunks of rows, in the precision in which the factors are stored, of at most `chunk_bytes`."""
@@ -171,21 +184,18 @@ class LayeredJacobian:
 
     def diagonal(self) -> Tensor:
         """Return the diagonal of J^T J, of shape (p,)."""
-        squares = self._zeros(self.columns)
-        for block in self.blocks():
-            for layer, group in zip(block, self.groups, strict=True):
-                squares[group] += layer.squares()
-        return squares
+        return self._sum(lambda block: torch.cat([layer.squares() for layer in block]), self.blocks())
 
     def row_squares(self) -> Tensor:
         """Return the squared lengths of the rows, of shape (M,)."""
-        squares, start = self._zeros(self.rows), 0
-        for block in self.blocks():
-            stop = start + len(block[0])
+
+        def squares_of(block: Block) -> Tensor:
+            squares = self._zeros(len(block[0]))
             for layer in block:
-                squares[start:stop] += layer.row_squares()
-            start = stop
-        return squares
+                squares += layer.row_squares()
+            return squares
+
+        return torch.cat([self._zeros(0), *self._of_blocks(squares_of, self.blocks())])
 
     def sample(self, rows: Tensor) -> LayeredJacobian:
         """Return the Jacobian of the given rows, with stored factors."""
@@ -220,6 +230,14 @@ class LayeredJacobian:
                 for layer, group in zip(part, self.groups, strict=True):
                     layer.write_runs(length, sums[:, group])
                 yield sums
+
+
+def _placed(blocks: Iterable[Block]) -> Iterator[tuple[Block, slice]]:
+    """Yield blocks with their rows of J."""
+    start = 0
+    for block in blocks:
+        yield block, slice(start, start + len(block[0]))
+        start += len(block[0])
 
 
 def _without_zero_rows(block: Block, *, most_nonzero: float = 0.9) -> Block:

@@ -145,6 +145,8 @@ def map_in_threads(
     items: Sequence[Item],
     device: str | torch.device = "cpu",
     advance: ProgressCallback = ignore_progress,
+    *,
+    brief: bool = False,
 ) -> list[Result]:
     """Return ``work(item)`` for all items, in their order, computed in `worker_count` threads.
 
@@ -157,15 +159,18 @@ def map_in_threads(
     items : sequence
     device : where the work is done; on a GPU the calls run one after the other
     advance : called with the share of items that are done
+    brief : whether the calls take no longer than to start threads, so that only those of `fixed_sums`, which stay, are
+        worth it
     """
 
     def report(result: Result, number: int) -> Result:
         advance(number / len(items))
         return result
 
-    if min(worker_count(), len(items)) <= 1 or torch.device(device).type != "cpu":
-        return [report(work(item), number) for number, item in enumerate(items, 1)]
     kept = _workers.get()
+    alone = min(worker_count(), len(items)) <= 1 or (brief and kept is None)
+    if alone or torch.device(device).type != "cpu":
+        return [report(work(item), number) for number, item in enumerate(items, 1)]
     workers = kept or _Workers(worker_count())
     with _one_blas_thread:
         futures = [workers.pool.submit(work, item) for item in items]

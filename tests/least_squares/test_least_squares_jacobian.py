@@ -16,6 +16,7 @@ from torch import Tensor
 from gnrecon.least_squares import DenseJacobian, Jacobian, LayeredJacobian, LayerRows
 from gnrecon.least_squares import layered_jacobian as module
 from gnrecon.least_squares.layer_products import gram
+from gnrecon.runtime.parallel import fixed_sums
 
 Made = tuple[Jacobian, Tensor]
 
@@ -125,6 +126,25 @@ def test_scaled_kernel_and_sample(make: Callable[[int, torch.dtype], Made], stor
     assert (sampled.rows, sampled.columns) == (len(some), J.shape[1])
     close(sampled.gram().tril(), (J[some].T @ J[some]).tril(), stored)
     close(sampled.mv(torch.ones(J.shape[1], dtype=jacobian.dtype)), J[some].sum(1), stored)
+
+
+@pytest.mark.parametrize("stored", [F64, torch.float32])
+def test_products_of_kept_blocks_are_the_same_for_any_number_of_threads(stored: torch.dtype) -> None:
+    jacobian, matrix = layered(3, rows=[(400, 0), (300, 1), (1, 1), (250, 4)], widths=(3, 16, 16, 1), stored=stored)
+    jacobian = replace(jacobian, kept=True)
+    generator = torch.Generator().manual_seed(0)
+    v, u = randn(generator, jacobian.columns), randn(generator, jacobian.rows)
+    found = []
+    for threads in (1, 2, 3):
+        with fixed_sums(threads):
+            found.append((jacobian.mv(v), jacobian.tmv(u), jacobian.diagonal(), jacobian.row_squares()))
+    for others in found[1:]:
+        assert all(map(torch.equal, found[0], others))
+    wanted = matrix @ v, matrix.T @ u, matrix.square().sum(0), matrix.square().sum(1)
+    for product, right in zip(found[0], wanted, strict=True):
+        torch.testing.assert_close(
+            product, right, rtol=1e-3, atol=float(torch.finfo(stored).eps * 20 * right.abs().max())
+        )
 
 
 def test_rounded_factors_keep_the_precision_of_vectors() -> None:

@@ -194,6 +194,20 @@ def test_the_first_piece_that_fails_ends_the_work(count: int) -> None:
     assert len(begun) < 100
 
 
+def test_brief_pieces_are_done_by_kept_threads_or_by_the_caller() -> None:
+    def ident(_: int) -> int:
+        time.sleep(0.01)
+        return get_ident()
+
+    with limited(2, same_bytes=False):
+        assert set(map_in_threads(ident, range(4), brief=True)) == {get_ident()}
+    with fixed_sums(2):
+        first = set(map_in_threads(ident, range(4), brief=True))
+        assert first == set(map_in_threads(ident, range(4), brief=True))
+    assert get_ident() not in first
+    assert len(first) == 2
+
+
 def test_importing_gnrecon_imports_no_heavy_library() -> None:
     script = f"import sys, gnrecon\ndir(gnrecon)\nprint([name for name in {HEAVY} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=REPOSITORY, check=True)

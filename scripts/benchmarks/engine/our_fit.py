@@ -32,6 +32,7 @@ from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.least_squares import SOLVERS, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 from gnrecon.residuals import interface, normal_vector, signed_distance
+from gnrecon.runtime.parallel import fixed_sums
 
 OnRecord = Callable[[float, Tensor], None]
 """Called with the seconds so far, without its own, and theta, of shape (p,)."""
@@ -81,7 +82,9 @@ def our_fit(
     search = GainRatioDamping(initial_damping=initial_damping, metric=layer_scaled, geodesic=True)
     steps = 1_000_000
     stop = StopRule(steps, tolerance=0.0, patience=steps, seconds=seconds - clock.seconds)
-    report(GaussNewton(search, solver).run(problem_at, start, stop).theta)
+    with fixed_sums(None):
+        solution = GaussNewton(search, solver).run(problem_at, start, stop)
+    report(solution.theta)
 
 
 def weights_at(number: int, *, eikonal_factor: float = 0.7, least_eikonal: float = 1e-2) -> LossWeights:

@@ -31,6 +31,7 @@ from gnrecon.field import Siren
 from gnrecon.fit.parameters import SingleNetworkParameters
 from gnrecon.least_squares import SOLVERS, Cholesky, Jacobian, layer_scaled
 from gnrecon.optim import GainRatioDamping, GaussNewton, Solution, StopRule
+from gnrecon.runtime.parallel import fixed_sums
 
 
 @dataclass(frozen=True)
@@ -50,15 +51,16 @@ class Frozen:
 def our_steps(frozen: Frozen, steps: int) -> tuple[Solution, str]:
     """Take so many of gnrecon's steps on the frozen sample; return the solution, and the solver's description.
 
-    The factors of the rows are stored in float32.
+    The factors of the rows are stored in float32, and threads share pieces of work and no sum, as in a fit.
     """
     solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
     search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled)
     field = Siren(frozen.widths)
     never = StopRule(steps=steps, tolerance=0.0, patience=steps + 1)
-    solution = GaussNewton(search, solver).run(
-        lambda _, theta: posed(field, theta, frozen.sample, torch.float32), frozen.theta, never
-    )
+    with fixed_sums(None):
+        solution = GaussNewton(search, solver).run(
+            lambda _, theta: posed(field, theta, frozen.sample, torch.float32), frozen.theta, never
+        )
     return solution, solver.describe()
 
 
