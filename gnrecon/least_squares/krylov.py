@@ -42,20 +42,32 @@ class KrylovResult:
 
 
 def conjugate_gradients(
-    apply: Apply, b: Tensor, precondition: Apply, tolerance: float, limit: int, energy: float = 0.0
+    apply: Apply,
+    b: Tensor,
+    precondition: Apply,
+    tolerance: float,
+    limit: int,
+    energy: float = 0.0,
+    start: KrylovResult | None = None,
 ) -> KrylovResult:
     """Solve A x = b, for b of shape (p,), in at most `limit` products.
 
     With P near A, r.P^-1 r approximates the squared error |x - A^-1 b|_A^2. The iteration also stops when the square
-    root of this falls below `energy` times its initial value.
+    root of this falls below `energy` times its value at x = 0. It begins there, or where another one, such as with a
+    worse preconditioner, has ended.
     """
     target = tolerance * norm(b)
     if not norm(b) > 0.0:
         return zero_solution(b)
+    z = precondition(b)
+    least = energy**2 * float(b @ z)
     x, r = torch.zeros_like(b), b.clone()
-    z = precondition(r)
+    if start is not None:
+        x, r = start.solution.clone(), start.rest.clone()
+        z = precondition(r)
+        if norm(r) <= target or 0.0 <= float(r @ z) <= least:
+            return KrylovResult(x, r, 0, True)
     p, rz = z.clone(), float(r @ z)
-    least = energy**2 * rz
     for count in range(1, limit + 1):
         if not 0.0 < rz < math.inf:
             return KrylovResult(x, r, count - 1, False, "The preconditioner is not positive definite.")

@@ -8,17 +8,23 @@ growing factors while trials fail. Source: Madsen, Nielsen, Tingleff, Methods fo
 *Geodesic acceleration.* Along theta + t s the residuals leave their linear model by t^2 r_ss / 2, their second
 derivative along s. The step that compensates for this within the model solves the same system with r_ss in place of r,
 and half of that solution a is added:  s + a / 2. r_ss takes one more evaluation,
-2 / h ((r(theta + h s) - r(theta)) / h - J s). A trial with |a|_D > 3/4 |s|_D is rejected, because the step is then
-longer than the range of the model. In the long, curved valleys of sine networks this halves the number of steps
-(docs/research/2026-11-21-step-control.md).
+2 / h ((r(theta + h s) - r(theta)) / h - J s). A step with |a|_D > 3/4 |s|_D is longer than the range of the model. In
+the long, curved valleys of sine networks this halves the number of steps (docs/research/2026-11-21-step-control.md).
 Source: Transtrum and Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
 minimization (2012).
+
+*Shorter steps.* To solve again with a larger damping takes many times as long as to evaluate the loss. So a trial goes
+along the curve  theta + t s + t^2 a / 2  only as far as the model's range, t = 3/4 |s|_D / |a|_D, where the criterion
+holds for t s and t^2 a. Where the loss has risen, the minimum of the parabola through its value and slope at the start
+and its new value is tried once, before the damping rises. Source: Nocedal and Wright, Numerical Optimization (2006),
+section 3.5, for the parabola and its bounds.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -40,7 +46,9 @@ class GainRatioDamping:
     length : fraction of an accepted step that is taken; if points are resampled at each step and the residuals do not
         vanish at the minimum, shorter steps average over more samples
     smallest : least damping
-    trials : rejected trials after which the parameters stay
+    trials : dampings after which the parameters stay
+    growth : factor of the damping after a first trial that is rejected, and after a step that had to be shorter
+    least_share : share of a step below which the damping rises instead
     """
 
     initial_damping: float = 1e-3
@@ -49,30 +57,44 @@ class GainRatioDamping:
     length: float = 1.0
     smallest: float = 1e-12
     trials: int = 10
+    growth: float = 2.0
+    least_share: float = 0.1
 
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
-        """Raise the damping until a step decreases the loss."""
-        start, growth, gain, iterations, failure = damping, 2.0, 0.0, 0, None
+        """Raise the damping until a step, or the part of it within the model's range, decreases the loss."""
+        start, growth, gain, iterations, failure = damping, self.growth, 0.0, 0, None
         for _ in range(self.trials):
             step = system.solve(damping)
             acceleration = self._acceleration(problem, system, free, damping, step)
             iterations += step.iterations + acceleration.iterations
             failure = step.failure
-            if step.predicted > 0.0 and _within_model(system.equations.metric, step, acceleration):
-                trial = free + (step.direction + acceleration.direction / 2).to(free.dtype)
-                loss = loss_of(problem, trial)
-                gain = (system.loss - loss) / step.predicted
-                if math.isfinite(loss) and gain > 0.0:
-                    easing = max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3)
-                    following = max(damping * easing, self.smallest)
+            if step.predicted > 0.0:
+                curve = _Curve(free, step, acceleration, system)
+                share, loss, gain = self._lowered(problem, curve)
+                if gain > 0.0:
+                    easing = max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3) if share == 1.0 else self.growth
+                    trial = free + self.length * (curve.at(share) - free)
                     if self.length < 1.0:
-                        trial = free + self.length * (trial - free)
                         loss = loss_of(problem, trial)
-                    return Move(trial, loss, damping, gain, self.length, following, iterations)
+                    following = max(damping * easing, self.smallest)
+                    return Move(trial, loss, damping, gain, self.length * share, following, iterations)
             damping *= growth
             growth *= 2.0
         # No trial decreased the loss; the next step, with other points, starts ten times as damped as this one did.
         return Move(free, system.loss, damping, gain, 0.0, start * 10, iterations, failure)
+
+    def _lowered(self, problem: Problem, curve: _Curve) -> tuple[float, float, float]:
+        """Return a share of a step, the loss there, and its gain ratio, which is not positive if the loss has risen."""
+        share, loss, gain = curve.range, math.inf, 0.0
+        for _ in range(2):
+            if share < self.least_share:
+                break
+            loss = loss_of(problem, curve.at(share))
+            gain = (curve.system.loss - loss) / curve.predicted(share) if math.isfinite(loss) else 0.0
+            if gain > 0.0:
+                break
+            share = curve.shorter(share, loss)
+        return share, loss, gain
 
     def _acceleration(
         self,
@@ -101,10 +123,43 @@ class GainRatioDamping:
         return f"Gauss-Newton with gain-ratio damping{' and geodesic acceleration' if self.geodesic else ''}."
 
 
-def _within_model(metric: Tensor, step: Step, acceleration: Step, *, largest_ratio: float = 0.75) -> bool:
-    """Whether |a|_D <= 3/4 |s|_D, the acceptance criterion of Transtrum and Sethna."""
-    square = float(metric @ acceleration.direction.square())
-    return square <= largest_ratio**2 * float(metric @ step.direction.square())
+@dataclass(frozen=True)
+class _Curve:
+    """theta + t s + t^2 a / 2 for a step s and its acceleration a, in the free parameters theta, of shape (k,)."""
+
+    free: Tensor
+    step: Step
+    acceleration: Step
+    system: DampedSystem
+
+    def at(self, share: float) -> Tensor:
+        """Return the parameters at t."""
+        return self.free + (share * self.step.direction + share**2 / 2 * self.acceleration.direction).to(self.free)
+
+    @cached_property
+    def slope(self) -> float:
+        """The derivative of the loss by t at the start."""
+        return float(self.step.direction @ self.system.equations.gradient)
+
+    def predicted(self, share: float) -> float:
+        """Return the decrease of the loss in the linear model, -t g.s - t^2 |J s|^2 / 2."""
+        return share**2 * self.step.predicted - (share - share**2) * self.slope
+
+    @cached_property
+    def range(self, *, largest_ratio: float = 0.75) -> float:
+        """The largest t up to one with |t^2 a|_D <= 3/4 |t s|_D, the acceptance criterion of Transtrum and Sethna."""
+        metric = self.system.equations.metric
+        squares = [float(metric @ part.direction.square()) for part in (self.step, self.acceleration)]
+        bends = largest_ratio**2 * squares[0] < squares[1]
+        return largest_ratio * math.sqrt(squares[0] / squares[1]) if bends else 1.0
+
+    def shorter(self, share: float, loss: float) -> float:
+        """Return where the parabola through the loss and its slope at the start, and a larger loss at t, is least.
+
+        It is a tenth to a half of t; 0 where the loss is not finite.
+        """
+        bend = loss - self.system.loss - share * self.slope
+        return share * min(max(-share * self.slope / (2 * bend), 0.1), 0.5) if math.isfinite(bend) else 0.0
 
 
 # Lengths along one direction: the paper's log-spaced line search, and a fixed multiple.

@@ -81,6 +81,31 @@ def test_every_iteration_brings_the_solution_nearer(method: Method, seed: int) -
         value = lower
 
 
+@few
+@seeds
+def test_a_solve_goes_on_where_another_has_ended(seed: int) -> None:
+    A, b = definite(seed)
+    begun = conjugate_gradients(A.mv, b, plain, 1e-12, 6)
+    assert not begun.converged
+    better: Apply = lambda r: torch.linalg.solve(A + 0.1 * torch.diag(A.diagonal()), r)  # noqa: E731
+    kept = begun.solution.clone(), begun.rest.clone()
+    whole = conjugate_gradients(A.mv, b, better, 1e-10, 100, energy=1e-3)
+    rest = conjugate_gradients(A.mv, b, better, 1e-10, 100, energy=1e-3, start=begun)
+    assert whole.converged
+    assert rest.converged
+    assert rest.iterations <= whole.iterations + 3
+    assert torch.equal(begun.solution, kept[0])
+    assert torch.equal(begun.rest, kept[1])
+    # Both end at the same share of the error of x = 0, as the preconditioner measures it, however near the start is.
+    for result in (whole, rest):
+        r = result.rest
+        assert float(r @ better(r)) <= 1e-6 * float(b @ better(b))
+        torch.testing.assert_close(result.rest, b - A @ result.solution, rtol=0.0, atol=1e-10 * float(b.norm()))
+    again = conjugate_gradients(A.mv, b, better, 1e-10, 100, energy=2e-3, start=rest)
+    assert (again.iterations, again.converged) == (0, True)
+    assert torch.equal(again.solution, rest.solution)
+
+
 def test_each_method_minimises_its_own_norm() -> None:
     A, b = definite(2)
     exact = torch.linalg.solve(A, b)

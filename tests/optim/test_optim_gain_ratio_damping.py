@@ -19,18 +19,44 @@ from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
 F64 = torch.float64
 
 
-def test_the_first_improvement_is_taken_and_eases_the_damping() -> None:
+@pytest.mark.parametrize(
+    ("script", "rejections"),
+    # A loss that is finite and no lower is asked for once more, at a share of the step.
+    [([1.0], []), ([math.nan, 1.0], [2.0]), ([1e6, 1e6, 1.0], [2.0]), ([1e6, math.nan, math.inf, 1.0], [2.0, 4.0])],
+)
+def test_the_first_improvement_is_taken_and_eases_the_damping(script: list[float], rejections: list[float]) -> None:
     search = GainRatioDamping(initial_damping=1e-2)
-    problem, system, theta = posed(search, [1e6, math.nan, 1.0, 0.5])
+    problem, system, theta = posed(search, [*script, 0.5])
     move = search.advance(problem, system, theta, 1e-2)
-    assert len(problem.asked) == 3
-    # Two rejections: by 2, then by 4.
-    assert move.damping == pytest.approx(8e-2)
+    assert len(problem.asked) == len(script)
+    assert move.damping == pytest.approx(math.prod(rejections, start=1e-2))
     step = system.solve(move.damping)
     assert torch.equal(move.free, theta + step.direction)
+    assert move.length == 1.0
     assert move.gain_ratio == pytest.approx((system.loss - 1.0) / step.predicted)
     easing = max(1 / 3, 1 - (2 * min(move.gain_ratio, 1.0) - 1) ** 3)
     assert move.next_damping == pytest.approx(move.damping * easing)
+
+
+@pytest.mark.parametrize(("rise", "share"), [(1e6, 0.1), (0.0, 0.5), (1e-9, 0.5), (30.0, None)])
+def test_where_the_loss_rises_a_shorter_step_is_tried_before_the_damping_rises(
+    rise: float, share: float | None
+) -> None:
+    search = GainRatioDamping(initial_damping=1e-2)
+    problem, system, theta = posed(search)
+    step = system.solve(1e-2)
+    slope = float(step.direction @ system.equations.gradient)
+    # The parabola l + slope t + (rise - slope) t^2 is least where its derivative vanishes.
+    wanted = share or -slope / (2 * (rise - slope))
+    assert 0.1 <= wanted <= 0.5
+    problem.script[:] = [system.loss + rise, system.loss - 1.0]
+    move = search.advance(problem, system, theta, 1e-2)
+    assert move.length == pytest.approx(wanted)
+    assert (move.damping, move.next_damping) == (1e-2, 2e-2)
+    torch.testing.assert_close(move.free, theta + wanted * step.direction)
+    J = system.equations.jacobian
+    linear = system.equations.residual + wanted * J.mv(step.direction)
+    assert move.gain_ratio == pytest.approx(1.0 / (system.loss - 0.5 * float(linear @ linear)))
 
 
 def test_a_share_of_the_accepted_step_is_gone() -> None:
@@ -45,7 +71,7 @@ def test_a_share_of_the_accepted_step_is_gone() -> None:
 
 def test_it_gives_up_where_it_was() -> None:
     search = GainRatioDamping(trials=4)
-    problem, system, theta = posed(search, [1e6, math.inf, math.nan, 50.0])
+    problem, system, theta = posed(search, [1e6, math.inf, math.inf, math.nan, 50.0, 30.0])
     move = search.advance(problem, system, theta, 1e-3)
     assert torch.equal(move.free, theta)
     assert (move.loss, move.length) == (system.loss, 0.0)
@@ -121,6 +147,23 @@ def test_the_correction_is_of_second_order() -> None:
     torch.testing.assert_close(move.free, torch.zeros(2, dtype=F64), rtol=0, atol=1e-9)
     straight = GainRatioDamping(metric=identity, trials=1).advance(problem, system, theta, 1e-13)
     torch.testing.assert_close(straight.free, torch.tensor([0.0, -1.0], dtype=F64), rtol=0, atol=1e-9)
+
+
+def test_a_step_that_bends_goes_as_far_as_its_model() -> None:
+    plain = quadratic(3, 10.0)
+    problem, theta = Scripted(plain), plain.free()
+    search = GainRatioDamping(geodesic=True, trials=1)
+    system = Cholesky().linearise(*plain.linearise(theta), search.metric)
+    move = search.advance(problem, system, theta, 1e-3)
+    s = system.solve(1e-3).direction
+    t = move.length
+    assert search.least_share < t < 0.5
+    # The last place asked for is theta + t s + t^2 a / 2.
+    a = (problem.asked[-1] - theta - t * s) * (2 / t**2)
+    D = system.equations.metric
+    assert float(D @ (t**2 * a).square()) == pytest.approx(0.75**2 * float(D @ (t * s).square()), rel=1e-6)
+    assert move.loss < system.loss
+    assert move.next_damping == 2e-3
 
 
 @pytest.mark.parametrize("bend", [0.05, 200.0])
