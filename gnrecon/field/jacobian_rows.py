@@ -22,6 +22,7 @@ from torch import Tensor
 
 from gnrecon.field.layers import Activation, Index, parted
 from gnrecon.least_squares.layer_products import LayerRows
+from gnrecon.runtime.matrix_product import matmul
 
 
 @dataclass(frozen=True)
@@ -83,14 +84,14 @@ class Jet:
         """Return D_v a_l and D_v d_l of all layers, for directions v of shape (N, 3)."""
         tangents, z_tangents = [v], []
         for slope, (weights, _) in zip(self.slopes, self.layers[:-1], strict=True):
-            z_tangents.append(tangents[-1] @ weights.T)
+            z_tangents.append(matmul(tangents[-1], weights.T))
             tangents.append(slope * z_tangents[-1])
         adjoint_tangents = [torch.zeros_like(self.adjoints[-1])]
         for level in range(len(self.slopes) - 1, -1, -1):
             weights = self.layers[level + 1][0]
             # The outermost adjoint is constant, so its tangent is zero.
-            inner = self.slopes[level] * (adjoint_tangents[0] @ weights) if level + 1 < len(self.slopes) else 0.0
-            bend = (self.adjoints[level + 1] @ weights).mul_(z_tangents[level]).mul_(self.activations[level + 1])
+            inner = self.slopes[level] * matmul(adjoint_tangents[0], weights) if level + 1 < len(self.slopes) else 0.0
+            bend = matmul(self.adjoints[level + 1], weights).mul_(z_tangents[level]).mul_(self.activations[level + 1])
             adjoint_tangents.insert(0, inner - bend)
         return tangents, adjoint_tangents
 

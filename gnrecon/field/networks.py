@@ -20,6 +20,7 @@ from torch import Tensor
 from gnrecon.field.jacobian_rows import CurvedJet, Jet
 from gnrecon.field.layers import TANH, Activation, Layout, parted
 from gnrecon.field.random_features import Stencil
+from gnrecon.runtime.matrix_product import matmul
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,13 @@ class Siren:
         layers = self.layout.layers(theta)
         activations, slopes = [x], []
         for weights, bias in layers[:-1]:
-            z = torch.addmm(bias, activations[-1], weights.T)
+            z = matmul(activations[-1], weights.T).add_(bias)
             slopes.append(z.cos())
             activations.append(z.sin_())
         value = (activations[-1] @ layers[-1][0][0]).add_(layers[-1][1])
         adjoints = [torch.ones_like(value)[:, None]]
         for slope, (weights, _) in zip(reversed(slopes), reversed(layers[1:]), strict=True):
-            adjoints.insert(0, (adjoints[0] @ weights).mul_(slope))
+            adjoints.insert(0, matmul(adjoints[0], weights).mul_(slope))
         return Jet(layers, activations, slopes, adjoints, value, adjoints[0] @ layers[0][0])
 
 

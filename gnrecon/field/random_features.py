@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.geometry.arrays import Float
+from gnrecon.runtime.matrix_product import matmul
 
 
 @dataclass(frozen=True)
@@ -146,5 +147,5 @@ class Stencil:
         phases : of shape (N, m), F . c + p
         amplitudes : of shape (m,), or (N, m) of each centre its own
         """
-        along = phases.cos().mul_(amplitudes) @ self.sine
-        return along.addmm_(phases.sin().mul_(amplitudes), self.cosine)
+        along = matmul(phases.cos().mul_(amplitudes), self.sine)
+        return along.add_(matmul(phases.sin().mul_(amplitudes), self.cosine))

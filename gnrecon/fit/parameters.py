@@ -320,6 +320,7 @@ class SingleNetworkParameters:
     subspace_units: int = 400  # whose frequencies a step of a wide fit frees, so that J^T J stays small
     step_points: int = 4000  # most data points of a step of a wide fit
     krylov_tolerance: float = 0.3  # relative error in the energy norm: steps that a search shortens need no better
+    least_step_share: float = 0.1  # of a step of a deep fit, down to which it is shortened before the damping rises
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def fit_deep(
         few = terms.with_rows(max(least, int(parameters.first_points * growing)))
         return few.problem(field, theta, noise, rng)
 
-    optimiser = optimiser_for(options, GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True))
+    optimiser = optimiser_for(options, geodesic_search())
     # The score of points that are fitted shows which parameters are best, but not when they begin to follow noise.
     patience = steps + 1 if held is None else parameters.held_out_patience_steps
     stop = StopRule(steps, parameters.least_gain, steps + 1, held_out_patience=patience)
@@ -116,10 +116,15 @@ def optimiser_for(
     searches: dict[str, Search] = {
         "auto": auto,
         "damping": GainRatioDamping(initial_damping=auto.initial_damping, metric=auto.metric),
-        "geodesic": GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True),
+        "geodesic": geodesic_search(),
         "line": LogLineSearch(),
     }
     return GaussNewton(searches[options.search], SOLVERS[options.solver](krylov_tolerance))
+
+
+def geodesic_search(*, least_share: float = SingleNetworkParameters.least_step_share) -> GainRatioDamping:
+    """Return the search of deep networks."""
+    return GainRatioDamping(initial_damping=1e-2, metric=layer_scaled, geodesic=True, least_share=least_share)
 
 
 # One wide layer: a linear start, then steps in random subspaces.

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.matrix_product import matmul
 from gnrecon.runtime.parallel import map_in_threads
 
 
@@ -54,8 +55,7 @@ def lower_factor(
 
 def _subtract_product(matrix: Tensor, rows: slice, columns: slice, before: slice) -> None:
     """Subtract from the rows of a block column the product of these rows with those of the diagonal block."""
-    array = matrix.numpy()
-    array[rows, columns] -= array[rows, before] @ array[columns, before].T
+    matrix[rows, columns] -= matmul(matrix[rows, before], matrix[columns, before].T)
 
 
 def _is_finite(factor: Tensor) -> bool:

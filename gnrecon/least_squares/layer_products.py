@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.runtime.chunks import slices
+from gnrecon.runtime.matrix_product import matmul
 from gnrecon.runtime.parallel import map_in_threads
 
 Pair = tuple[Tensor, Tensor]
@@ -126,37 +127,37 @@ class LayerRows:
         if self.further:
             # One product for all pairs; for a single pair, stacking would cost more than it saves.
             lefts, rights = self._stacked
-            product = (rights.flatten(0, 1) @ weights.T).view_as(lefts)
+            product = matmul(rights.flatten(0, 1), weights.T).view_as(lefts)
             product[:, 0] += v[out * into :]
             return product.mul_(lefts).sum((1, 2))
         # l . (V i + b) + r . (V t)
-        product = torch.addmm(v[out * into :], self.inputs, weights.T).mul_(self.left)
+        product = matmul(self.inputs, weights.T).add_(v[out * into :]).mul_(self.left)
         for right, tangents in self.pairs:
-            product.addcmul_(tangents @ weights.T, right)
+            product.addcmul_(matmul(tangents, weights.T), right)
         return product.sum(1)
 
     def tmv(self, u: Tensor) -> Tensor:
         """Return J^T u, of shape (size,), for u of shape (M,)."""
         if self.further:
             lefts, rights = self._stacked
-            along = (lefts * u[:, None, None]).flatten(0, 1).T @ rights.flatten(0, 1)
+            along = matmul((lefts * u[:, None, None]).flatten(0, 1).T, rights.flatten(0, 1))
             return torch.cat([along.flatten(), self.left.T @ u])
         scaled = self.left * u[:, None]
-        weights = scaled.T @ self.inputs
+        weights = matmul(scaled.T, self.inputs)
         for right, tangents in self.pairs:
-            weights.addmm_((right * u[:, None]).T, tangents)
+            weights += matmul((right * u[:, None]).T, tangents)
         return torch.cat([weights.flatten(), scaled.sum(0)])
 
     def squares(self) -> Tensor:
         """Return the diagonal of J^T J, of shape (size,)."""
         left = self.left.square()
         # (l i + r t)^2 = l^2 i^2 + 2 (l r) (i t) + r^2 t^2, each again an outer product
-        weights = left.T @ self.inputs.square()
+        weights = matmul(left.T, self.inputs.square())
         terms = [(self.left, self.inputs), *self.pairs]
         for place, (right, tangents) in enumerate(self.pairs, 1):
             for other, inputs in terms[:place]:
-                weights.addmm_((other * right).T, inputs * tangents, alpha=2.0)
-            weights.addmm_(right.square().T, tangents.square())
+                weights += matmul((other * right).mul_(2.0).T, inputs * tangents)
+            weights += matmul(right.square().T, tangents.square())
         return torch.cat([weights.flatten(), left.sum(0)])
 
     def row_squares(self) -> Tensor:

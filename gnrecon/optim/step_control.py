@@ -13,11 +13,12 @@ the long, curved valleys of sine networks this halves the number of steps (docs/
 Source: Transtrum and Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
 minimization (2012).
 
-*Shorter steps.* To solve again with a larger damping takes many times as long as to evaluate the loss. So a trial goes
-along the curve  theta + t s + t^2 a / 2  only as far as the model's range, t = 3/4 |s|_D / |a|_D, where the criterion
-holds for t s and t^2 a. Where the loss has risen, the minimum of the parabola through its value and slope at the start
-and its new value is tried once, before the damping rises. Source: Nocedal and Wright, Numerical Optimization (2006),
-section 3.5, for the parabola and its bounds.
+*Shorter steps.* Where a network has thousands of parameters, to solve again with a larger damping takes many times as
+long as to evaluate the loss. A trial may then go along the curve  theta + t s + t^2 a / 2  as far as the model's
+range, t = 3/4 |s|_D / |a|_D, where the criterion holds for t s and t^2 a. Where the loss has risen, the minimum of the
+parabola through its value and slope at the start and its new value is tried once, before the damping rises. Such a step
+gains a little less than a damped one. Source: Nocedal and Wright, Numerical Optimization (2006), section 3.5, for the
+parabola and its bounds.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class GainRatioDamping:
     smallest : least damping
     trials : dampings after which the parameters stay
     growth : factor of the damping after a first trial that is rejected, and after a step that had to be shorter
-    least_share : share of a step below which the damping rises instead
+    least_share : share down to which a step may be shortened before the damping rises; at 1 no step is
     """
 
     initial_damping: float = 1e-3
@@ -58,7 +59,7 @@ class GainRatioDamping:
     smallest: float = 1e-12
     trials: int = 10
     growth: float = 2.0
-    least_share: float = 0.1
+    least_share: float = 1.0
 
     def advance(self, problem: Problem, system: DampedSystem, free: Tensor, damping: float) -> Move:
         """Raise the damping until a step, or the part of it within the model's range, decreases the loss."""

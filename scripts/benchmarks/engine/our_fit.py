@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -28,9 +29,10 @@ from gnrecon.field import Siren
 from gnrecon.fit.initialisation import solve_last_layer
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene
 from gnrecon.fit.parameters import SingleNetworkParameters
+from gnrecon.fit.single_network import geodesic_search
 from gnrecon.geometry.point_cloud import Frame, Samples
-from gnrecon.least_squares import SOLVERS, layer_scaled
-from gnrecon.optim import GainRatioDamping, GaussNewton, StopRule
+from gnrecon.least_squares import SOLVERS
+from gnrecon.optim import GaussNewton, StopRule
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.parallel import fixed_sums
 
@@ -79,7 +81,7 @@ def our_fit(
 
     start = solved_start(field, sample)
     solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
-    search = GainRatioDamping(initial_damping=initial_damping, metric=layer_scaled, geodesic=True)
+    search = replace(geodesic_search(), initial_damping=initial_damping)
     steps = 1_000_000
     stop = StopRule(steps, tolerance=0.0, patience=steps, seconds=seconds - clock.seconds)
     with fixed_sums(None):

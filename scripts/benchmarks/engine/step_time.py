@@ -54,7 +54,8 @@ def our_steps(frozen: Frozen, steps: int) -> tuple[Solution, str]:
     The factors of the rows are stored in float32, and threads share pieces of work and no sum, as in a fit.
     """
     solver = SOLVERS["auto"](SingleNetworkParameters.krylov_tolerance)
-    search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled)
+    share = SingleNetworkParameters.least_step_share
+    search = GainRatioDamping(initial_damping=frozen.damping, metric=layer_scaled, least_share=share)
     field = Siren(frozen.widths)
     never = StopRule(steps=steps, tolerance=0.0, patience=steps + 1)
     with fixed_sums(None):
