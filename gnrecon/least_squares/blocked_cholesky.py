@@ -9,6 +9,8 @@ Source: Golub and Van Loan, Matrix Computations (2013), section 4.2.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -34,28 +36,29 @@ def lower_factor(
         factor, failed = torch.linalg.cholesky_ex(matrix)
         return None if int(failed) or not _is_finite(factor) else factor
     for block in slices(len(matrix), block_columns):
-        before = slice(0, block.start)
-        _subtract_product(matrix, block, block, before)
+        _subtract_products(matrix, block, block)
         diagonal, failed = torch.linalg.cholesky_ex(matrix[block, block])
         if int(failed) or not _is_finite(diagonal):
             return None
         matrix[block, block] = diagonal
-
-        def divide(rows: slice, block: slice = block, before: slice = before, divisor: Tensor = diagonal.T) -> None:
-            _subtract_product(matrix, rows, block, before)
-            # X L^T = A for the factor L of the diagonal block
-            matrix[rows, block] = torch.linalg.solve_triangular(divisor, matrix[rows, block], upper=True, left=False)
-
-        below = slices(len(matrix) - block.stop, piece_rows)
-        # The rows of a piece do not depend on the number of threads, so that neither does the factor.
-        pieces = [slice(block.stop + rows.start, block.stop + rows.stop) for rows in below]
-        map_in_threads(divide, pieces, brief=True)
+        # The pieces do not depend on the number of threads, so that neither does the factor.
+        starts = range(block.stop, len(matrix), piece_rows)
+        pieces = [slice(start, min(start + piece_rows, len(matrix))) for start in starts]
+        map_in_threads(partial(_finish, matrix, block), pieces, brief=True)
     return matrix
 
 
-def _subtract_product(matrix: Tensor, rows: slice, columns: slice, before: slice) -> None:
-    """Subtract from the rows of a block column the product of these rows with those of the diagonal block."""
-    matrix[rows, columns] -= matmul(matrix[rows, before], matrix[columns, before].T)
+def _finish(matrix: Tensor, block: slice, rows: slice) -> None:
+    """Make the factor's rows in a block column whose diagonal block L is made: X with X L^T = A."""
+    _subtract_products(matrix, block, rows)
+    divisor = matrix[block, block].T
+    matrix[rows, block] = torch.linalg.solve_triangular(divisor, matrix[rows, block], upper=True, left=False)
+
+
+def _subtract_products(matrix: Tensor, block: slice, rows: slice) -> None:
+    """Subtract from the rows of a block column their products with the block columns before it."""
+    before = slice(0, block.start)
+    matrix[rows, block] -= matmul(matrix[rows, before], matrix[block, before].T)
 
 
 def _is_finite(factor: Tensor) -> bool:
