@@ -66,7 +66,9 @@ def damped_factor(product: Tensor, diagonal: Tensor, overwrite: bool = False) ->
 
 def rounded_factor(product: Tensor, diagonal: Tensor, stored: torch.dtype) -> Tensor | None:
     """Return that factor in single precision, or None where J is not `stored` so or the damping does not hide it."""
-    return damped_factor(product.float(), diagonal.float(), overwrite=True) if stored == torch.float32 else None
+    if stored != torch.float32:
+        return None
+    return damped_factor(product.to(torch.float32, copy=True), diagonal.float(), overwrite=True)
 
 
 def solve_factored(factor: Tensor, right: Tensor) -> Tensor:
