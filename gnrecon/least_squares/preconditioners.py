@@ -96,13 +96,13 @@ def definite_factor(product: Tensor, diagonal: Tensor) -> Tensor:
 # A count sketch needs no lengths: S adds every row, with a random sign, to one of m sums, and J^T S^T S J approximates
 # J^T J for every J.
 #
-# Products are computed and, of sampled rows, summed in the storage precision of the rows; sums of all rows have that of
-# the vectors. float32 products lose eigenvalues below 1e-7 of the largest one, which are most of a network's: with a
-# damping of 2e-9 of the largest, 146 iterations instead of 17 (2,273 parameters, 19,400 rows, 4,546 drawn uniformly), at
-# half the set-up time. Late in a fit, rows are therefore stored in float64. Sources: Avron, Maymounkov, Toledo,
-# Blendenpik (2010), and Meng, Saunders, Mahoney, LSRN (2014), for least squares preconditioned by a sketch; Clarkson and
-# Woodruff, Low-rank approximation and regression in input sparsity time (2013), for the count sketch; Roosta-Khorasani
-# and Mahoney, Sub-sampled Newton methods (2016).
+# Products are computed and, of sampled rows, summed in the storage precision of the rows; sums of all rows have that
+# of the vectors. float32 products lose eigenvalues below 1e-7 of the largest one, which are most of a network's: with
+# a damping of 2e-9 of the largest, 146 iterations instead of 17 (2,273 parameters, 19,400 rows, 4,546 drawn uniformly),
+# at half the set-up time. Late in a fit, rows are therefore stored in float64. Sources: Avron, Maymounkov, Toledo,
+# Blendenpik (2010), and Meng, Saunders, Mahoney, LSRN (2014), for least squares preconditioned by a sketch; Clarkson
+# and Woodruff, Low-rank approximation and regression in input sparsity time (2013), for the count sketch;
+# Roosta-Khorasani and Mahoney, Sub-sampled Newton methods (2016).
 
 
 @dataclass(frozen=True)
