@@ -3,9 +3,11 @@
 A step solves  (J^T J + damping D) s = -g  at O(M p) per iteration. An iteration needs no set-up, but its preconditioner
 does. Gauss-Newton matrices change little from one step to the next, so the preconditioner of one linearisation is
 reused for later ones. It is replaced when a solve takes `patience` iterations more than the first solve with it; that
-solve then goes on with the new one. It is also reused for similar dampings, because a few more iterations cost less
-than a factorisation: with 2,273 parameters and 19,378 rows, ten steps took 0.76 s of CPU time each with one
-factorisation per damping, and 0.55 s with one for all dampings within a factor of four.
+solve then goes on with the new one, so that what it has spent is not lost. It is also reused for similar dampings,
+because a few more iterations cost less than a factorisation: with 2,273 parameters and 19,378 rows, ten steps took
+0.76 s of CPU time each with one factorisation per damping, and 0.55 s with one for all dampings within a factor of
+four. Later, with faster products, a factor of sixteen saved 3 % more, and a patience of 4 in place of 8 another 6 to
+11 % (docs/research/2026-11-29-steps-of-large-networks.md).
 
 Products with J may be computed in float32. This solves with J + E, |E| <= eps |J|, and the exact gradient. In the norm
 of J^T J + damping D, the step then changes by about |E D^-1/2| / sqrt(damping) of its length. `rounding` bounds this
@@ -47,7 +49,7 @@ class CachedPreconditioner:
     first: int | None = None
     last: tuple[float, Apply] | None = None
 
-    def at(self, damping: float, *, damping_ratio: float = 4.0) -> Apply:
+    def at(self, damping: float, *, damping_ratio: float = 16.0) -> Apply:
         """Return P^-1 for a damping, or the last one if its damping differs by at most the factor `damping_ratio`.
 
         Eigenvalues of the preconditioned matrix are wrong by at most that factor.
@@ -159,7 +161,7 @@ class Iterative:
     energy: float = 0.0
     limit: int = 200
     reuse: bool = True
-    patience: int = 8
+    patience: int = 4
     seed: int = 0
     rounding: float = 0.0
     adapt: Callable[[Preconditioner, float], Preconditioner] | None = None

@@ -97,10 +97,10 @@ def test_one_system_serves_many_dampings(solver: str, name: str) -> None:
     problem = PROBLEMS[name](7, F64)
     D = layer_scaled(problem.jacobian)
     system = SOLVERS[solver]().linearise(problem.jacobian, problem.r, layer_scaled)
-    steps = {damping: system.solve(damping) for damping in (1e-1, 1e-4, 10.0, 1e-2)}
+    steps = {damping: system.solve(damping) for damping in (1e-1, 1e-4, 10.0, 1e-3)}
     for damping, step in steps.items():
         check(problem, step, D, damping, F64)
-    assert steps[1e-4].predicted > steps[1e-2].predicted > steps[1e-1].predicted > steps[10.0].predicted > 0.0
+    assert steps[1e-4].predicted > steps[1e-3].predicted > steps[1e-1].predicted > steps[10.0].predicted > 0.0
     again = system.solve(1e-1)
     assert torch.equal(again.direction, steps[1e-1].direction)
 
