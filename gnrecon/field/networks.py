@@ -49,7 +49,7 @@ class Siren:
         *hidden, (weights, bias) = self.layout.layers(theta)
         activation = x
         for layer_weights, layer_bias in hidden:
-            activation = torch.addmm(layer_bias, activation, layer_weights.T).sin_()
+            activation = matmul(activation, layer_weights.T).add_(layer_bias).sin_()
         return (activation @ weights[0]).add_(bias)
 
     def around(self, theta: Tensor, offsets: Tensor) -> Callable[[Tensor], Tensor]:

@@ -14,9 +14,12 @@ def matmul(left: Tensor, right: Tensor) -> Tensor:
     needs up to twice the time on some of them. Where torch has several threads, those of two libraries would wait for
     each other.
     """
-    followed = left.requires_grad or right.requires_grad
-    if left.device.type != "cpu" or followed or torch.get_num_threads() > 1:
+    if left.device.type != "cpu" or torch.get_num_threads() > 1:
+        return left @ right
+    try:
+        first, second = left.numpy(), right.numpy()
+    except RuntimeError:  # of tensors whose derivatives are followed, by autograd or torch.func
         return left @ right
     # As torch does, it says nothing about numbers that are not finite.
     with np.errstate(all="ignore"):
-        return torch.from_numpy(left.numpy() @ right.numpy())
+        return torch.from_numpy(first @ second)

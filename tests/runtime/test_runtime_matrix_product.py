@@ -55,3 +55,6 @@ def test_derivatives_go_through() -> None:
         matmul(left, right).sum().backward()
     assert left.grad is not None
     torch.testing.assert_close(left.grad, right.sum(1).expand(3, 3))
+    with torch_threads(1):
+        slopes = torch.func.jacrev(lambda matrix: matmul(matrix, right).sum())(torch.eye(3))
+    torch.testing.assert_close(slopes, left.grad)
