@@ -74,8 +74,9 @@ class GainRatioDamping:
                 share, loss, gain = self._lowered(problem, curve)
                 if gain > 0.0:
                     easing = max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3) if share == 1.0 else self.growth
-                    trial = free + self.length * (curve.at(share) - free)
+                    trial = curve.at(share)
                     if self.length < 1.0:
+                        trial = free + self.length * (trial - free)
                         loss = loss_of(problem, trial)
                     following = max(damping * easing, self.smallest)
                     return Move(trial, loss, damping, gain, self.length * share, following, iterations)
@@ -157,10 +158,10 @@ class _Curve:
     def shorter(self, share: float, loss: float) -> float:
         """Return where the parabola through the loss and its slope at the start, and a larger loss at t, is least.
 
-        It is a tenth to a half of t; 0 where the loss is not finite.
+        It is a tenth to a half of t; 0 where there is no such parabola, as the loss is not finite.
         """
         bend = loss - self.system.loss - share * self.slope
-        return share * min(max(-share * self.slope / (2 * bend), 0.1), 0.5) if math.isfinite(bend) else 0.0
+        return share * min(max(-share * self.slope / (2 * bend), 0.1), 0.5) if 0.0 < bend < math.inf else 0.0
 
 
 # Lengths along one direction: the paper's log-spaced line search, and a fixed multiple.

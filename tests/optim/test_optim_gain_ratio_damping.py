@@ -59,6 +59,7 @@ def test_where_the_loss_rises_a_shorter_step_is_tried_before_the_damping_rises(
     assert move.length == pytest.approx(wanted)
     assert (move.damping, move.next_damping) == (1e-2, 2e-2)
     torch.testing.assert_close(move.free, theta + wanted * step.direction)
+    assert torch.equal(move.free, problem.asked[-1]), "the parameters whose loss was found"
     J = system.equations.jacobian
     linear = system.equations.residual + wanted * J.mv(step.direction)
     assert move.gain_ratio == pytest.approx(1.0 / (system.loss - 0.5 * float(linear @ linear)))
