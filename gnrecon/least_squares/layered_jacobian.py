@@ -199,13 +199,11 @@ class LayeredJacobian:
 
     def sample(self, rows: Tensor) -> LayeredJacobian:
         """Return the Jacobian of the given rows, with stored factors."""
-        blocks, start = [], 0
-        for block in self.blocks():
-            stop = start + len(block[0])
-            inside = rows[(rows >= start) & (rows < stop)] - start
+        blocks = []
+        for block, place in _placed(self.blocks()):
+            inside = rows[(rows >= place.start) & (rows < place.stop)] - place.start
             if len(inside):
                 blocks.append([layer.take(inside) for layer in block])
-            start = stop
         return replace(self, blocks=lambda: blocks, rows=len(rows))
 
     def rounded(self) -> LayeredJacobian:
