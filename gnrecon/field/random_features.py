@@ -3,7 +3,11 @@
     c(x) = sum_j a_j sin(F_j . (x - c_0) / l + p_j)
 
 Frequencies F are drawn for a length of one, so one draw can be used for functions of any length l around any centre
-c_0.
+c_0. With independent normal amplitudes, c is a Gaussian process whose covariance is a mean over the features, and
+features that fill their distribution evenly are closer to the exact one than as many independent ones: by a factor of
+two for 300 to 700 features. So the radius, direction and phase of each are those of a scrambled Sobol sequence.
+Source: Rahimi and Recht, *Random Features for Large-Scale Kernel Machines* (2007); Avron, Sindhwani, Yang and Mahoney,
+*Quasi-Monte Carlo Feature Maps for Shift-Invariant Kernels* (2016).
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.special import fdtri
 from torch import Tensor
 
 from gnrecon.field.field_parameters import FieldParameters
@@ -36,10 +41,17 @@ class Features:
         *,
         degrees_of_freedom: float = FieldParameters.degrees_of_freedom,
     ) -> Features:
-        """Draw features whose frequencies have a Student t distribution; more degrees of freedom are smoother."""
-        spread = np.sqrt(rng.chisquare(degrees_of_freedom, count) / degrees_of_freedom)
-        frequencies = rng.standard_normal((count, 3)) / spread[:, None]
-        phases = rng.uniform(0.0, 2 * np.pi, count)
+        """Draw features whose frequencies have a Student t distribution; more degrees of freedom are smoother.
+
+        Also the first of them (`first`) fill it evenly.
+        """
+        even = torch.quasirandom.SobolEngine(4, scramble=True, seed=int(rng.integers(2**31)))  # type: ignore[no-untyped-call]
+        share, height, turn, phase = even.draw(count, dtype=torch.float64).numpy().T
+        # |F|^2 / 3 has Fisher's F distribution; heights and turns about the axis are those of a uniform direction.
+        radius = np.sqrt(3.0 * fdtri(3, degrees_of_freedom, share))
+        height, turn, phases = 2.0 * height - 1.0, 2 * np.pi * turn, 2 * np.pi * phase
+        around = np.sqrt(1.0 - height**2)
+        frequencies = radius[:, None] * np.stack([around * np.cos(turn), around * np.sin(turn), height], axis=1)
         return cls(torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like))
 
     def __len__(self) -> int:

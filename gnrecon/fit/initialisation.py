@@ -2,10 +2,8 @@
 
 *Wide and linear.* One hidden layer of random sine features sin(w . x + b) is linear in its output weights, so that
 f = 0, grad f = n and the coarse signed distance have one exact least-squares solution (variable projection). The
-frequencies w follow the spectral density of a Matern kernel, a Student t distribution: w = z / (l sqrt(c / nu)) with z
-normal, c chi-squared of nu degrees of freedom, and l a length of 0.12 of the radius; the solve is then a sketch of
-kernel interpolation with Hermite data.
-Source: Rahimi and Recht, Random Features for Large-Scale Kernel Machines (2007).
+frequencies w = F / l, with a length l of 0.12 of the radius by default, follow the spectral density of a Matern kernel
+(`field.random_features`); the solve is then a sketch of kernel interpolation with Hermite data.
 Where the solution's sign disagrees with the coarse distance, samples are added and the solve is repeated. As the
 features stay, so does J^T J of the data, and new samples only add to that of the volume.
 
@@ -27,6 +25,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gnrecon.field.networks import Siren
+from gnrecon.field.random_features import Features
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, distance_weight
 from gnrecon.fit.parameters import InitialisationParameters
 from gnrecon.geometry.arrays import Float
@@ -50,17 +49,6 @@ class Spectrum:
     degrees_of_freedom: float = InitialisationParameters.degrees_of_freedom
 
 
-def random_features(
-    width: int, rng: np.random.Generator, like: Tensor, spectrum: Spectrum = Spectrum()
-) -> tuple[Tensor, Tensor]:
-    """Return frequencies, of shape (width, 3), and phases, of shape (width,), of sine features of a spectrum."""
-    direction = rng.standard_normal((width, 3))
-    spread = np.sqrt(rng.chisquare(spectrum.degrees_of_freedom, width) / spectrum.degrees_of_freedom)
-    frequencies = direction / spread[:, None] / spectrum.length
-    phases = rng.uniform(0.0, 2 * np.pi, width)
-    return torch.as_tensor(frequencies).to(like), torch.as_tensor(phases).to(like)
-
-
 def wide_start(
     field: Siren,
     scene: Scene,
@@ -81,8 +69,9 @@ def wide_start(
         When the linear system cannot be solved.
     """
     like = scene.points
-    frequencies, phases = random_features(field.widths[0], rng, like, spectrum)
-    theta = field.layout.flatten([(frequencies, phases), (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
+    features = Features.draw(field.widths[0], rng, like, degrees_of_freedom=spectrum.degrees_of_freedom)
+    first = features.frequencies / spectrum.length, features.phases
+    theta = field.layout.flatten([first, (like.new_zeros(1, field.widths[0]), like.new_zeros(1))])
 
     def of_volume(x: Float, distance: Float, repeats: int) -> LastLayer:
         """Return the equations of coarse distances that count so often each, at a weight of one."""

@@ -71,7 +71,7 @@ def fit_linear(
     """
     smoothness = field_smoothness(samples, held_out, scene, rng.spawn(1)[0], parameters=parameters)
     spectrum = smooth_spectrum(smoothness.length, scene, parameters=parameters)
-    field = Siren((parameters.units,))
+    field = Siren((_unit_count(spectrum.length, parameters),))
     linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
 
     def fitted(reach: float, advance: ProgressCallback) -> tuple[NeuralSDF, Solution, float]:
@@ -89,12 +89,18 @@ def fit_linear(
             reach, sdf, solution = default_reach, default_sdf, default_solution
     _log.info(
         "The linear field has %d features of length %.3g radii, and sees %d points; normals reach %.3g spacings.",
-        parameters.units,
+        field.widths[0],
         spectrum.length,
         len(scene.points),
         reach,
     )
     return LinearField(sdf, solution, spectrum.length)
+
+
+def _unit_count(length: float, parameters: LinearFieldParameters) -> int:
+    """Return how many units a field of a length in radii needs: as many as squares of that length cover a surface."""
+    count = parameters.most_units * (parameters.length_scales_radii[0] / length) ** 2
+    return min(max(round(count), parameters.least_units), parameters.most_units)
 
 
 def wrong_sign(sdf: NeuralSDF, scene: Scene, rng: np.random.Generator) -> float:

@@ -105,7 +105,6 @@ def select_hyperparameters(
     radius: float,
     rng: np.random.Generator,
     device: str = "cpu",
-    features: int = ModelSelectionParameters.features,
     *,
     outliers: bool = False,
 ) -> Hyperparameters:
@@ -120,13 +119,12 @@ def select_hyperparameters(
     radius : of the disk that a point stands for, unit coordinates
     rng : draws patches and features
     device : a torch device
-    features : number of features a cube
     outliers : whether some were found. Those that remain would make spikes if the scan were fitted as clean, and the
         marginal likelihood is not robust to them.
     """
     # Draws of its own, so that later ones do not depend on the number of patches.
     rng = rng.spawn(1)[0]
-    validation = CrossValidation.draw(residuals, held_out, radius, rng, device, features)
+    validation = CrossValidation.draw(residuals, held_out, radius, rng, device)
     clean = None if outliers else validation.clean()
     if clean is not None:
         return clean
@@ -246,11 +244,10 @@ class CrossValidation:
         radius: float,
         rng: np.random.Generator,
         device: str,
-        cube_features: int = ModelSelectionParameters.features,
         *,
         parameters: ModelSelectionParameters = ModelSelectionParameters(),
     ) -> CrossValidation:
-        """Draw the patches, for cubes of so many features; see `select_hyperparameters` for the other parameters."""
+        """Draw the patches; see `select_hyperparameters` for the parameters."""
         out = np.flatnonzero(held_out)
         covering = parameters.predictions * len(out) // parameters.patch_validation_points
         patches = min(max(covering, parameters.least_patches), parameters.most_patches)
@@ -258,10 +255,7 @@ class CrossValidation:
         # As a list, so that the answer has two dimensions also where a single point is left out.
         ranks = list(range(1, min(parameters.patch_validation_points, len(out)) + 1))
         near = cKDTree(residuals.points[out]).query(residuals.points[chosen], ranks)[1]
-        # A patch need not resolve more than a cube does.
-        most = parameters.features if patches <= parameters.many_patches else parameters.fewer_features
-        count = min(cube_features, most)
-        features = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
+        features = Features.draw(parameters.features, rng, torch.zeros(0, dtype=torch.float64, device=device))
         centers = residuals.points[chosen]
         likelihood = None if residuals.estimated else patch_likelihood(residuals, radius, rng.spawn(1)[0], device)
         found = list(out[near])

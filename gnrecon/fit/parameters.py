@@ -86,14 +86,15 @@ class OutlierParameters:
 class LinearFieldParameters:
     """The linear global field, with which the networks are compared (`fit.linear_field`)."""
 
-    units: int = 1000
+    most_units: int = 1000  # with the shortest length
+    least_units: int = 300
     wrong_sign_share: float = 4e-3  # of free space, that heavier normals may give the wrong sign
     length_scales_radii: tuple[float, ...] = (0.25, 0.5, 1.0)  # candidates
     # Candidates of the normals' weight: the length over which an angle counts as a height. The first is the default.
     normal_reaches_spacings: tuple[float, ...] = (0.4, 1.2, 3.0, 8.0, 20.0)
     least_length_spacings: float = 4.0  # shorter features oscillate between the points
     tie_share: float = 0.01  # by which a longer length scale may predict worse than the best
-    selection_features: int = 600
+    selection_features: int = 300
     selection_points: int = 2000
     selection_volume_samples: int = 2000
     position_noise_spacings: float = 0.1  # assumed in the selection; that of normals is this over the reach, in radians
@@ -265,9 +266,7 @@ class ModelSelectionParameters:
     # through all of them has the least distances and the largest evidence.
     sparse_points: int = 20_000
     most_patch_points: int = 2500  # more change no score, and time grows with the square of the length
-    features: int = 700
-    many_patches: int = 20  # of more, each has fewer features
-    fewer_features: int = 300
+    features: int = 300
     least_slope: float = 0.05  # of the field along the normal, in a distance |f| / slope
     margin_lengths: float = 1.5  # how far a patch's data reaches beyond what it predicts, in length scales
 

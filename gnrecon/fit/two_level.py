@@ -238,8 +238,8 @@ class _Steps:
         if data.sharp is not None:
             hyperparameters = data.sharp.hyperparameters
         else:
-            chosen = (residuals.density.radius, rng, options.device, options.features)
-            hyperparameters = select_hyperparameters(residuals, data.held_out, *chosen, outliers=outliers)
+            chosen = residuals, data.held_out, residuals.density.radius, rng, options.device
+            hyperparameters = select_hyperparameters(*chosen, outliers=outliers)
             # The validation points have chosen everything, and may be fitted, too.
             if first.ladder is not None and len(residuals) <= self.parameters.two_level.most_refitted_points:
                 sdf = first.refitted(data.samples)

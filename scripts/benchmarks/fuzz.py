@@ -126,7 +126,7 @@ def work(argument: dict[str, Any]) -> int:
 def few_features() -> GlobalFieldParameters:
     """Return sizes of the global field with which the fit takes the same way in a third of the time."""
     linear = LinearFieldParameters(
-        units=200, selection_features=120, selection_points=200, selection_volume_samples=400
+        most_units=200, least_units=200, selection_features=120, selection_points=200, selection_volume_samples=400
     )
     return GlobalFieldParameters(linear=linear)
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from scipy.special import kv
 from torch import Tensor
 
 from gnrecon.field import Siren
-from gnrecon.field.field_parameters import FieldParameters
 from gnrecon.fit import initialisation
-from gnrecon.fit.initialisation import LastLayer, Spectrum, random_features, solve_last_layer
+from gnrecon.fit.initialisation import LastLayer, solve_last_layer
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm
 from gnrecon.residuals import interface, normal_vector, signed_distance
 from gnrecon.runtime.errors import FitError
@@ -117,24 +114,3 @@ def test_values_that_are_not_finite_end_with_a_sentence() -> None:
     broken = [*terms, ObjectiveTerm("distance", signed_distance, terms[0].points, terms[0].points[:, 0] * torch.nan)]
     with pytest.raises(FitError, match="not finite"):
         solve_last_layer(field, broken, theta)
-
-
-@pytest.mark.parametrize(
-    "spectrum", [Spectrum(), Spectrum(0.25, FieldParameters.degrees_of_freedom)], ids=["coarse", "smooth"]
-)
-def test_features_have_a_maternlike_spectrum(spectrum: Spectrum) -> None:
-    """The kernel E[2 sin(w.x + b) sin(w.y + b)] = E[cos w.(x - y)] is Matern's, of smoothness nu / 2."""
-    like = torch.zeros(1, dtype=torch.float64)
-    frequencies, phases = random_features(200_000, np.random.default_rng(0), like, spectrum)
-    assert frequencies.shape == (200_000, 3)
-    assert float(phases.min()) >= 0.0
-    assert float(phases.max()) <= 2 * np.pi
-    for distance in (0.05, 0.12, 0.3):
-        smoothness = spectrum.degrees_of_freedom / 2
-        s = np.sqrt(2 * smoothness) * distance / spectrum.length
-        matern = 2 ** (1 - smoothness) / np.prod(np.arange(1, smoothness)) * s**smoothness * kv(smoothness, s)
-        offset = distance * torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64)
-        kernel = float(torch.cos(frequencies @ offset).mean())
-        assert kernel == pytest.approx(matern, abs=4 / np.sqrt(200_000))
-        sines = 2 * torch.sin(phases) * torch.sin(phases + frequencies @ offset)
-        assert float(sines.mean()) == pytest.approx(matern, abs=6 / np.sqrt(200_000))

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from gnrecon.field import Siren
+from gnrecon.field.random_features import Features
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit
-from gnrecon.fit.initialisation import random_features
 from gnrecon.fit.parameters import LaplaceParameters, UncertaintyParameters
 from gnrecon.fit.posterior.laplace_approximation import DataRows, Laplace, free_units, laplace
 from gnrecon.fit.posterior.uncertainty import calibration, left_out_scores
@@ -105,9 +105,9 @@ def test_a_wide_last_layer_stands_for_all_parameters() -> None:
 def noisy_rows(count: int, noise: float, seed: int) -> DataRows:
     """Data of the zero field of random features, its normals (the gradient's targets) disturbed."""
     field, rng = Siren((700,)), np.random.default_rng(seed)
-    frequencies, phases = random_features(700, rng, torch.zeros(0, dtype=torch.float64))
+    features = Features.draw(700, rng, torch.zeros(0, dtype=torch.float64), degrees_of_freedom=4.0)
     zero = torch.zeros(1, 700, dtype=torch.float64)
-    theta = field.layout.flatten([(frequencies, phases), (zero, zero[0, :1])])
+    theta = field.layout.flatten([(features.frequencies / 0.12, features.phases), (zero, zero[0, :1])])
     x = torch.as_tensor(rng.uniform(-1, 1, (count, 3)))
     return DataRows(field, theta, x, noise * torch.as_tensor(rng.standard_normal((count, 3))), normal_vector, 1.0)
 
