@@ -7,8 +7,10 @@ the derivatives of the features' sum, and the noise covariance D, the log margin
     -1/2 (y^T (K + D)^-1 y + log det (K + D)) + constant.
 
 The noise that maximises its sum over patches is selected (`MarginalLikelihood.likeliest`). All points contribute, so
-that it separates noises which validation points cannot, because those have noise of their own. It selects length scales
-less well: under it a surface is equally curved everywhere, which no shape is.
+that it separates noises which validation points cannot, because those have noise of their own. It selects the
+length scales of noisy scans less well: under it a surface is equally curved everywhere, which no shape is. That of a
+clean scan it selects better (`MarginalLikelihood.likeliest_length`): the shape is known wherever the points are, and
+how fast they let it vary decides.
 
 Estimated normals are no data: their errors follow from those of the positions, and are alike among neighbours. By the
 values alone, a correction that cancels the global field in the whole band of noise would explain all points. So values
@@ -96,6 +98,29 @@ class MarginalLikelihood:
             while (better := max(self._around(best, stride), key=found)) != best:
                 best = better
         return self._noise_at(best)
+
+    def likeliest_length(self, lengths: Sequence[float], position: float, angle: float) -> float:
+        """Return the length of the largest marginal likelihood for a known noise, unit coordinates.
+
+        Parameters
+        ----------
+        lengths : candidates, unit coordinates, in order: the search ends after two that are less likely in a row
+        position, angle : standard deviations of the noise, unit coordinates and radians
+        """
+
+        def of(length: float) -> float:
+            def of_patch(patch: Patch) -> float:
+                return log_density(patch, data_kernel(patch, self.features, length, patch.size), position, angle)
+
+            return sum(map_in_threads(of_patch, self.patches, self.device))
+
+        best, most = 0, of(lengths[0])
+        for number, length in enumerate(lengths[1:], start=1):
+            if number > best + 2:
+                break
+            if (found := of(length)) > most:
+                best, most = number, found
+        return lengths[best]
 
     def _noise_at(self, place: Place) -> tuple[float, float]:
         positions, angles = self.parameters.position_noises_disk_radii, self.parameters.angle_noises_radians

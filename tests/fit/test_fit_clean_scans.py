@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gnrecon.fit import FitOptions, fit
+from gnrecon.fit import FitOptions, fit, model_selection
 from gnrecon.fit.marginal_likelihood import clean_noise, median_pair_height
-from gnrecon.fit.model_selection import CrossValidation, FieldResiduals
-from gnrecon.fit.parameters import CleanScanParameters, ModelSelectionParameters
+from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
+from gnrecon.fit.parameters import CleanScanParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
@@ -97,29 +97,32 @@ def test_points_that_were_scanned_twice_are_no_pairs() -> None:
     assert median_pair_height(*told(twice)) == pytest.approx(median_pair_height(*told(scan)), rel=0.6)
 
 
-def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    scan = residuals(bumpy(200))
-    validation = CrossValidation.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
-    even = np.linspace(-1.0, 1.0, 10)[:, None]
-    lengths = ModelSelectionParameters.lengths_disk_radii
-    # In one patch all lengths are far off, and which of them by more is chance.
-    astray = 1000.0 * (np.arange(10) == 4)[:, None]
-    scores = {
-        lengths[0]: 3.0 + even + astray,
-        lengths[1]: 2.0 + even + 1.1 * astray,
-        lengths[2]: 1.99 - even + 1.1 * astray,
-        lengths[3]: 1e-3 + 0.0 * even,
-    }
-    monkeypatch.setattr(CrossValidation, "scores", lambda _, length: scores[length])
-    hyperparameters = validation.clean()
-    assert hyperparameters is not None
-    assert hyperparameters.length == lengths[1]
+@pytest.mark.parametrize("estimated", [False, True])
+def test_the_points_themselves_show_how_fast_they_vary(estimated: bool) -> None:
+    """Validation points have no part in it; nor have normals that were estimated."""
+    scan = bumpy(3000)
+    radius, noise = Density(scan.points).radius, 0.1 if estimated else 0.01
+    normals = scan.normals + noise * np.random.default_rng(1).standard_normal((3000, 3))
+    lengths = []
+    for waves in (6.0, 24.0):
+        value = 0.3 * radius * np.sin(waves * scan.points[:, 0])
+        slope = 0.3 * radius * waves * np.cos(waves * scan.points[:, 0])
+        gradient = scan.normals + slope[:, None] * np.array([1.0, 0.0, 0.0])
+        left = FieldResiduals(scan.points, scan.normals if not estimated else normals, value, gradient, estimated)
+        chosen = [
+            select_hyperparameters(left, np.arange(3000) % 6 == rest, radius, np.random.default_rng(0))
+            for rest in (0, 1)
+        ]
+        assert chosen[0] == chosen[1]
+        assert chosen[0].position < 0.02 * radius, "the scan is clean"
+        lengths.append(chosen[0].length)
+    assert lengths[0] > 1.4 * lengths[1]
 
 
 def test_clean_scans_are_fitted_nearer_than_by_choice(monkeypatch: pytest.MonkeyPatch) -> None:
     scan = bumpy(800)
     by_neighbours = off_truth(scan)
-    monkeypatch.setattr(CrossValidation, "clean", lambda _: None)
+    monkeypatch.setattr(model_selection, "_of_clean_scan", lambda *_: None)
     by_evidence = off_truth(scan)
     select = CrossValidation.select
     monkeypatch.setattr(CrossValidation, "select", lambda one: select(replace(one, likelihood=None)))

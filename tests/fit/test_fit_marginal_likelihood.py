@@ -68,6 +68,21 @@ def test_noise_is_found_again(position: float, angle: float, rng: np.random.Gene
         assert table[max(nearest - 1, 0)] - 1e-9 <= value <= table[min(nearest + 1, len(table) - 1)] + 1e-9
 
 
+@pytest.mark.parametrize("angle", [0.05, 1.0])
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_a_length_is_found_again(factor: float, angle: float, rng: np.random.Generator) -> None:
+    """With normals, and by positions alone where these are exact."""
+    position, exact = 0.01, patches(6, 60, rng)[0]
+    drawn = [noisy(patch, position, angle, rng) for patch in exact]
+    likelihood = MarginalLikelihood.of(drawn, RADIUS, rng, "cpu")
+    # From well below the length of the functions to well above it.
+    lengths = [LENGTH * factor * 2.0 ** (step / 2) for step in range(-5, 4)]
+    found = likelihood.likeliest_length(lengths, position, angle)
+    # A finite number of features shows longer functions less exactly, which makes shorter lengths likelier.
+    assert LENGTH / 2.1 < found < 1.5 * LENGTH
+    assert likelihood.likeliest_length([LENGTH], position, angle) == LENGTH
+
+
 def test_exact_points_with_tilted_normals_are_believed(rng: np.random.Generator) -> None:
     """Left-out points say little there, because the noise of their own normals hides what a fit adds to it."""
     x = rng.standard_normal((1500, 3))
