@@ -131,7 +131,8 @@ def test_sigterm_ends_the_watch(folders: tuple[Path, Path]) -> None:
 
 def test_the_open3d_script(scan: Path, tmp_path: Path) -> None:
     mesh = tmp_path / "mesh.ply"
-    found = open3d_pipeline.pipeline(scan, mesh, voxel=0.1, **FEW)
+    # With half of the units, it depends on the draw whether the coarse mesh crosses itself.
+    found = open3d_pipeline.pipeline(scan, mesh, voxel=0.1, **FEW | {"widths": (400,)})
     assert 200 < found.used < found.points == 600
     assert found.watertight
     assert found.mean < 0.02

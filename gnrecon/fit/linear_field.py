@@ -71,7 +71,9 @@ def fit_linear(
     """
     smoothness = field_smoothness(samples, held_out, scene, rng.spawn(1)[0], parameters=parameters)
     spectrum = smooth_spectrum(smoothness.length, scene, parameters=parameters)
-    field = Siren((_unit_count(spectrum.length, parameters),))
+    # Curvature penalties shape the field where nothing was seen, for which fewer units leave too little freedom.
+    count = parameters.most_units if options.regularisers else _unit_count(spectrum.length, parameters)
+    field = Siren((count,))
     linear = replace(options, widths=field.widths, steps=0, smooth=None, fill=None, prior=None)
 
     def fitted(reach: float, advance: ProgressCallback) -> tuple[NeuralSDF, Solution, float]:

@@ -124,7 +124,7 @@ def select_hyperparameters(
     """
     # Draws of its own, so that later ones do not depend on the number of patches.
     rng = rng.spawn(1)[0]
-    clean = None if outliers else _of_clean_scan(residuals, radius, rng.spawn(1)[0], device)
+    clean = None if outliers else _of_clean_scan(residuals, held_out, radius, rng.spawn(1)[0], device)
     if clean is not None:
         return clean
     if residuals.estimated and len(residuals) <= ModelSelectionParameters.sparse_points:
@@ -137,6 +137,7 @@ def select_hyperparameters(
 
 def _of_clean_scan(
     residuals: FieldResiduals,
+    held_out: Mask,
     radius: float,
     rng: np.random.Generator,
     device: str,
@@ -145,19 +146,22 @@ def _of_clean_scan(
 ) -> Hyperparameters | None:
     """Return the hyperparameters of a clean scan, or None of any other; see `select_hyperparameters`.
 
-    Its noise follows from the points. Validation points hardly tell lengths apart: they lie a spacing away from all
-    others, farther than most of the surface, and there a correction that is too smooth predicts as well.
+    Its noise follows from the points. Its length is the likeliest, or the one of the validation points if that is
+    shorter, as both err to the other side: flat faces outweigh edges in a likelihood of equally curved surfaces, and
+    validation points lie a spacing away from all others, farther than most of the surface.
     """
     left = residuals
     noise = clean_noise(left.points, left.normals, left.density, left.rms, left.estimated)
     if noise is None:
         return None
-    position, angle = noise
     # Estimated normals follow from the positions, and are no data.
-    deviation = SurfaceLikelihoodParameters.angle_radians if left.estimated else angle
+    deviation = SurfaceLikelihoodParameters.angle_radians if left.estimated else noise[1]
     likelihood = patch_likelihood(left, radius, rng, device)
-    length = likelihood.likeliest_length([each * radius for each in lengths], position, deviation)
-    return Hyperparameters(length, position, angle)
+    length = likelihood.likeliest_length([each * radius for each in lengths], noise[0], deviation)
+    if length > lengths[0] * radius:
+        validation = CrossValidation.draw(left, held_out, radius, rng, device)
+        length = min(length, replace(validation, known=noise).length_of_clean_scan())
+    return Hyperparameters(length, *noise)
 
 
 def _by_positions(
@@ -243,6 +247,7 @@ class CrossValidation:
     predicted : rows of the validation points that each patch predicts
     held_out : mask of shape (N,), of the validation points
     device : a torch device
+    known : noise of positions and normals, if it is known; then no other is tried
     likelihood : which gives the noise of each length; None of estimated normals, whose errors are correlated, and of
         scans with outliers, to which it is not robust. Then candidates are tried.
     """
@@ -254,6 +259,7 @@ class CrossValidation:
     predicted: Sequence[Int]
     held_out: Mask
     device: str
+    known: tuple[float, float] | None = None
     likelihood: MarginalLikelihood | None = None
     parameters: ModelSelectionParameters = ModelSelectionParameters()
     _noises: dict[float, list[tuple[float, float]]] = field(default_factory=dict, init=False, repr=False)
@@ -282,7 +288,18 @@ class CrossValidation:
         centers = residuals.points[chosen]
         likelihood = None if residuals.estimated else patch_likelihood(residuals, radius, rng.spawn(1)[0], device)
         found = list(out[near])
-        return cls(residuals, radius, features, centers, found, held_out, device, likelihood, parameters)
+        return cls(residuals, radius, features, centers, found, held_out, device, None, likelihood, parameters)
+
+    def length_of_clean_scan(self) -> float:
+        """Return the shortest length that the next longer one does not beat by two standard errors.
+
+        Clean points justify the shortest; longer ones are better only where the points, or a cube's features, are too
+        few for it.
+        """
+        number, count = 0, len(self.parameters.lengths_disk_radii)
+        while number + 1 < count and self._clearly_better(number + 1, number):
+            number += 1
+        return self._length(number)
 
     def select(self) -> Hyperparameters:
         """Return the hyperparameters that predict best, with the likeliest noise where it is known."""
@@ -314,8 +331,18 @@ class CrossValidation:
         """Return a length scale, unit coordinates, by its number."""
         return self.parameters.lengths_disk_radii[number] * self.radius
 
+    def _clearly_better(self, number: int, than: int) -> bool:
+        """Return whether a length's score is better than another's by more than some standard errors.
+
+        Logarithms are compared: one patch where both lengths are far off would outweigh all others.
+        """
+        gain = np.log(self.scores(self._length(than))[:, 0]) - np.log(self.scores(self._length(number))[:, 0])
+        return _is_gain(gain, self.parameters.gain_standard_errors)
+
     def noises(self, length: float) -> list[tuple[float, float]]:
-        """Return the noises of positions and normals to try with a length: one, where it is the likeliest."""
+        """Return the noises of positions and normals to try with a length: one, where it is known or the likeliest."""
+        if self.known is not None:
+            return [self.known]
         if length not in self._noises:
             # With estimated normals, few validation points hardly tell a smooth field from one that winds through all.
             least, most = 0.0, max(self.residuals.rms, self.parameters.least_position_noise_disk_radii * self.radius)

@@ -251,6 +251,7 @@ class ModelSelectionParameters:
     position_noises_disk_radii: tuple[float, ...] = (0.02, 0.1, 0.3, 0.8)  # candidates
     angle_noises_radians: tuple[float, ...] = (0.03, 0.1, 0.3)  # candidates
     tie_share: float = 0.025  # by which a score may exceed the best and yet count as equal
+    gain_standard_errors: float = 2.0  # by which a longer length must predict a clean scan better
     search_standard_errors: float = 1.0  # by which the next length must predict any other scan better, to go on
     least_position_noise_disk_radii: float = 1e-3  # below, rounding would decide
     most_noise_factor: float = 2.0  # between the noise that is tried with estimated normals, and that of the survey
@@ -298,7 +299,7 @@ class SingleNetworkParameters:
     lbfgs_steps: int = 40  # each of 20 iterations
     least_points_to_refine: int = 1000  # docs/research/2026-11-21-one-wide-layer.md
     units_per_point: int = 3  # of one wide layer
-    least_units: int = 1000
+    least_units: int = 300
     points_per_unit: int = 4  # more units than data rows only make it slower and less smooth
     most_sparse_units: int = 2000
     most_units: int = 3000

@@ -10,7 +10,7 @@ import pytest
 from gnrecon.fit import FitOptions, fit, model_selection
 from gnrecon.fit.marginal_likelihood import clean_noise, median_pair_height
 from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
-from gnrecon.fit.parameters import CleanScanParameters
+from gnrecon.fit.parameters import CleanScanParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.geometry.signed_distance import Density
@@ -117,6 +117,23 @@ def test_the_points_themselves_show_how_fast_they_vary(estimated: bool) -> None:
         assert chosen[0].position < 0.02 * radius, "the scan is clean"
         lengths.append(chosen[0].length)
     assert lengths[0] > 1.4 * lengths[1]
+
+
+def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    scan = residuals(bumpy(200))
+    validation = CrossValidation.draw(scan, np.arange(200) % 6 == 0, 1.0, np.random.default_rng(0), "cpu")
+    even = np.linspace(-1.0, 1.0, 10)[:, None]
+    lengths = ModelSelectionParameters.lengths_disk_radii
+    # In one patch all lengths are far off, and which of them by more is chance.
+    astray = 1000.0 * (np.arange(10) == 4)[:, None]
+    scores = {
+        lengths[0]: 3.0 + even + astray,
+        lengths[1]: 2.0 + even + 1.1 * astray,
+        lengths[2]: 1.99 - even + 1.1 * astray,
+        lengths[3]: 1e-3 + 0.0 * even,
+    }
+    monkeypatch.setattr(CrossValidation, "scores", lambda _, length: scores[length])
+    assert validation.length_of_clean_scan() == lengths[1]
 
 
 def test_clean_scans_are_fitted_nearer_than_by_choice(monkeypatch: pytest.MonkeyPatch) -> None:

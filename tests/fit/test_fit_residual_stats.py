@@ -67,7 +67,7 @@ def test_a_fitted_field_explains_its_points_in_any_units(rng: np.random.Generato
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     found: list[dict[str, Any]] = []
     for frame in (Frame(np.zeros(3), 1.0), FRAME):
-        sdf, _ = fit(Samples(normals, normals, frame), FitOptions(widths=(400,), steps=0))
+        sdf, _ = fit(Samples(normals, normals, frame), FitOptions(widths=(1000,), steps=0))
         found.append(Misfit.of(sdf, Samples(normals, normals, frame)).as_dict())
     assert 0 < found[0]["distance"]["max"] < 0.05
     assert found[0]["angle"]["max"] < 20

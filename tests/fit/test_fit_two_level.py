@@ -128,7 +128,7 @@ def bending(sdf: NeuralSDF, about: Samples) -> float:
 
 
 def test_a_gap_of_a_clean_scan_is_bridged_by_coarser_fields(monkeypatch: pytest.MonkeyPatch) -> None:
-    scan, unseen = with_gap(rippled(4000, np.random.default_rng(5)))
+    scan, unseen = with_gap(rippled(12_000, np.random.default_rng(5)))  # the gap is six length scales wide
     bridged = fit(scan, FitOptions(quality="draft"))[0]
     assert bridged.detail is not None
     assert bridged.detail.coarser is not None
