@@ -299,7 +299,7 @@ class SingleNetworkParameters:
     lbfgs_steps: int = 40  # each of 20 iterations
     least_points_to_refine: int = 1000  # docs/research/2026-11-21-one-wide-layer.md
     units_per_point: int = 3  # of one wide layer
-    least_units: int = 300
+    least_units: int = 1000
     points_per_unit: int = 4  # more units than data rows only make it slower and less smooth
     most_sparse_units: int = 2000
     most_units: int = 3000
