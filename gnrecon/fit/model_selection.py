@@ -147,19 +147,19 @@ def _of_clean_scan(
     """Return the hyperparameters of a clean scan, or None of any other; see `select_hyperparameters`.
 
     Its noise follows from the points. Its length is the likeliest, or the one of the validation points if that is
-    shorter, as both err to the other side: flat faces outweigh edges in a likelihood of equally curved surfaces, and
-    validation points lie a spacing away from all others, farther than most of the surface.
+    shorter, as both err towards longer ones: flat faces outweigh edges in a likelihood of equally curved surfaces,
+    and validation points lie a spacing away from all others, farther than most of the surface.
     """
-    left = residuals
-    noise = clean_noise(left.points, left.normals, left.density, left.rms, left.estimated)
+    scan = residuals.points, residuals.normals, residuals.density
+    noise = clean_noise(*scan, residuals.rms, residuals.estimated)
     if noise is None:
         return None
     # Estimated normals follow from the positions, and are no data.
-    deviation = SurfaceLikelihoodParameters.angle_radians if left.estimated else noise[1]
-    likelihood = patch_likelihood(left, radius, rng, device)
+    deviation = SurfaceLikelihoodParameters.angle_radians if residuals.estimated else noise[1]
+    likelihood = patch_likelihood(residuals, radius, rng, device)
     length = likelihood.likeliest_length([each * radius for each in lengths], noise[0], deviation)
     if length > lengths[0] * radius:
-        validation = CrossValidation.draw(left, held_out, radius, rng, device)
+        validation = CrossValidation.draw(residuals, held_out, radius, rng, device)
         length = min(length, replace(validation, known=noise).length_of_clean_scan())
     return Hyperparameters(length, *noise)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit, model_selection
-from gnrecon.fit.marginal_likelihood import clean_noise, median_pair_height
+from gnrecon.fit.marginal_likelihood import MarginalLikelihood, clean_noise, median_pair_height
 from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
 from gnrecon.fit.parameters import CleanScanParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float
@@ -99,7 +99,7 @@ def test_points_that_were_scanned_twice_are_no_pairs() -> None:
 
 @pytest.mark.parametrize("estimated", [False, True])
 def test_the_points_themselves_show_how_fast_they_vary(estimated: bool) -> None:
-    """Validation points have no part in it; nor have normals that were estimated."""
+    """Whichever points are left out, and with normals that are no more than estimated."""
     scan = bumpy(3000)
     radius, noise = Density(scan.points).radius, 0.1 if estimated else 0.01
     normals = scan.normals + noise * np.random.default_rng(1).standard_normal((3000, 3))
@@ -117,6 +117,25 @@ def test_the_points_themselves_show_how_fast_they_vary(estimated: bool) -> None:
         assert chosen[0].position < 0.02 * radius, "the scan is clean"
         lengths.append(chosen[0].length)
     assert lengths[0] > 1.4 * lengths[1]
+
+
+@pytest.mark.parametrize(("likeliest", "predicting", "expected"), [(3, 1, 1), (1, 3, 1), (0, None, 0)])
+def test_the_shorter_of_two_lengths_is_taken(
+    likeliest: int, predicting: int | None, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is predicted where the likeliest is the shortest of all."""
+    left, lengths = residuals(bumpy(600)), ModelSelectionParameters.lengths_disk_radii
+    radius = left.density.radius
+    monkeypatch.setattr(MarginalLikelihood, "likeliest_length", lambda *_: lengths[likeliest] * radius)
+
+    def by_prediction(validation: CrossValidation) -> float:
+        assert predicting is not None
+        assert validation.known is not None
+        return lengths[predicting] * radius
+
+    monkeypatch.setattr(CrossValidation, "length_of_clean_scan", by_prediction)
+    chosen = select_hyperparameters(left, np.arange(600) % 6 == 0, radius, np.random.default_rng(0))
+    assert chosen.length == lengths[expected] * radius
 
 
 def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
