@@ -7,9 +7,9 @@ the derivatives of the features' sum, and the noise covariance D, the log margin
     -1/2 (y^T (K + D)^-1 y + log det (K + D)) + constant.
 
 The noise that maximises its sum over patches is selected (`MarginalLikelihood.likeliest`). All points contribute, so
-that it separates noises which validation points cannot, because those have noise of their own. Length
-scales of noisy scans it selects less well: under it a surface is equally curved everywhere, which no shape is. Those of
-clean scans it mostly selects better (`MarginalLikelihood.likeliest_length`).
+that it separates noises which validation points cannot, because those have noise of their own. Length scales of noisy
+scans it selects less well: under it a surface is equally curved everywhere, which no shape is. Those of clean scans it
+mostly selects better (`MarginalLikelihood.likeliest_length`).
 
 Estimated normals are no data: their errors follow from those of the positions, and are alike among neighbours. By the
 values alone, a correction that cancels the global field in the whole band of noise would explain all points. So values
