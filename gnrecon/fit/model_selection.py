@@ -43,7 +43,7 @@ from gnrecon.runtime.parallel import map_in_threads
 class FieldResiduals:
     """The global field at the points, whose values are residuals: all of shape (N,) or (N, 3), unit coordinates.
 
-    `estimated` says whether normals were estimated; `noise` is the deviation that the points themselves show, or None.
+    `estimated` and `clean` are those of `Samples`; `noise` is the deviation that the points themselves show, or None.
     """
 
     points: Float
@@ -52,13 +52,14 @@ class FieldResiduals:
     gradient: Float
     estimated: bool = False
     noise: float | None = None
+    clean: bool | None = None
 
     @classmethod
     def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
         """Evaluate a field at samples."""
         value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
-        off = value / samples.frame.scale
-        return cls(samples.points, samples.normals, off, gradient, samples.estimated, samples.noise)
+        given = samples.estimated, samples.noise, samples.clean
+        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, *given)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -81,7 +82,7 @@ class FieldResiduals:
     def take(self, rows: Int) -> FieldResiduals:
         """Return those of some points."""
         at = (self.points[rows], self.normals[rows], self.value[rows], self.gradient[rows])
-        return FieldResiduals(*at, self.estimated, self.noise)
+        return FieldResiduals(*at, self.estimated, self.noise, self.clean)
 
     def after(self, detail: Detail) -> FieldResiduals:
         """Return the residuals of the field with a detail that is added."""
@@ -151,8 +152,7 @@ def _of_clean_scan(
     and validation points lie a spacing away from all others, farther than most of the surface.
     """
     scan = residuals.points, residuals.normals, residuals.density
-    noise = clean_noise(*scan, residuals.rms, residuals.estimated)
-    if noise is None:
+    if (noise := clean_noise(*scan, residuals.rms, residuals.estimated, residuals.clean)) is None:
         return None
     # Estimated normals follow from the positions, and are no data.
     deviation = SurfaceLikelihoodParameters.angle_radians if residuals.estimated else noise[1]

@@ -143,6 +143,8 @@ class Samples:
         Whether the normals or their signs were estimated from the points and may be wrong in places.
     noise : float, optional
         Standard deviation of the points along the normal, unit coordinates, where it was measured.
+    clean : bool, optional
+        Whether the points have no noise that matters, where normals were estimated by it; see `spline_patches`.
     """
 
     points: Float
@@ -151,6 +153,7 @@ class Samples:
     held_out: Samples | None = None
     estimated: bool = False
     noise: float | None = None
+    clean: bool | None = None
 
     def __repr__(self) -> str:
         held_out = "" if self.held_out is None else f", {len(self.held_out):,} held out"

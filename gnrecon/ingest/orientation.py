@@ -14,6 +14,8 @@ with both, the second way is taken. Otherwise it decides only where neighbours d
 such as objects on a ground, normals of changing signs may have a winding number nearer to that of a closed surface than
 the right ones. Signs that change within a sheet show: the neighbours that face the other way lie in front of a point as
 often as behind it (`Agreement`).
+
+Of few points without noise, the normals then become those of the smoothest surface (`geometry.spline_patches`).
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
+from gnrecon.geometry.spline_patches import SplineParameters, smoothest_normals
 from gnrecon.ingest.ingest_parameters import IngestParameters, OrientationParameters
+from gnrecon.ingest.line_scans import lie_on_lines
 from gnrecon.ingest.normal_agreement import Agreement, agreement_of
 from gnrecon.ingest.normals import tangent_planes, unoriented_normals
 from gnrecon.ingest.orientation_methods import (
@@ -54,12 +58,14 @@ class Orientation:
         surface with outward normals; on an open surface, most neighbours do not face the other way; by origins, the
         line of sight is clear of the tangent plane; None for given signs
     flipped : share in [0, 1] of the given normals that were flipped
+    clean : whether the points have no noise that matters, where that was found with the normals
     """
 
     normals: Float
     how: str
     confidence: float | None = None
     flipped: float = 0.0
+    clean: bool | None = None
 
     @property
     def estimated(self) -> bool:
@@ -72,6 +78,7 @@ def oriented_normals(
     origins: Float | None = None,
     along: Float | None = None,
     *,
+    most_points: int = SplineParameters.most_points,
     parameters: IngestParameters = IngestParameters(),
 ) -> Orientation:
     """Estimate outward unit normals: towards the scanner where it is known, and mostly upward (+z) for an open sheet.
@@ -83,6 +90,7 @@ def oriented_normals(
         Positions of the scanner; rows of NaN where they are unknown.
     along : array of shape (N, 3), optional
         Unit normals of which only the signs are estimated.
+    most_points : of which normals and noise are found together, see `geometry.spline_patches`
     parameters : tuning constants
 
     Raises
@@ -99,12 +107,19 @@ def oriented_normals(
     if seen is not None:
         return Orientation(seen[0], "estimated, oriented by origins", seen[1])
     normals, disorder = _by_shape(centred, axes, along is None, parameters)
+    clean = None
+    # The nearest points of a point on a line are those of the line, which span no surface.
+    if along is None and len(points) <= most_points and not lie_on_lines(centred, parameters=parameters.lines):
+        smoothest = smoothest_normals(centred, normals)
+        clean, normals = smoothest is not None, normals if smoothest is None else smoothest
     if disorder <= parameters.orientation.most_disorder:
-        return Orientation(normals, "estimated", winding_agreement(centred, normals))
+        return Orientation(normals, "estimated", winding_agreement(centred, normals), clean=clean)
     agreement = agreement_of(centred, normals)
     if is_open(outwardness(centred, normals)) and agreement.conflicting <= parameters.orientation.most_conflicting:
-        return Orientation(normals, "estimated, upward, as of an open surface", 1 - agreement.contradicted)
-    return Orientation(normals, "estimated, orientation uncertain", winding_agreement(centred, normals))
+        how, confidence = "estimated, upward, as of an open surface", 1 - agreement.contradicted
+    else:
+        how, confidence = "estimated, orientation uncertain", winding_agreement(centred, normals)
+    return Orientation(normals, how, confidence, clean=clean)
 
 
 def _by_shape(points: Float, axes: Float, free: bool, parameters: IngestParameters) -> tuple[Float, float]:

@@ -103,7 +103,7 @@ def prepare(
     counts = replace(counts, normals=orientation.how, confidence=orientation.confidence, flipped=orientation.flipped)
     message = "Kept %d of %d points, %d for validation; normals: %s."
     _log.info(message, len(kept), len(cloud), len(held_out), orientation.how)
-    return _in_unit_ball(kept, held_out, orientation.estimated), counts
+    return _in_unit_ball(kept, held_out, orientation, smoothed=moved is not None), counts
 
 
 def _clear_of_few(
@@ -160,7 +160,7 @@ def _smooth(cloud: PointCloud, width: float | None, parameters: IngestParameters
     return replace(cloud, points=points + centre, normals=normals), moved
 
 
-def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Samples:
+def _in_unit_ball(kept: PointCloud, held_out: PointCloud, orientation: Orientation, *, smoothed: bool) -> Samples:
     """Return the samples of a fit, with the validation points in the same frame."""
     assert kept.normals is not None
     frame, held = Frame.of(kept.points), None
@@ -169,8 +169,9 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, estimated: bool) -> Sa
         held = Samples(frame.to_unit(held_out.points), held_out.normals, frame)
     points, normals = frame.to_unit(kept.points), kept.normals
     layer = points
-    if not estimated and sheet_thickness(points, normals) is not None:
+    if not orientation.estimated and sheet_thickness(points, normals) is not None:
         # The two sides of a thin sheet would look like noise; one of them shows it.
         layer = points[normals @ np.linalg.eigh(normals.T @ normals)[1][:, -1] > 0.5]
     noise = estimate_noise(layer, mean_spacing(layer)).deviation if len(layer) >= 16 else None
-    return Samples(points, normals, frame, held, estimated, noise)
+    clean = None if smoothed else orientation.clean
+    return Samples(points, normals, frame, held, orientation.estimated, noise, clean)

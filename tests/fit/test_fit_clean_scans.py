@@ -91,6 +91,17 @@ def test_of_other_scans_the_noise_is_chosen(scan: Samples, over: float) -> None:
     assert clean_noise(points, normals, density, over * density.radius, estimated=False) is None
 
 
+def test_what_was_found_with_the_normals_counts_more_than_pairs() -> None:
+    exact, noisy = told(bumpy(1500)), told(bumpy(1500, noise=0.003))
+    radius = exact[2].radius
+    assert clean_noise(*exact, radius, estimated=True, clean=False) is None
+    assert clean_noise(*noisy, radius, estimated=True, clean=None) is None
+    assert clean_noise(*noisy, radius, estimated=True, clean=True) == (
+        CleanScanParameters.least_position_noise_disk_radii * noisy[2].radius,
+        CleanScanParameters.estimated_angle_noise_radians,
+    )
+
+
 def test_points_that_were_scanned_twice_are_no_pairs() -> None:
     scan = bumpy(600)
     twice = replace(scan, points=np.repeat(scan.points, 2, axis=0), normals=np.repeat(scan.normals, 2, axis=0))

@@ -36,7 +36,7 @@ def test_normals_beside_edges_are_those_of_their_faces(seed: int) -> None:
 
 def test_a_thin_side_is_found_once_the_points_of_the_large_faces_are_gone() -> None:
     """All neighbourhoods of the sides hold points of the upper and lower face."""
-    exact, normals = bored_plate(4000, 0.8, 0.04, 0.3, seed=2)
+    exact, normals = bored_plate(4000, 0.8, 0.035, 0.3, seed=2)
     points = exact + NOISE / 2 * np.random.default_rng(2).standard_normal(exact.shape)
     estimated = oriented_normals(points).normals
     side = np.abs(normals[:, 2]) < 0.5

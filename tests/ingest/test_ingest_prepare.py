@@ -91,6 +91,25 @@ def test_real_files(name: str, kept: int, dropped: dict[str, int], normals: str)
     np.testing.assert_allclose(np.linalg.norm(samples.normals, axis=1), 1)
 
 
+def test_noise_is_looked_for_where_normals_are_missing() -> None:
+    points, normals = torus(500, np.random.default_rng(3))
+    height = 0.03 * np.random.default_rng(4).standard_normal((500, 1))
+    assert prepare(PointCloud(points))[0].clean is True
+    assert prepare(PointCloud(points + height * normals))[0].clean is False
+    # It is not looked for with given normals, and unknown of points that were moved.
+    assert prepare(PointCloud(points, normals))[0].clean is None
+    assert prepare(PointCloud(points), smooth_scan="3s")[0].clean is None
+
+
+def test_estimated_normals_of_few_exact_points_are_those_of_the_smoothest_surface() -> None:
+    points, normals = torus(300, np.random.default_rng(3))
+    by_winding, found = (
+        np.arccos(np.einsum("ij,ij->i", oriented_normals(points, most_points=most).normals, normals).clip(-1, 1))
+        for most in (0, 300)
+    )
+    assert found.mean() < 0.5 * by_winding.mean()
+
+
 @pytest.mark.parametrize("name", ["kitten", "mug"])
 def test_real_sparse_clouds_are_oriented_as_the_truth(name: str) -> None:
     points = read_cloud(stored(f"vipss500/{name}.xyz")).points

@@ -1,0 +1,265 @@
+"""Normals as unknowns: those of the smoothest surface through the points, where noise is not likelier.
+
+Of all functions that are zero at k points and have given gradients g there, of shape (3k,), the triharmonic spline has
+the least energy, the integral of its squared third derivatives. That energy is a quadratic form g^T J g, so that the
+smoothest surface through points of unknown normals has the unit vectors of its minimum. Here the forms are those of
+patches of nearest points, which overlap: the minimum of their sum is one of the surface as a whole, in linear time.
+
+The spline is also the mean of a Gaussian process with the covariance c |x - y|^3, up to linear functions. With noise of
+deviation s of the positions, the values of a patch have the covariance c (K + r I) with r = s^2 / c, and J is that part
+of its inverse which belongs to the gradients. The normals are integrated out about the minimum (Laplace's method):
+
+    log p = -1/2 ((m - 2k) log c + log det A + g^T J g / c + log det H) + constant,
+
+where A is the covariance of the m = 4k - 4 combinations of values and gradients that no linear function changes, for
+c = 1, and H the energy's Hessian in the tangent planes. Each patch has the amplitude c that is likeliest: with one for
+all, thin parts of a sparse scan, which curve more than the others, would pass for noise. The noise of the scan is the
+one of the largest sum over all patches. Of scans of some hundred points, no surface that was fitted first shows it:
+what that leaves over is as irregular as noise where the spacing is that of the shape's features.
+
+Sources: Huang, Carr and Ju, *Variational Implicit Point Set Surfaces* (ACM TOG 2019), for the energy and its unit
+normals; Rasmussen and Williams, *Gaussian Processes for Machine Learning* (2006), sections 2.7 and 3.4; Varin, Reid and
+Firth, *An overview of composite likelihood methods* (2011), for sums over patches that overlap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+
+from gnrecon.geometry.arrays import Float, Int
+from gnrecon.runtime.chunks import slices
+
+
+@dataclass(frozen=True)
+class SplineParameters:
+    """Tuning constants of `smoothest_normals`."""
+
+    most_points: int = 6000  # of a scan, whose forms take 250 MB
+    patch_points: int = 16  # with 12 normals are off by a twentieth more, with 20 by a fiftieth less
+    group_patches: int = 128  # handled at a time, in one thread
+    clean_noises_disk_radii: tuple[float, ...] = (0.0, 0.05)  # candidates of a scan without noise that matters
+    noises_disk_radii: tuple[float, ...] = (0.14, 0.4)  # and of any other; factors of three are fine enough
+    ratios: tuple[float, ...] = tuple(10.0**step for step in range(-7, 2))  # of the noise's and the spline's variance,
+    # in a patch of radius one; below the first, rounding would decide
+    least_amplitude: float = 1e-6  # of a patch of radius one: that of heights of a thousandth; planes have none
+    gradient_variance: float = 0.01  # over the amplitude, in such a patch, for points that nearly coincide
+    regions: int = 8  # whose patches show the noise
+    region_points: int = 125
+    rounds: int = 2  # of amplitudes for these normals, and normals for these amplitudes
+    iterations: int = 50  # of each minimisation
+
+
+def smoothest_normals(
+    points: Float, normals: Float, *, parameters: SplineParameters = SplineParameters()
+) -> Float | None:
+    """Return the unit normals, of shape (N, 3), of the smoothest surface through points; None where noise is likelier.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3), distinct, N >= 10
+    normals : array of shape (N, 3), unit vectors, a first guess, which decides the side
+    parameters : tuning constants
+    """
+    centred = points - points.mean(axis=0)
+    scaled = centred / np.abs(centred).max()
+    some = _regions(scaled, parameters)
+    patches = _SplinePatches(scaled, some, parameters)
+    clean, noisy = (
+        max((patches.fit(normals, noise * patches.radius) for noise in noises), key=_log_likelihood)
+        for noises in (parameters.clean_noises_disk_radii, parameters.noises_disk_radii)
+    )
+    if clean.log_likelihood < noisy.log_likelihood:
+        return None
+    if len(some) < len(points):
+        clean = _SplinePatches(scaled, np.arange(len(points)), parameters).fit(normals, clean.noise)
+    return clean.normals
+
+
+def _regions(points: Float, parameters: SplineParameters) -> Int:
+    """Return the rows of all points, or of those in some random regions, if they are many; in order."""
+    if len(points) <= parameters.regions * parameters.region_points:
+        return np.arange(len(points))
+    centers = points[np.random.default_rng(0).choice(len(points), parameters.regions, replace=False)]
+    return np.unique(cKDTree(points).query(centers, parameters.region_points)[1])
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Unit normals of least energy for a noise, of shape (N, 3), and their log likelihood, but for a constant."""
+
+    noise: float
+    normals: Float
+    log_likelihood: float
+
+
+def _log_likelihood(fit: _Fit) -> float:
+    return fit.log_likelihood
+
+
+class _SplinePatches:
+    """The energies of the patches about some points.
+
+    Parameters
+    ----------
+    points : array of shape (N, 3)
+    centers : rows of the points that have a patch
+    parameters : as of `smoothest_normals`
+    """
+
+    def __init__(self, points: Float, centers: Int, parameters: SplineParameters) -> None:
+        from gnrecon.runtime.parallel import map_in_threads  # it loads torch
+
+        self._map = map_in_threads
+        self.parameters = parameters
+        ranks = list(range(1, min(parameters.patch_points, len(points)) + 1))
+        distance, near = cKDTree(points).query(points[centers], ranks)
+        reach = distance[:, -1]
+        self.radius = float(np.median(reach)) / len(ranks) ** 0.5
+        """Of the disk that a point stands for, in the unit of the points."""
+        groups = slices(len(centers), parameters.group_patches)
+        self._groups = self._map(lambda rows: _Group(points, near[rows], reach[rows], parameters), groups)
+
+    def fit(self, normals: Float, noise: float) -> _Fit:
+        """Return the normals of least energy for a noise of the positions.
+
+        Parameters
+        ----------
+        normals : of shape (N, 3), unit vectors to start at
+        noise : standard deviation, in the unit of the points
+        """
+        for _ in range(self.parameters.rounds):
+            amplitudes = self._likeliest(normals, noise)
+            pairs = list(zip(self._groups, amplitudes, strict=True))
+            normals = self._minimum(self._map(lambda pair: pair[0].form(*pair[1][:2]), pairs), normals)
+        return _Fit(noise, normals, sum(float(one[2].sum()) for one in self._likeliest(normals, noise)))
+
+    def _likeliest(self, normals: Float, noise: float) -> list[tuple[Float, Float, Float]]:
+        """Return the likeliest ratio and amplitude and the log likelihood of the patches of each group."""
+        return self._map(lambda group: group.likeliest(normals, noise), self._groups)
+
+    def _minimum(self, forms: list[Float], normals: Float) -> Float:
+        """Return the unit vectors at which the sum of quadratic forms is least, near those of a start."""
+        both = list(zip(self._groups, forms, strict=True))
+
+        def energy(flat: Float) -> tuple[float, Float]:
+            vectors = flat.reshape(-1, 3)
+            length = np.linalg.norm(vectors, axis=1, keepdims=True)
+            unit = vectors / length
+            slope = np.sum(self._map(lambda one: one[0].derivative(one[1], unit), both), axis=0)
+            along = (slope * unit).sum(axis=1, keepdims=True)
+            # Lengths do not count. The forms are quadratic: their value is the product with half of their derivative.
+            return float(along.sum()), (2 * (slope - along * unit) / length).ravel()
+
+        limits = {"maxiter": self.parameters.iterations}
+        vectors: Float = minimize(energy, normals.ravel(), jac=True, method="L-BFGS-B", options=limits).x.reshape(-1, 3)
+        unit: Float = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        return unit
+
+
+class _Group:
+    """The quadratic forms of some patches, each in coordinates in which its radius is one."""
+
+    def __init__(self, points: Float, near: Int, reach: Float, parameters: SplineParameters) -> None:
+        self.parameters = parameters
+        self.near, self.reach, self.count = near, reach, len(points)
+        k = near.shape[1]
+        local = points[near]
+        local = (local - local.mean(axis=1, keepdims=True)) / reach[:, None, None]
+        system = _spline_system(local)
+        rows = np.arange(4 * k)
+        system[:, rows, rows] += np.where(rows < k, parameters.ratios[0], parameters.gradient_variance)
+        linear = system[:, : 4 * k, 4 * k :]
+        # The determinant of the whole system is that of A, times that of the linear functions' products.
+        self.log_det = np.linalg.slogdet(system)[1] - np.linalg.slogdet(linear.transpose(0, 2, 1) @ linear)[1]
+        inverse = np.linalg.inv(system)
+        # A ratio r changes the values' diagonal alone: J - J_gf (1 / r + J_ff)^-1 J_fg, by the eigenvalues of J_ff.
+        values, axes = np.linalg.eigh(inverse[:, :k, :k])
+        self.values = np.maximum(values, 0.0)
+        self.mixed = axes.transpose(0, 2, 1) @ inverse[:, :k, k : 4 * k]
+        self.least = inverse[:, k : 4 * k, k : 4 * k].copy()
+
+    def likeliest(self, normals: Float, noise: float) -> tuple[Float, Float, Float]:
+        """Return the likeliest ratio, the amplitude and the log likelihood of each patch, of shape (B,)."""
+        k = self.near.shape[1]
+        freedom = 4 * k - 4 - 2 * k
+        flat = normals[self.near].reshape(len(self.near), -1)
+        tangents = _tangents(normals)[self.near]
+        blocks = np.zeros((len(self.near), k, 3, k, 2))
+        blocks[:, range(k), :, range(k)] = tangents.transpose(1, 0, 3, 2)
+        planes = blocks.reshape(len(self.near), 3 * k, 2 * k)
+        hessian, off = planes.transpose(0, 2, 1) @ (self.least @ planes), self.mixed @ planes
+        less = off @ np.linalg.solve(hessian, off.transpose(0, 2, 1))
+        log_hessian = np.linalg.slogdet(hessian)[1]
+        energy = (flat * (self.least @ flat[:, :, None])[:, :, 0]).sum(axis=1)
+        squares = (self.mixed @ flat[:, :, None])[:, :, 0] ** 2
+        best = np.full(len(flat), -np.inf)
+        ratios, amplitudes = np.full(len(flat), self.parameters.ratios[0]), np.ones(len(flat))
+        for ratio in self.parameters.ratios if noise else self.parameters.ratios[:1]:
+            share = self._share(np.full(len(flat), ratio))
+            rest = energy - (share * squares).sum(axis=1)
+            # Without noise, the amplitude is free.
+            amplitude = (noise / self.reach) ** 2 / ratio if noise else rest / freedom
+            amplitude = np.maximum(amplitude, self.parameters.least_amplitude)
+            root = np.sqrt(share)
+            lost = np.linalg.slogdet(np.eye(k) - root[:, :, None] * less * root[:, None, :])[1]
+            log_det = self.log_det + np.log1p((ratio - self.parameters.ratios[0]) * self.values).sum(axis=1)
+            density = -0.5 * (freedom * np.log(amplitude) + log_det + rest / amplitude + log_hessian + lost)
+            better = density > best
+            best, ratios = np.where(better, density, best), np.where(better, ratio, ratios)
+            amplitudes = np.where(better, amplitude, amplitudes)
+        return ratios, amplitudes, best
+
+    def form(self, ratios: Float, amplitudes: Float) -> Float:
+        """Return the energies' quadratic forms over their amplitudes, of shape (B, 3k, 3k)."""
+        scaled = self.mixed * self._share(ratios)[:, :, None]
+        forms: Float = (self.least - self.mixed.transpose(0, 2, 1) @ scaled) / amplitudes[:, None, None]
+        return forms
+
+    def derivative(self, forms: Float, normals: Float) -> Float:
+        """Return half of the derivative of the sum of quadratic forms by all normals, of shape (N, 3)."""
+        flat = normals[self.near].reshape(len(self.near), -1, 1)
+        parts, rows = (forms @ flat).reshape(-1, 3), self.near.ravel()
+        return np.stack([np.bincount(rows, parts[:, axis], self.count) for axis in range(3)], axis=1)
+
+    def _share(self, ratios: Float) -> Float:
+        """Return what ratios of shape (B,) subtract from a form along the eigenvectors of J_ff, of shape (B, k)."""
+        more = (ratios - self.parameters.ratios[0])[:, None]
+        shares: Float = more / (1.0 + more * self.values)
+        return shares
+
+
+def _spline_system(points: Float) -> Float:
+    """Return the covariances of values, gradients and linear functions at points of shape (B, k, 3).
+
+    The rows of the answer, of shape (B, 4k + 4, 4k + 4), are the values, the gradients of each point, and the
+    coefficients of the linear functions. The covariance is |x - y|^3.
+    """
+    count, k = points.shape[:2]
+    offset = points[:, :, None] - points[:, None]
+    distance = np.sqrt((offset**2).sum(axis=3))
+    outer = offset[..., :, None] * offset[..., None, :] / np.where(distance > 0, distance, 1.0)[..., None, None]
+    system = np.zeros((count, 4 * k + 4, 4 * k + 4))
+    system[:, :k, :k] = distance**3
+    slope = (3 * distance[..., None] * offset).reshape(count, k, 3 * k)
+    system[:, :k, k : 4 * k] = -slope
+    second = -3 * (distance[..., None, None] * np.eye(3) + outer)
+    system[:, k : 4 * k, k : 4 * k] = second.transpose(0, 1, 3, 2, 4).reshape(count, 3 * k, 3 * k)
+    system[:, :k, 4 * k] = 1.0
+    system[:, :k, 4 * k + 1 :] = points
+    system[:, k : 4 * k, 4 * k + 1 :] = np.tile(np.eye(3), (k, 1))
+    upper = np.triu(np.ones(system.shape[1:], dtype=bool), 1)
+    symmetric: Float = np.where(upper, system, system.transpose(0, 2, 1))
+    return symmetric
+
+
+def _tangents(normals: Float) -> Float:
+    """Return two unit vectors across each unit normal, of shape (N, 2, 3)."""
+    axis = np.where(np.abs(normals[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = np.cross(normals, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    both: Float = np.stack([first, np.cross(normals, first)], axis=1)
+    return both
