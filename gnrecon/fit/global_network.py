@@ -183,9 +183,15 @@ class NetworkTerms:
         medians, components = {1: 0.6745, 2: 1.1774, 3: 1.538}, turn.shape[1]
         values = float(distance.median()) / medians[1]
         normals = float(turn.norm(dim=1).median()) / medians.get(components, components**0.5)
-        # The errors of estimated normals are alike among neighbours, so that validation points do not show them.
-        least_angle = self.parameters.least_estimated_deviation if self.scene.samples.estimated else least
-        return Deviations(max(values, least * radius), max(normals, least_angle))
+        return Deviations(max(values, least * radius), max(normals, self._least_angle))
+
+    @property
+    def _least_angle(self) -> float:
+        """Least deviation of the normals: neighbours' estimates err alike, which validation points do not show."""
+        samples, limits = self.scene.samples, self.parameters
+        if not samples.estimated:
+            return limits.least_deviation
+        return limits.least_estimated_deviation if samples.clean is None else limits.least_sparse_deviation
 
     def prediction(self, field: Siren, theta: Tensor) -> Prediction:
         """Return how the field predicts."""

@@ -212,6 +212,25 @@ def test_the_noise_of_the_data_is_that_of_the_validation_points(rng: np.random.G
     assert terms.noise(field.field, field.theta).values == pytest.approx(0.02, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("estimated", "clean", "least"),
+    [
+        pytest.param(False, None, NetworkTermParameters.least_deviation, id="given"),
+        pytest.param(True, None, NetworkTermParameters.least_estimated_deviation, id="by neighbourhoods"),
+        pytest.param(True, True, NetworkTermParameters.least_sparse_deviation, id="of the smoothest surface"),
+        pytest.param(True, False, NetworkTermParameters.least_sparse_deviation, id="by winding number"),
+    ],
+)
+def test_estimated_normals_are_off_by_more_than_validation_points_show(
+    estimated: bool, clean: bool | None, least: float, rng: np.random.Generator
+) -> None:
+    terms = terms_of(replace(capsule(400, 0), estimated=estimated, clean=clean), rng)
+    field = Siren((8, 8))
+    theta = random_network(field, rng, terms.scene.points)
+    terms = replace(terms, normals=field.value_and_gradient(theta, terms.points)[1])
+    assert terms.noise(field, theta).normals == least
+
+
 def test_sparse_points_get_several_small_networks_and_dense_ones_one(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
