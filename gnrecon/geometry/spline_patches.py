@@ -41,8 +41,7 @@ class SplineParameters:
     most_points: int = 6000  # of a scan, whose forms take 250 MB
     patch_points: int = 16  # with 12 normals are off by a twentieth more, with 20 by a fiftieth less
     group_patches: int = 128  # handled at a time, in one thread
-    clean_noises_disk_radii: tuple[float, ...] = (0.0, 0.05)  # candidates of a scan without noise that matters
-    noises_disk_radii: tuple[float, ...] = (0.14, 0.4)  # and of any other; factors of three are fine enough
+    noises_disk_radii: tuple[float, ...] = (0.14, 0.4)  # that are compared with none; below 0.07, none is likelier
     ratios: tuple[float, ...] = tuple(10.0**step for step in range(-7, 2))  # of the noise's and the spline's variance,
     # in a patch of radius one; below the first, rounding would decide
     least_amplitude: float = 1e-6  # of a patch of radius one: that of heights of a thousandth; planes have none
@@ -68,15 +67,13 @@ def smoothest_normals(
     scaled = centred / np.abs(centred).max()
     some = _regions(scaled, parameters)
     patches = _SplinePatches(scaled, some, parameters)
-    clean, noisy = (
-        max((patches.fit(normals, noise * patches.radius) for noise in noises), key=_log_likelihood)
-        for noises in (parameters.clean_noises_disk_radii, parameters.noises_disk_radii)
-    )
-    if clean.log_likelihood < noisy.log_likelihood:
-        return None
+    exact = patches.fit(normals, 0.0)
+    for noise in parameters.noises_disk_radii:
+        if patches.fit(normals, noise * patches.radius).log_likelihood > exact.log_likelihood:
+            return None
     if len(some) < len(points):
-        clean = _SplinePatches(scaled, np.arange(len(points)), parameters).fit(normals, clean.noise)
-    return clean.normals
+        exact = _SplinePatches(scaled, np.arange(len(points)), parameters).fit(normals, 0.0)
+    return exact.normals
 
 
 def _regions(points: Float, parameters: SplineParameters) -> Int:
@@ -89,15 +86,10 @@ def _regions(points: Float, parameters: SplineParameters) -> Int:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Unit normals of least energy for a noise, of shape (N, 3), and their log likelihood, but for a constant."""
+    """Unit normals of least energy, of shape (N, 3), and their log likelihood, but for a constant."""
 
-    noise: float
     normals: Float
     log_likelihood: float
-
-
-def _log_likelihood(fit: _Fit) -> float:
-    return fit.log_likelihood
 
 
 class _SplinePatches:
@@ -135,7 +127,7 @@ class _SplinePatches:
             amplitudes = self._likeliest(normals, noise)
             pairs = list(zip(self._groups, amplitudes, strict=True))
             normals = self._minimum(self._map(lambda pair: pair[0].form(*pair[1][:2]), pairs), normals)
-        return _Fit(noise, normals, sum(float(one[2].sum()) for one in self._likeliest(normals, noise)))
+        return _Fit(normals, sum(float(one[2].sum()) for one in self._likeliest(normals, noise)))
 
     def _likeliest(self, normals: Float, noise: float) -> list[tuple[Float, Float, Float]]:
         """Return the likeliest ratio and amplitude and the log likelihood of the patches of each group."""
