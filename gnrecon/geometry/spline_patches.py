@@ -13,9 +13,9 @@ of its inverse which belongs to the gradients. The normals are integrated out ab
 
 where A is the covariance of the m = 4k - 4 combinations of values and gradients that no linear function changes, for
 c = 1, and H the energy's Hessian in the tangent planes. Each patch has the amplitude c that is likeliest: with one for
-all, thin parts of a sparse scan, which curve more than the others, would pass for noise. The noise of the scan is the
-one of the largest sum over all patches. Of scans of some hundred points, no surface that was fitted first shows it:
-what that leaves over is as irregular as noise where the spacing is that of the shape's features.
+all, thin parts of a sparse scan, which curve more than the others, would pass for noise. Points are exact where no
+noise makes the sum over all patches larger. Of some hundred points, no surface that was fitted first shows this: what
+it leaves over is as irregular as noise where the spacing is that of the shape's features.
 
 Sources: Huang, Carr and Ju, *Variational Implicit Point Set Surfaces* (ACM TOG 2019), for the energy and its unit
 normals; Rasmussen and Williams, *Gaussian Processes for Machine Learning* (2006), sections 2.7 and 3.4; Varin, Reid and
