@@ -271,12 +271,12 @@ def clean_noise(
     clean : whether the scan is, where that was found with its normals; pairs do not show it where they lie as far apart
         as the surface's features
     """
-    if rms < parameters.least_residual_disk_radii * density.radius:
+    if clean is False or rms < parameters.least_residual_disk_radii * density.radius:
+        return None
+    height = 0.0 if clean else median_pair_height(points, normals, density, parameters=parameters)
+    if not height <= parameters.most_height:
         return None
     least = parameters.least_position_noise_disk_radii
-    height = 0.0 if clean else median_pair_height(points, normals, density, parameters=parameters)
-    if clean is False or not height <= parameters.most_height:
-        return None
     if estimated:
         return least * density.radius, parameters.estimated_angle_noise_radians
     angle = max(parameters.angle_over_position_noise * height, parameters.least_angle_noise_radians)
