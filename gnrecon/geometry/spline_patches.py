@@ -31,6 +31,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from gnrecon.geometry.arrays import Float, Int
+from gnrecon.geometry.statistics import perpendicular
 from gnrecon.runtime.chunks import slices
 
 
@@ -250,8 +251,7 @@ def _spline_system(points: Float) -> Float:
 
 def _tangents(normals: Float) -> Float:
     """Return two unit vectors across each unit normal, of shape (N, 2, 3)."""
-    axis = np.where(np.abs(normals[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    first = np.cross(normals, axis)
+    first = perpendicular(normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     both: Float = np.stack([first, np.cross(normals, first)], axis=1)
     return both

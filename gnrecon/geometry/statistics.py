@@ -70,11 +70,8 @@ def robust_deviation(residuals: Float) -> float:
 
 
 def perpendicular(axis: Float) -> Float:
-    """Return a vector at right angles to an axis, both of shape (3,); its length is not one."""
-    least = int(np.abs(axis).argmin())
-    one, other = (least + 1) % 3, (least + 2) % 3
-    across = np.zeros(3)
-    across[one], across[other] = axis[other], -axis[one]
+    """Return vectors at right angles to axes, both of shape (..., 3); their lengths are not one."""
+    across: Float = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=-1)])
     return across
 
 
