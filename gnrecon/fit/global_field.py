@@ -11,18 +11,25 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import torch
 
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions, network_steps
+from gnrecon.fit.free_space import Volume
 from gnrecon.fit.global_network import NetworkTerms, Prediction
 from gnrecon.fit.linear_field import fit_linear
+from gnrecon.fit.local_solve import Patch
 from gnrecon.fit.network_ladder import NetworkLadder, Rival
 from gnrecon.fit.objective import Scene
 from gnrecon.fit.parameters import GlobalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
+from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.point_cloud import Samples
+from gnrecon.geometry.signed_distance import Density, scene_dipoles
 from gnrecon.optim import Callback, Record, Solution
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress
 
@@ -59,9 +66,81 @@ class GlobalField:
         """Return the field after some steps on all samples, which the validation points are a part of."""
         if self.ladder is None:
             return self.sdf
-        points, normals = self.scene.tensor(samples.points), self.scene.tensor(samples.normals)
-        field, theta = self.ladder.refit(replace(self.scene, points=points, normals=normals, samples=samples))
+        field, theta = self.ladder.refit(self.scene.with_samples(samples))
         return replace(self.sdf, field=field, theta=theta)
+
+
+@dataclass(frozen=True)
+class FieldResiduals:
+    """The global field at the points, whose values are residuals: all of shape (N,) or (N, 3), unit coordinates.
+
+    `estimated`, `clean` and `deviations`, of shape (N,), are those of `Samples`; `noise` is the deviation that the
+    points themselves show, or None.
+    """
+
+    points: Float
+    normals: Float
+    value: Float
+    gradient: Float
+    estimated: bool = False
+    noise: float | None = None
+    clean: bool | None = None
+    deviations: Float | None = None
+
+    @classmethod
+    def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
+        """Evaluate a field at samples."""
+        value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
+        given = samples.estimated, samples.noise, samples.clean, samples.deviations
+        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, *given)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def density(self) -> Density:
+        """How densely the points lie."""
+        return Density(self.points)
+
+    @cached_property
+    def dipoles(self) -> DipoleTree:
+        """Of the points, for their winding number."""
+        return DipoleTree.of(self.points, *scene_dipoles(self.points, self.normals, self.density.disks))
+
+    @cached_property
+    def rms(self) -> float:
+        """Root mean square of the values."""
+        return float(np.sqrt(np.mean(self.value**2)))
+
+    @cached_property
+    def angle(self) -> float:
+        """Median deviation of the normals, that of one of weight one; a radian where none are known."""
+        return 1.0 if self.deviations is None else float(np.median(self.deviations))
+
+    def take(self, rows: Int) -> FieldResiduals:
+        """Return those of some points."""
+        at = (self.points[rows], self.normals[rows], self.value[rows], self.gradient[rows])
+        deviations = None if self.deviations is None else self.deviations[rows]
+        return FieldResiduals(*at, self.estimated, self.noise, self.clean, deviations)
+
+    def after(self, detail: Detail) -> FieldResiduals:
+        """Return the residuals of the field with a detail that is added."""
+        value, gradient = detail.value_and_gradient(self.points)
+        return replace(self, value=self.value + value, gradient=self.gradient + gradient)
+
+    def within(self, center: Float, reach: float) -> Int:
+        """Return the rows of the points in the cube of half an edge `reach` about a centre, in order."""
+        return np.sort(np.array(self.density.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64))
+
+    def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
+        """Return the patch of some rows, with samples of the volume."""
+        turn = self.normals[rows] - self.gradient[rows]
+        arrays = (self.points[rows], -self.value[rows], turn, *volume.rows(), center)
+        patch = Patch(*(torch.as_tensor(values, device=device) for values in arrays))
+        if self.deviations is None:
+            return patch
+        weights = (self.angle / self.deviations[rows]) ** 2
+        return replace(patch, normal_weights=torch.as_tensor(weights, device=device))
 
 
 def fit_global(

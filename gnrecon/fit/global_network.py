@@ -187,9 +187,9 @@ class NetworkTerms:
 
     @property
     def _least_angle(self) -> float:
-        """Least deviation of the normals: neighbours' estimates err alike, which validation points do not show."""
+        """Least deviation of all normals: neighbours' estimates err alike, which validation points do not show."""
         samples, limits = self.scene.samples, self.parameters
-        if not samples.estimated:
+        if not samples.estimated or self.scene.deviations is not None:
             return limits.least_deviation
         return limits.least_estimated_deviation if samples.clean is None else limits.least_sparse_deviation
 
@@ -248,11 +248,13 @@ class NetworkTerms:
         rows = self._part(len(self.scene.points), self.parameters.data_rows, rng)
         points, normals = self.scene.points[rows], self.scene.normals[rows]
         value, gradient = field.value_and_gradient(theta, points)
-        off = (value / noise.values).square()
+        off, angles = (value / noise.values).square(), torch.full_like(value, noise.normals)
+        if (own := self.scene.deviations) is not None:
+            angles = own[rows].maximum(angles)
         turn = self.normal(value, gradient, normals).residual
-        turned = (turn / noise.normals).square().sum(1)
+        turned = (turn / angles[:, None]).square().sum(1)
         of_values = (freedom + 1) / (freedom + off) / noise.values**2
-        of_normals = (freedom + turn.shape[1]) / (freedom + turned) / noise.normals**2
+        of_normals = (freedom + turn.shape[1]) / (freedom + turned) / angles.square()
         # A term's weight is divided by its number of rows.
         return (
             ObjectiveTerm("interface", interface, points, None, len(rows) * of_values),

@@ -20,8 +20,9 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import CubeSpace
-from gnrecon.fit.local_solve import Hyperparameters, Patch, PatchSystem, precise_enough
-from gnrecon.fit.model_selection import FieldResiduals, patch_likelihood
+from gnrecon.fit.global_field import FieldResiduals
+from gnrecon.fit.local_solve import Patch, PatchSystem, precise_enough
+from gnrecon.fit.model_selection import Hyperparameters, patch_likelihood
 from gnrecon.fit.parameters import CoarserFieldParameters, FreeSpaceParameters, LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from scipy.spatial import cKDTree
@@ -27,30 +27,6 @@ from gnrecon.fit.parameters import LocalSolveParameters
 from gnrecon.least_squares.direct import damped_factor, solve_factored
 from gnrecon.least_squares.layer_products import gram_and_product
 from gnrecon.runtime.chunks import slices
-
-
-@dataclass(frozen=True)
-class Hyperparameters:
-    """Length scale and noise of a scan, the hyperparameters of the Gaussian process.
-
-    Parameters
-    ----------
-    length : over which the surface's shape varies, unit coordinates
-    position : of the points' noise along the normal, unit coordinates
-    angle : of the normals' noise, radians
-    by_place : whether the length is that of the scan on the whole, from which each cube's own may differ
-    rms_factor : prior standard deviation of a cube's correction, over the RMS of the residuals there
-    robust : whether points that contradict the others of their cube lose their weight
-    by_slopes : whether the prior standard deviation is wide enough for the slopes that the data ask for, too
-    """
-
-    length: float
-    position: float
-    angle: float
-    by_place: bool = False
-    rms_factor: float = LocalSolveParameters.correction_rms_factor
-    robust: bool = False
-    by_slopes: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,6 +43,7 @@ class Patch:
     zero : of shape (Q,), the c at which the corrected field vanishes there
     center : of shape (3,), origin of the features' coordinates
     weights : of shape (N,), of the points, or None where all have a weight of one
+    normal_weights : of shape (N,), by which their normals count besides, or None
     """
 
     points: Tensor
@@ -80,6 +57,7 @@ class Patch:
     distance: Tensor
     center: Tensor
     weights: Tensor | None = None
+    normal_weights: Tensor | None = None
 
     @property
     def size(self) -> float:
@@ -90,6 +68,13 @@ class Patch:
     def rms(self) -> float:
         """Root mean square of what the correction should be at the points, or a tiny value."""
         return max(float(self.value.square().mean().sqrt()), 1e-6)
+
+    @property
+    def weights_of_normals(self) -> Tensor | None:
+        """Weights of the points' normals, of shape (N,), or None where all have a weight of one."""
+        if self.weights is None or self.normal_weights is None:
+            return self.weights if self.normal_weights is None else self.normal_weights
+        return self.weights * self.normal_weights
 
     def deviation(self, length: float, size: float) -> Tensor:
         """Return the standard deviation of what the correction should be at the samples of the volume, of shape (Q,).
@@ -121,10 +106,8 @@ class PatchSystem:
     @cached_property
     def _positions(self) -> tuple[Tensor, Tensor]:
         """J^T J and J^T y of the values."""
-        values = self._patch.value
-        return self._sums(
-            (self._weighted(z.sin(), rows), self._weighted(values[rows], rows)) for rows, z in self._phases()
-        )
+        values, weighted = self._patch.value, partial(_weighted, self._patch.weights)
+        return self._sums((weighted(z.sin(), rows), weighted(values[rows], rows)) for rows, z in self._phases())
 
     @cached_property
     def _angles(self) -> tuple[Tensor, Tensor]:
@@ -134,7 +117,8 @@ class PatchSystem:
         the Hadamard product of C^T C and S S^T, a third of the work of three products.
         """
         wanted, slopes = self._patch.gradient, self._features.frequencies / self._length
-        cosines = ((self._weighted(z.cos(), rows), self._weighted(wanted[rows], rows)) for rows, z in self._phases())
+        weighted = partial(_weighted, self._patch.weights_of_normals)
+        cosines = ((weighted(z.cos(), rows), weighted(wanted[rows], rows)) for rows, z in self._phases())
         product, along = self._sums(cosines, 3)
         slopes = slopes.to(product)
         return product.mul_(slopes @ slopes.T), (along * slopes).sum(dim=1)
@@ -165,13 +149,6 @@ class PatchSystem:
         patch = self._patch
         for rows in slices(len(patch.value), LocalSolveParameters.chunk_points):
             yield rows, self._features.phase(patch.points[rows], patch.center, self._length)
-
-    def _weighted(self, values: Tensor, rows: slice) -> Tensor:
-        """Return values of some points times the roots of the points' weights."""
-        if self._patch.weights is None:
-            return values
-        roots = self._patch.weights[rows].sqrt().to(values)
-        return values * (roots if values.dim() == 1 else roots[:, None])
 
     def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]], *columns: int) -> tuple[Tensor, Tensor]:
         """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y, of `columns`."""
@@ -329,10 +306,13 @@ class LocalRowSystem:
         variance, features = size**2 * 2.0 / len(features), features.to(patch.value.dtype)
         sines, slopes = _data_rows(patch, features, length, slice(None))
         free, wanted = _volume_rows(patch, features, length, size)
+        every = slice(None)
+        slopes = [_weighted(patch.normal_weights, slope, every) for slope in slopes]
+        turns = _weighted(patch.normal_weights, patch.gradient, every)
         rows = torch.cat([sines, *slopes, free])
         self._spread = variance * rows.T
         self._kernel = rows @ self._spread
-        self._wanted = torch.cat([patch.value, patch.gradient.T.flatten(), wanted])
+        self._wanted = torch.cat([patch.value, turns.T.flatten(), wanted])
         self._counts = torch.tensor([len(sines), 3 * len(sines), len(free)], device=rows.device)
 
     def solve(self, position: float, angle: float) -> Tensor:
@@ -366,6 +346,14 @@ def precise_enough(features: Features, points: int, length: float, size: float, 
     position, angle = size / noise[0], size / length / noise[1]
     # For features of variance one, a row of J has mean squares of one, for a value and each component of a normal.
     return features.precise_enough(points * (position**2 + 3 * angle**2))
+
+
+def _weighted(weights: Tensor | None, values: Tensor, rows: slice) -> Tensor:
+    """Return values of some points times the roots of the points' weights, if there are any."""
+    if weights is None:
+        return values
+    roots = weights[rows].sqrt().to(values)
+    return values * (roots if values.dim() == 1 else roots[:, None])
 
 
 def _crowd(points: Tensor, reach: float) -> Tensor:

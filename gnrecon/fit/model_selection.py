@@ -14,90 +14,49 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gnrecon.field.partition_of_unity import Detail
 from gnrecon.field.random_features import Features
-from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.free_space import Volume
-from gnrecon.fit.local_solve import Hyperparameters, Patch, patch_system, precise_enough
+from gnrecon.fit.global_field import FieldResiduals
+from gnrecon.fit.local_solve import Patch, patch_system, precise_enough
 from gnrecon.fit.marginal_likelihood import MarginalLikelihood, SurfaceLikelihood, clean_noise
 from gnrecon.fit.parameters import (
+    LocalSolveParameters,
     MarginalLikelihoodParameters,
     ModelSelectionParameters,
     SurfaceLikelihoodParameters,
 )
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.geometry.octree import DipoleTree
-from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import Density, scene_dipoles
 from gnrecon.runtime.parallel import map_in_threads
 
 
 @dataclass(frozen=True)
-class FieldResiduals:
-    """The global field at the points, whose values are residuals: all of shape (N,) or (N, 3), unit coordinates.
+class Hyperparameters:
+    """Length scale and noise of a scan, the hyperparameters of the Gaussian process.
 
-    `estimated` and `clean` are those of `Samples`; `noise` is the deviation that the points themselves show, or None.
+    Parameters
+    ----------
+    length : over which the surface's shape varies, unit coordinates
+    position : of the points' noise along the normal, unit coordinates
+    angle : of the normals' noise, radians
+    by_place : whether the length is that of the scan on the whole, from which each cube's own may differ
+    rms_factor : prior standard deviation of a cube's correction, over the RMS of the residuals there
+    robust : whether points that contradict the others of their cube lose their weight
+    by_slopes : whether the prior standard deviation is wide enough for the slopes that the data ask for, too
     """
 
-    points: Float
-    normals: Float
-    value: Float
-    gradient: Float
-    estimated: bool = False
-    noise: float | None = None
-    clean: bool | None = None
-
-    @classmethod
-    def of(cls, sdf: NeuralSDF, samples: Samples) -> FieldResiduals:
-        """Evaluate a field at samples."""
-        value, gradient = sdf.sdf_and_gradient(samples.frame.to_world(samples.points))
-        given = samples.estimated, samples.noise, samples.clean
-        return cls(samples.points, samples.normals, value / samples.frame.scale, gradient, *given)
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    @cached_property
-    def density(self) -> Density:
-        """How densely the points lie."""
-        return Density(self.points)
-
-    @cached_property
-    def dipoles(self) -> DipoleTree:
-        """Of the points, for their winding number."""
-        return DipoleTree.of(self.points, *scene_dipoles(self.points, self.normals, self.density.disks))
-
-    @cached_property
-    def rms(self) -> float:
-        """Root mean square of the values."""
-        return float(np.sqrt(np.mean(self.value**2)))
-
-    def take(self, rows: Int) -> FieldResiduals:
-        """Return those of some points."""
-        at = (self.points[rows], self.normals[rows], self.value[rows], self.gradient[rows])
-        return FieldResiduals(*at, self.estimated, self.noise, self.clean)
-
-    def after(self, detail: Detail) -> FieldResiduals:
-        """Return the residuals of the field with a detail that is added."""
-        value, gradient = detail.value_and_gradient(self.points)
-        return replace(self, value=self.value + value, gradient=self.gradient + gradient)
-
-    def within(self, center: Float, reach: float) -> Int:
-        """Return the rows of the points in the cube of half an edge `reach` about a centre, in order."""
-        return np.sort(np.array(self.density.tree.query_ball_point(center, reach, p=np.inf), dtype=np.int64))
-
-    def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
-        """Return the patch of some rows, with samples of the volume."""
-        turn = self.normals[rows] - self.gradient[rows]
-        arrays = (self.points[rows], -self.value[rows], turn, *volume.rows(), center)
-        return Patch(*(torch.as_tensor(values, device=device) for values in arrays))
+    length: float
+    position: float
+    angle: float
+    by_place: bool = False
+    rms_factor: float = LocalSolveParameters.correction_rms_factor
+    robust: bool = False
+    by_slopes: bool = False
 
 
 def select_hyperparameters(
@@ -143,7 +102,7 @@ def _of_clean_scan(
     rng: np.random.Generator,
     device: str,
     *,
-    lengths: Sequence[float] = ModelSelectionParameters.lengths_disk_radii,
+    parameters: ModelSelectionParameters = ModelSelectionParameters(),
 ) -> Hyperparameters | None:
     """Return the hyperparameters of a clean scan, or None of any other; see `select_hyperparameters`.
 
@@ -154,12 +113,17 @@ def _of_clean_scan(
     scan = residuals.points, residuals.normals, residuals.density
     if (noise := clean_noise(*scan, residuals.rms, residuals.estimated, residuals.clean)) is None:
         return None
+    if residuals.deviations is not None:
+        noise = noise[0], residuals.angle
+        every = (parameters.short_length_disk_radii, *parameters.lengths_disk_radii)
+        parameters = replace(parameters, lengths_disk_radii=every)
     # Estimated normals follow from the positions, and are no data.
     deviation = SurfaceLikelihoodParameters.angle_radians if residuals.estimated else noise[1]
     likelihood = patch_likelihood(residuals, radius, rng, device)
-    length = likelihood.likeliest_length([each * radius for each in lengths], noise[0], deviation)
-    if length > lengths[0] * radius:
-        validation = CrossValidation.draw(residuals, held_out, radius, rng, device)
+    lengths = [each * radius for each in parameters.lengths_disk_radii]
+    length = likelihood.likeliest_length(lengths, noise[0], deviation)
+    if length > lengths[0]:
+        validation = CrossValidation.draw(residuals, held_out, radius, rng, device, parameters=parameters)
         length = min(length, replace(validation, known=noise).length_of_clean_scan())
     return Hyperparameters(length, *noise)
 

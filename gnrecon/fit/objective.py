@@ -336,6 +336,7 @@ class Scene:
     """Data points and normals, of shape (N, 3), on the device; the rest in numpy, for sampling.
 
     `reach` is the length, in spacings, over which an angle of a normal counts as a height; see `normal_weight`.
+    `deviations`, of shape (N,), are the least standard deviations of the normals, where they are known for each.
     """
 
     points: Tensor
@@ -345,13 +346,24 @@ class Scene:
     box: Box
     volume_count: int = ObjectiveParameters.volume_samples
     reach: float = ObjectiveParameters.normal_reach_spacings
+    deviations: Tensor | None = None
 
     @classmethod
     def of(cls, samples: Samples, device: str, rng: np.random.Generator) -> Scene:
         """Put samples on a device."""
-        points, normals = (torch.as_tensor(rows, device=device) for rows in (samples.points, samples.normals))
         coarse = CoarseDistance(samples.points, samples.normals, rng, may_be_open=True)
-        return cls(points, normals, samples, coarse, _box(samples))
+        points, normals, deviations = _tensors(samples, device)
+        return cls(points, normals, samples, coarse, _box(samples), deviations=deviations)
+
+    def with_samples(self, samples: Samples) -> Scene:
+        """Return the scene with other samples of the same surface."""
+        points, normals, deviations = _tensors(samples, str(self.points.device))
+        return replace(self, points=points, normals=normals, samples=samples, deviations=deviations)
+
+    def take(self, rows: Tensor) -> Scene:
+        """Return the scene with some of the points; all else is that of all samples."""
+        deviations = None if self.deviations is None else self.deviations[rows]
+        return replace(self, points=self.points[rows], normals=self.normals[rows], deviations=deviations)
 
     def volume(self, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
         """Return about `count` points of the box, (Q, 3), half of them near the data, and their coarse distances."""
@@ -368,6 +380,12 @@ class Scene:
     def tensor(self, values: Float) -> Tensor:
         """Return `values` as a tensor like the data's."""
         return torch.as_tensor(values).to(self.points)
+
+
+def _tensors(samples: Samples, device: str) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return points, normals and the normals' deviations, if they are known, on a device."""
+    points, normals = (torch.as_tensor(rows, device=device) for rows in (samples.points, samples.normals))
+    return points, normals, None if samples.deviations is None else torch.as_tensor(samples.deviations, device=device)
 
 
 def bounds_of(samples: Samples) -> Float:

@@ -250,6 +250,7 @@ class ModelSelectionParameters:
     """Length scale and noise by cross-validation (`fit.model_selection`)."""
 
     lengths_disk_radii: tuple[float, ...] = (2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6)  # candidates, sqrt(2) apart
+    short_length_disk_radii: float = 1.4  # another, where normals have deviations; 1.0 makes handles in thin walls
     position_noises_disk_radii: tuple[float, ...] = (0.02, 0.1, 0.3, 0.8)  # candidates
     angle_noises_radians: tuple[float, ...] = (0.03, 0.1, 0.3)  # candidates
     tie_share: float = 0.025  # by which a score may exceed the best and yet count as equal

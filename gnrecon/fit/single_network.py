@@ -13,7 +13,6 @@ out, and the fit ends when their score stops falling. The parameters of the leas
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -95,11 +94,7 @@ def hold_out(
         return scene, None
     order = torch.as_tensor(rng.permutation(count)).to(scene.points.device)
     held, fitted = (rows.sort().values for rows in order.tensor_split([count // parameters.held_out_one_in]))
-    return _only(scene, fitted), _only(scene, held)
-
-
-def _only(scene: Scene, rows: Tensor) -> Scene:
-    return replace(scene, points=scene.points[rows], normals=scene.normals[rows])
+    return scene.take(fitted), scene.take(held)
 
 
 # From the options' names to an optimiser.

@@ -26,9 +26,9 @@ from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.fit_summary import FitSummary, describe
-from gnrecon.fit.global_field import GlobalField, fit_global
+from gnrecon.fit.global_field import FieldResiduals, GlobalField, fit_global
 from gnrecon.fit.local_fields import PenaltiesFor, fit_detail
-from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
+from gnrecon.fit.model_selection import select_hyperparameters
 from gnrecon.fit.parameters import FitParameters
 from gnrecon.fit.penalties.surface_penalties import FreeSpace, SurfacePenalties, penalise_global
 from gnrecon.fit.shape_priors.ball_fit import BallFit
@@ -142,12 +142,11 @@ class _Data:
         across = complete_holes(self.samples.points, self.samples.normals, exact, parameters)
         if not len(across):
             return self
-        points, normals = across.appended_to(self.samples.points, self.samples.normals)
         held_out = np.concatenate([self.held_out, np.zeros(len(across), dtype=bool)])
         # The global field sees the same share of them as of the points that are not held out.
         share = len(self.seen) / max(len(self.samples) - int(self.held_out.sum()), 1)
         added = len(self.samples) + np.flatnonzero(rng.random(len(across)) < share)
-        samples = replace(self.samples, points=points, normals=normals)
+        samples = self.samples.appended(across.points, across.normals)
         return _Data(self.scan, samples, held_out, np.concatenate([self.seen, added]), None, across)
 
     def without(self, outliers: Mask) -> _Data:

@@ -145,6 +145,8 @@ class Samples:
         Standard deviation of the points along the normal, unit coordinates, where it was measured.
     clean : bool, optional
         Whether the points have no noise that matters, where normals were estimated by it; see `spline_patches`.
+    deviations : array of shape (N,), optional
+        Standard deviations of estimated normals along each tangent, radians, where they are known.
     """
 
     points: Float
@@ -154,6 +156,7 @@ class Samples:
     estimated: bool = False
     noise: float | None = None
     clean: bool | None = None
+    deviations: Float | None = None
 
     def __repr__(self) -> str:
         held_out = "" if self.held_out is None else f", {len(self.held_out):,} held out"
@@ -164,7 +167,16 @@ class Samples:
 
     def select(self, rows: Mask | Int) -> Samples:
         """Return the samples of the given rows (a mask of shape (N,), or indices), with all else as it is."""
-        return replace(self, points=self.points[rows], normals=self.normals[rows])
+        deviations = None if self.deviations is None else self.deviations[rows]
+        return replace(self, points=self.points[rows], normals=self.normals[rows], deviations=deviations)
+
+    def appended(self, points: Float, normals: Float) -> Samples:
+        """Return the samples with more of them, of shape (M, 3), whose normals are as sure as most."""
+        deviations = self.deviations
+        if deviations is not None:
+            deviations = np.pad(deviations, (0, len(points)), constant_values=np.median(deviations))
+        points, normals = np.concatenate([self.points, points]), np.concatenate([self.normals, normals])
+        return replace(self, points=points, normals=normals, deviations=deviations)
 
 
 BoxCorners = tuple[Sequence[float], Sequence[float]]

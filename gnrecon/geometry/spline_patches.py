@@ -17,6 +17,9 @@ all, thin parts of a sparse scan, which curve more than the others, would pass f
 noise makes the sum over all patches larger. Of some hundred points, no surface that was fitted first shows this: what
 it leaves over is as irregular as noise where the spacing is that of the shape's features.
 
+How sure a point's normal is, the patch about it says: the inverse of H is the covariance of its normals about the
+minimum, and the part of it that belongs to one point has all others integrated out.
+
 Sources: Huang, Carr and Ju, *Variational Implicit Point Set Surfaces* (ACM TOG 2019), for the energy and its unit
 normals; Rasmussen and Williams, *Gaussian Processes for Machine Learning* (2006), sections 2.7 and 3.4; Varin, Reid and
 Firth, *An overview of composite likelihood methods* (2011), for sums over patches that overlap.
@@ -47,16 +50,31 @@ class SplineParameters:
     # in a patch of radius one; below the first, rounding would decide
     least_amplitude: float = 1e-6  # of a patch of radius one: that of heights of a thousandth; planes have none
     gradient_variance: float = 0.01  # over the amplitude, in such a patch, for points that nearly coincide
+    least_precision: float = 1.0  # per squared radian: a normal that nothing determines is one radian off
     regions: int = 8  # whose patches show the noise
     region_points: int = 125
     rounds: int = 2  # of amplitudes for these normals, and normals for these amplitudes
     iterations: int = 50  # of each minimisation
 
 
+@dataclass(frozen=True)
+class SmoothestNormals:
+    """Normals of the smoothest surface through points.
+
+    Parameters
+    ----------
+    normals : array of shape (N, 3), unit vectors
+    deviations : array of shape (N,), their standard deviations along each tangent, radians
+    """
+
+    normals: Float
+    deviations: Float
+
+
 def smoothest_normals(
     points: Float, normals: Float, *, parameters: SplineParameters = SplineParameters()
-) -> Float | None:
-    """Return the unit normals, of shape (N, 3), of the smoothest surface through points; None where noise is likelier.
+) -> SmoothestNormals | None:
+    """Return the normals of the smoothest surface through points, or None where noise is likelier.
 
     Parameters
     ----------
@@ -73,8 +91,9 @@ def smoothest_normals(
         if patches.fit(normals, noise * patches.radius).log_likelihood > exact.log_likelihood:
             return None
     if len(some) < len(points):
-        exact = _SplinePatches(scaled, np.arange(len(points)), parameters).fit(normals, 0.0)
-    return exact.normals
+        patches = _SplinePatches(scaled, np.arange(len(points)), parameters)
+        exact = patches.fit(normals, 0.0)
+    return SmoothestNormals(exact.normals, patches.deviations(exact.normals))
 
 
 def _regions(points: Float, parameters: SplineParameters) -> Int:
@@ -130,6 +149,13 @@ class _SplinePatches:
             normals = self._minimum(self._map(lambda pair: pair[0].form(*pair[1][:2]), pairs), normals)
         return _Fit(normals, sum(float(one[2].sum()) for one in self._likeliest(normals, noise)))
 
+    def deviations(self, normals: Float) -> Float:
+        """Return the standard deviations, of shape (N,), of the normals of least energy for points without noise."""
+        pairs = list(zip(self._groups, self._likeliest(normals, 0.0), strict=True))
+        variances = self._map(lambda pair: pair[0].first_variances(normals, *pair[1][:2]), pairs)
+        deviations: Float = np.sqrt(np.concatenate(variances))
+        return deviations
+
     def _likeliest(self, normals: Float, noise: float) -> list[tuple[Float, Float, Float]]:
         """Return the likeliest ratio and amplitude and the log likelihood of the patches of each group."""
         return self._map(lambda group: group.likeliest(normals, noise), self._groups)
@@ -180,10 +206,7 @@ class _Group:
         k = self.near.shape[1]
         freedom = 4 * k - 4 - 2 * k
         flat = normals[self.near].reshape(len(self.near), -1)
-        tangents = _tangents(normals)[self.near]
-        blocks = np.zeros((len(self.near), k, 3, k, 2))
-        blocks[:, range(k), :, range(k)] = tangents.transpose(1, 0, 3, 2)
-        planes = blocks.reshape(len(self.near), 3 * k, 2 * k)
+        planes = self._tangent_planes(normals)
         hessian, off = planes.transpose(0, 2, 1) @ (self.least @ planes), self.mixed @ planes
         less = off @ np.linalg.solve(hessian, off.transpose(0, 2, 1))
         log_hessian = np.linalg.slogdet(hessian)[1]
@@ -211,6 +234,26 @@ class _Group:
         scaled = self.mixed * self._share(ratios)[:, :, None]
         forms: Float = (self.least - self.mixed.transpose(0, 2, 1) @ scaled) / amplitudes[:, None, None]
         return forms
+
+    def first_variances(self, normals: Float, ratios: Float, amplitudes: Float) -> Float:
+        """Return the variance of each patch's first normal along a tangent, of shape (B,), squared radians."""
+        k, count = self.near.shape[1], len(self.near)
+        forms, planes, unit = self.form(ratios, amplitudes), self._tangent_planes(normals), normals[self.near]
+        slope = (forms @ unit.reshape(count, -1, 1)).reshape(count, k, 3)
+        hessian = planes.transpose(0, 2, 1) @ (forms @ planes)
+        # On the sphere, a gradient along the normal curves the energy, too.
+        hessian[:, range(2 * k), range(2 * k)] -= np.repeat((slope * unit).sum(axis=2), 2, axis=1)
+        precisions, axes = np.linalg.eigh(hessian)
+        precisions = np.maximum(precisions, self.parameters.least_precision)
+        variances: Float = (axes[:, :2] ** 2 / precisions[:, None]).sum(axis=2).mean(axis=1)
+        return variances
+
+    def _tangent_planes(self, normals: Float) -> Float:
+        """Return two tangents of each normal as columns of shape (B, 3k, 2k), for products with forms."""
+        k = self.near.shape[1]
+        blocks = np.zeros((len(self.near), k, 3, k, 2))
+        blocks[:, range(k), :, range(k)] = _tangents(normals)[self.near].transpose(1, 0, 3, 2)
+        return blocks.reshape(len(self.near), 3 * k, 2 * k)
 
     def derivative(self, forms: Float, normals: Float) -> Float:
         """Return half of the derivative of the sum of quadratic forms by all normals, of shape (N, 3)."""

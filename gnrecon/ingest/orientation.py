@@ -59,6 +59,7 @@ class Orientation:
         line of sight is clear of the tangent plane; None for given signs
     flipped : share in [0, 1] of the given normals that were flipped
     clean : whether the points have no noise that matters, where that was found with the normals
+    deviations : array of shape (N,), standard deviations of the normals along each tangent, radians, if they are known
     """
 
     normals: Float
@@ -66,6 +67,7 @@ class Orientation:
     confidence: float | None = None
     flipped: float = 0.0
     clean: bool | None = None
+    deviations: Float | None = None
 
     @property
     def estimated(self) -> bool:
@@ -107,19 +109,22 @@ def oriented_normals(
     if seen is not None:
         return Orientation(seen[0], "estimated, oriented by origins", seen[1])
     normals, disorder = _by_shape(centred, axes, along is None, parameters)
-    clean = None
+    clean, deviations = None, None
     # The nearest points of a point on a line are those of the line, which span no surface.
     if along is None and len(points) <= most_points and not lie_on_lines(centred, parameters=parameters.lines):
         smoothest = smoothest_normals(centred, normals)
-        clean, normals = smoothest is not None, normals if smoothest is None else smoothest
+        clean = smoothest is not None
+        if smoothest is not None:
+            normals, deviations = smoothest.normals, smoothest.deviations
     if disorder <= parameters.orientation.most_disorder:
-        return Orientation(normals, "estimated", winding_agreement(centred, normals), clean=clean)
+        how, confidence = "estimated", winding_agreement(centred, normals)
+        return Orientation(normals, how, confidence, clean=clean, deviations=deviations)
     agreement = agreement_of(centred, normals)
     if is_open(outwardness(centred, normals)) and agreement.conflicting <= parameters.orientation.most_conflicting:
         how, confidence = "estimated, upward, as of an open surface", 1 - agreement.contradicted
     else:
         how, confidence = "estimated, orientation uncertain", winding_agreement(centred, normals)
-    return Orientation(normals, how, confidence, clean=clean)
+    return Orientation(normals, how, confidence, clean=clean, deviations=deviations)
 
 
 def _by_shape(points: Float, axes: Float, free: bool, parameters: IngestParameters) -> tuple[Float, float]:

@@ -91,6 +91,9 @@ def prepare(
     if counts.inner:
         orientation = replace(orientation, how="estimated, outward from the volume", confidence=1.0)
     advance(0.7)
+    if orientation.deviations is not None:
+        # No other values are used from here on.
+        oriented = replace(oriented, attributes={"deviations": orientation.deviations})
     oriented, held_out = _hold_out(oriented, holdout, seed)
     # Spacings are those of the whole cloud.
     lengths = (spacing, smooth_scan)
@@ -174,4 +177,5 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, orientation: Orientati
         layer = points[normals @ np.linalg.eigh(normals.T @ normals)[1][:, -1] > 0.5]
     noise = estimate_noise(layer, mean_spacing(layer)).deviation if len(layer) >= 16 else None
     clean = None if smoothed else orientation.clean
-    return Samples(points, normals, frame, held, orientation.estimated, noise, clean)
+    deviations = None if smoothed or orientation.deviations is None else kept.attributes["deviations"].astype(float)
+    return Samples(points, normals, frame, held, orientation.estimated, noise, clean, deviations)

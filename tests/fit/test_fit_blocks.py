@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,9 +25,9 @@ from gnrecon.fit.blocks import block, workers
 from gnrecon.fit.blocks import solve as large
 from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.fit_options import QUALITIES
+from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_fields import fit_detail
-from gnrecon.fit.local_solve import Hyperparameters
-from gnrecon.fit.model_selection import FieldResiduals
+from gnrecon.fit.model_selection import Hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Int
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -69,8 +70,9 @@ def fitted(
     block_points: int = 200,
     scheduler: str | None = None,
     advance: ProgressCallback = ignore_progress,
+    samples: Samples | None = None,
 ) -> tuple[NeuralSDF, Detail]:
-    samples = ellipsoid()
+    samples = samples or ellipsoid()
     sdf, rng = constant_field(samples), np.random.default_rng(0)
     held = np.arange(COUNT) % 6 == 0
     options = FitOptions(quality="draft")
@@ -163,6 +165,18 @@ def test_it_is_the_smaller_scans_fit(whole: Detail) -> None:
     assert np.abs(by_blocks).mean() < 1.2 * np.abs(by_single).mean() < 4e-3
     off = samples.points + 0.05 * samples.normals * np.where(np.arange(COUNT) % 2, -1.0, 1.0)[:, None]
     assert ((0.05 + detail.value(off) > 0) == (np.arange(COUNT) % 2 == 0)).mean() > 0.97
+
+
+def test_blocks_know_how_sure_normals_are(tmp_path: Path) -> None:
+    samples, rng = ellipsoid(), np.random.default_rng(4)
+    deviations = np.where(rng.random(COUNT) < 0.3, 1.0, 0.02)
+    tilted = samples.normals + deviations[:, None] * rng.standard_normal((COUNT, 3))
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    off = []
+    for known, name in ((None, "unknown"), (deviations, "known")):
+        detail = fitted(tmp_path / name, samples=replace(samples, normals=tilted, deviations=known))[1]
+        off.append(np.abs(detail.value_and_gradient(samples.points)[1] - samples.normals).mean())
+    assert off[1] < 0.7 * off[0]
 
 
 def test_there_is_no_seam(whole: Detail) -> None:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from gnrecon.fit import FitOptions, fit, model_selection
+from gnrecon.fit.free_space import Volume
+from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.marginal_likelihood import MarginalLikelihood, clean_noise, median_pair_height
-from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
+from gnrecon.fit.model_selection import CrossValidation, select_hyperparameters
 from gnrecon.fit.parameters import CleanScanParameters, ModelSelectionParameters
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import Frame, Samples
@@ -147,6 +149,27 @@ def test_the_shorter_of_two_lengths_is_taken(
     monkeypatch.setattr(CrossValidation, "length_of_clean_scan", by_prediction)
     chosen = select_hyperparameters(left, np.arange(600) % 6 == 0, radius, np.random.default_rng(0))
     assert chosen.length == lengths[expected] * radius
+
+
+def test_unsure_normals_bind_less_and_allow_a_shorter_length() -> None:
+    """One in three normals is far off: known as such, it bends no field, and the others count as before."""
+    scan, rng = bumpy(600), np.random.default_rng(2)
+    radius = Density(scan.points).radius
+    deviations = np.where(rng.random(600) < 1 / 3, 0.6, 0.03)
+    normals = scan.normals + deviations[:, None] * rng.standard_normal((600, 3))
+    # Half a radius apart, residuals have nothing in common.
+    value = 0.05 * radius * np.sin(8.0 / radius * scan.points[:, 0])
+    given = FieldResiduals(scan.points, normals, value, scan.normals, True, None, True, deviations)
+    chosen = select_hyperparameters(given, np.arange(600) % 6 == 0, radius, np.random.default_rng(0))
+    assert chosen.angle == pytest.approx(0.03)
+    assert chosen.length == ModelSelectionParameters.short_length_disk_radii * radius
+    patch = given.take(np.arange(100, 600)).patch(np.arange(50), np.zeros(3), Volume.none(), "cpu")
+    assert patch.normal_weights is not None
+    np.testing.assert_allclose(patch.normal_weights, (0.03 / deviations[100:150]) ** 2)
+    plain = replace(given, deviations=None)
+    assert plain.patch(np.arange(50), np.zeros(3), Volume.none(), "cpu").normal_weights is None
+    longer = select_hyperparameters(plain, np.arange(600) % 6 == 0, radius, np.random.default_rng(0)).length
+    assert longer >= ModelSelectionParameters.lengths_disk_radii[0] * radius
 
 
 def test_a_longer_length_is_taken_only_where_it_is_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -138,7 +138,7 @@ def test_outliers_and_contradicting_normals_lose_their_weight() -> None:
 
 def terms_of(samples: Samples, rng: np.random.Generator) -> NetworkTerms:
     out = held_out(samples)
-    seen = replace(samples, points=samples.points[~out], normals=samples.normals[~out])
+    seen = samples.select(~out)
     return NetworkTerms.draw(Scene.of(seen, "cpu", rng), samples.points[out], samples.normals[out], rng)
 
 
@@ -229,6 +229,26 @@ def test_estimated_normals_are_off_by_more_than_validation_points_show(
     theta = random_network(field, rng, terms.scene.points)
     terms = replace(terms, normals=field.value_and_gradient(theta, terms.points)[1])
     assert terms.noise(field, theta).normals == least
+
+
+def test_a_normal_counts_as_its_deviation_says(rng: np.random.Generator) -> None:
+    deviations = rng.choice([0.02, 0.5], 400)
+    known = replace(capsule(400, 0), estimated=True, clean=True, deviations=deviations)
+    terms = terms_of(known, rng)
+    field = Siren((8, 8))
+    theta = random_network(field, rng, terms.scene.points)
+    # The field turns every normal by an angle of its own; take those that it gives, so that robust weights are equal.
+    scene = replace(terms.scene, normals=field.value_and_gradient(theta, terms.scene.points)[1])
+    exact = replace(terms, scene=scene, normals=field.value_and_gradient(theta, terms.points)[1])
+    noise = exact.noise(field, theta)
+    assert noise.normals == NetworkTermParameters.least_deviation, "the least one is that of each normal"
+    sure = scene.deviations is not None and scene.deviations < 0.1
+    for floor in (noise.normals, 0.1):
+        problem = exact.problem(field, theta, replace(noise, normals=floor), np.random.default_rng(0))
+        weight = next(term.weight for term in problem.terms if term.name == "normal")
+        expected = (0.5 / max(0.02, floor)) ** 2
+        assert isinstance(weight, torch.Tensor)
+        assert float(weight[sure].min() / weight[~sure].max()) == pytest.approx(expected, rel=1e-6)
 
 
 def test_sparse_points_get_several_small_networks_and_dense_ones_one(

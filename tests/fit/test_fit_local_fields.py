@@ -11,9 +11,9 @@ import torch
 
 from gnrecon.field.random_features import Features
 from gnrecon.fit.free_space import CubeLattice, LatticeVolume, Volume
+from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_fields import solve_cube
-from gnrecon.fit.local_solve import Hyperparameters
-from gnrecon.fit.model_selection import FieldResiduals
+from gnrecon.fit.model_selection import Hyperparameters
 
 Float = npt.NDArray[np.float64]
 NOISE = Hyperparameters(0.4, 0.01, 0.1, by_place=True)

@@ -98,6 +98,28 @@ def test_a_point_of_little_weight_counts_as_little(patch: Patch, features: Featu
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.parametrize("system", [PatchSystem, LocalRowSystem])
+@pytest.mark.usefixtures("double")
+def test_a_normal_that_is_unsure_counts_as_little(
+    system: type[PatchSystem | LocalRowSystem], patch: Patch, features: Features, rng: np.random.Generator
+) -> None:
+    weights = torch.as_tensor(rng.uniform(0.01, 1.0, 20))
+    J, r = plainly(patch, features)
+    roots = torch.cat([torch.ones(20), weights.repeat_interleave(3), torch.ones(8)]).sqrt()
+    J, r = J * roots[:, None], r * roots
+    expected = torch.linalg.solve(J.T @ J + torch.eye(len(features)) * len(features) / 2 / patch.size**2, J.T @ r)
+    unsure = replace(patch, normal_weights=weights)
+    found = system(unsure, features, LENGTH, patch.size).solve(POSITION, ANGLE)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
+    # Weights of the points count besides.
+    halves = torch.full((20,), 0.5).to(weights)
+    both = PatchSystem(replace(unsure, weights=halves), features, LENGTH, patch.size).solve(POSITION, ANGLE)
+    product = replace(patch, weights=halves, normal_weights=None)
+    assert not torch.allclose(both, PatchSystem(product, features, LENGTH, patch.size).solve(POSITION, ANGLE))
+    wider = PatchSystem(unsure, features, LENGTH, patch.size).solve(2**0.5 * POSITION, 2**0.5 * ANGLE)
+    torch.testing.assert_close(both, wider, rtol=1e-8, atol=1e-10)
+
+
 def test_a_point_loses_its_weight_by_how_far_it_is_from_what_the_others_give(
     patch: Patch, features: Features, rng: np.random.Generator
 ) -> None:

@@ -12,9 +12,10 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from gnrecon.field.random_features import Features
+from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_solve import Patch, data_kernel
 from gnrecon.fit.marginal_likelihood import MarginalLikelihood, SurfaceLikelihood, log_density
-from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
+from gnrecon.fit.model_selection import CrossValidation, select_hyperparameters
 from gnrecon.fit.parameters import LocalSolveParameters, MarginalLikelihoodParameters, SurfaceLikelihoodParameters
 
 LENGTH, RADIUS = 0.4, 0.05

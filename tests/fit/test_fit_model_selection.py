@@ -8,8 +8,9 @@ import made_shapes
 import numpy as np
 import pytest
 
+from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.marginal_likelihood import MarginalLikelihood
-from gnrecon.fit.model_selection import CrossValidation, FieldResiduals, select_hyperparameters
+from gnrecon.fit.model_selection import CrossValidation, select_hyperparameters
 
 
 def test_the_noise_of_estimated_normals_is_about_that_of_the_points() -> None:

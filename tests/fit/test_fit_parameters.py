@@ -14,7 +14,7 @@ import gnrecon.fit
 from gnrecon.fit import FitOptions, fit, parameters, two_level
 from gnrecon.fit.consistency import find_outliers
 from gnrecon.fit.local_fields import cube_length
-from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import Hyperparameters
 from gnrecon.fit.objective import normal_weight
 from gnrecon.fit.parameters import (
     FitParameters,

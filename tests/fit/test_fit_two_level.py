@@ -13,7 +13,8 @@ from gnrecon.export import curvatures
 from gnrecon.field.random_features import Features
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit, local_fields
 from gnrecon.fit import two_level as adaptive
-from gnrecon.fit.model_selection import FieldResiduals, _smoothest, select_hyperparameters
+from gnrecon.fit.global_field import FieldResiduals
+from gnrecon.fit.model_selection import _smoothest, select_hyperparameters
 from gnrecon.fit.parameters import ModelSelectionParameters, SurfaceLikelihoodParameters
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.runtime.errors import InputError

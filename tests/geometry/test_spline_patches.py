@@ -10,7 +10,7 @@ from made_shapes import box, sphere, torus
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.signed_distance import Density
-from gnrecon.geometry.spline_patches import SplineParameters, smoothest_normals
+from gnrecon.geometry.spline_patches import SmoothestNormals, SplineParameters, smoothest_normals
 from gnrecon.runtime.parallel import fixed_sums
 
 
@@ -32,11 +32,15 @@ def off(normals: Float, exact: Float) -> float:
     return float(np.degrees(np.arccos(np.einsum("nd,nd->n", normals, exact).clip(-1, 1))).mean())
 
 
+def smoothest(points: Float, normals: Float) -> SmoothestNormals:
+    found = smoothest_normals(points, normals)
+    assert found is not None, "the points have no noise"
+    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0)
+    return found
+
+
 def found(points: Float, normals: Float) -> Float:
-    smoothest = smoothest_normals(points, normals)
-    assert smoothest is not None, "the points have no noise"
-    np.testing.assert_allclose(np.linalg.norm(smoothest, axis=1), 1.0)
-    return smoothest
+    return smoothest(points, normals).normals
 
 
 SHAPES = {
@@ -77,14 +81,48 @@ def test_faces_stay_flat_and_edges_are_no_noise() -> None:
     assert np.median(np.degrees(np.arccos(np.einsum("nd,nd->n", turned, exact).clip(-1, 1)))) < 1.0
 
 
+def rugged_ball(count: int, seed: int) -> tuple[Float, Float]:
+    """Points of a ball with heights of all wavelengths: the spectrum is the spline's, k^-6."""
+    u, _ = sphere(count, seed)
+    rng = np.random.default_rng(seed)
+    waves = rng.standard_normal((200, 3))
+    size = np.exp(rng.uniform(np.log(2.0), np.log(40.0), 200))
+    waves *= (size / np.linalg.norm(waves, axis=1))[:, None]
+    phases = u @ waves.T + rng.uniform(0, 2 * np.pi, 200)
+    height = 1.0 + 0.05 * np.sin(phases) @ size**-1.5
+    slope = 0.05 * np.cos(phases) @ (size[:, None] ** -1.5 * waves)
+    across = slope - np.einsum("nd,nd->n", slope, u)[:, None] * u
+    normals = u - across / height[:, None]
+    return height[:, None] * u, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("count", [300, 1000])
+def test_deviations_are_as_large_as_errors(count: int) -> None:
+    points, exact = rugged_ball(count, 2)
+    turned = smoothest(points, rough(exact, 20.0))
+    # An error has two components, one along each tangent.
+    errors = np.arccos(np.einsum("nd,nd->n", turned.normals, exact).clip(-1, 1)) / 2**0.5
+    assert 0.4 < np.sqrt(np.mean((errors / turned.deviations) ** 2)) < 2.0
+
+
+def test_normals_near_edges_are_less_sure_than_those_of_faces() -> None:
+    points, exact = box(800, np.random.default_rng(6), (1.0, 0.8, 0.6))
+    turned = smoothest(points, rough(exact, 10.0))
+    errors = np.degrees(np.arccos(np.einsum("nd,nd->n", turned.normals, exact).clip(-1, 1)))
+    sure, unsure = np.array_split(np.argsort(turned.deviations), 2)
+    assert np.mean(errors[unsure] ** 2) > 10 * np.mean(errors[sure] ** 2)
+    assert turned.deviations.max() <= 1.0
+
+
 def test_large_scans_show_their_noise_in_some_regions() -> None:
     points, exact = ellipsoid(3000, (1.0, 0.7, 0.5))
     guess = rough(exact, 20.0)
     few = replace(SplineParameters(), regions=2, region_points=100)
-    smoothest = smoothest_normals(points, guess, parameters=few)
-    assert smoothest is not None
+    turned = smoothest_normals(points, guess, parameters=few)
+    assert turned is not None
     # All normals are those of the surface, not only the regions'.
-    assert np.quantile(np.einsum("nd,nd->n", smoothest, exact), 0.001) > np.cos(np.radians(5))
+    assert np.quantile(np.einsum("nd,nd->n", turned.normals, exact), 0.001) > np.cos(np.radians(5))
+    assert turned.deviations.shape == (3000,)
     height = 0.3 * Density(points).radius * np.random.default_rng(3).standard_normal(len(points))
     assert smoothest_normals(points + height[:, None] * exact, guess, parameters=few) is None
 
@@ -92,8 +130,8 @@ def test_large_scans_show_their_noise_in_some_regions() -> None:
 @pytest.mark.parametrize("count", [10, 17])
 def test_few_points_are_one_patch(count: int) -> None:
     points, exact = sphere(count, 7)
-    smoothest = smoothest_normals(points, exact)
-    assert smoothest is None or off(smoothest, exact) < 30.0
+    turned = smoothest_normals(points, exact)
+    assert turned is None or off(turned.normals, exact) < 30.0
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-9, 0.0), (1e150, 0.0), (1.0, 1e4)])

@@ -96,6 +96,20 @@ def test_noise_is_looked_for_where_normals_are_missing() -> None:
     height = 0.03 * np.random.default_rng(4).standard_normal((500, 1))
     assert prepare(PointCloud(points))[0].clean is True
     assert prepare(PointCloud(points + height * normals))[0].clean is False
+    every = prepare(PointCloud(points))[0]
+    assert every.deviations is not None
+    # Each deviation stays with its point.
+    few = prepare(PointCloud(points), max_points=100, holdout=0.2)[0]
+    assert few.deviations is not None
+    same = cKDTree(every.frame.to_world(every.points)).query(few.frame.to_world(few.points))[1]
+    np.testing.assert_array_equal(few.deviations, every.deviations[same])
+    assert len(np.unique(few.deviations)) > 50
+    for unknown in (
+        prepare(PointCloud(points + height * normals)),
+        prepare(PointCloud(points, normals)),
+        prepare(PointCloud(points), smooth_scan="3s"),
+    ):
+        assert unknown[0].deviations is None
     # It is not looked for with given normals, and unknown of points that were moved.
     assert prepare(PointCloud(points, normals))[0].clean is None
     assert prepare(PointCloud(points), smooth_scan="3s")[0].clean is None

@@ -20,9 +20,9 @@ from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
 from gnrecon.fit.free_space import CubeSpace
+from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_fields import cube_generator, cube_length, solve_cube
-from gnrecon.fit.local_solve import Hyperparameters
-from gnrecon.fit.model_selection import FieldResiduals
+from gnrecon.fit.model_selection import Hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
 from gnrecon.geometry.octree import Codes, DipoleTree, morton_codes, ranges
@@ -80,7 +80,9 @@ class BlockSolver:
     def of(cls, work: WorkFolder, device: str) -> BlockSolver:
         """Map the arrays of a work folder."""
         facts, array = work.facts, work.array
-        residuals = FieldResiduals(array("points"), array("normals"), array("value"), array("gradient"))
+        deviations = array("deviations") if facts["deviations"] else None
+        at = array("points"), array("normals"), array("value"), array("gradient")
+        residuals = FieldResiduals(*at, deviations=deviations)
         frequencies, phases, theta = (
             torch.tensor(np.array(array(name)), device=device) for name in ("frequencies", "phases", "theta")
         )

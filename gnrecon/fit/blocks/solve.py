@@ -28,8 +28,8 @@ from gnrecon.fit.blocks.store import WorkFolder
 from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
-from gnrecon.fit.local_solve import Hyperparameters
-from gnrecon.fit.model_selection import FieldResiduals, select_hyperparameters
+from gnrecon.fit.global_field import FieldResiduals
+from gnrecon.fit.model_selection import Hyperparameters, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.octree import DipoleTree, morton_codes, octree_blocks
@@ -139,6 +139,7 @@ def _task_data(
         "theta": sdf.theta.cpu().numpy(),
         "frequencies": features.frequencies.cpu().numpy(),
         "phases": features.phases.cpu().numpy(),
+        **({} if residuals.deviations is None else {"deviations": residuals.deviations[order]}),
         **dipoles.arrays(),
     }
     facts = {
@@ -149,6 +150,7 @@ def _task_data(
         "overlap": partition.overlap,
         "radius": density.radius,
         "hyperparameters": asdict(hyperparameters),
+        "deviations": residuals.deviations is not None,
     }
     return arrays, facts
 

@@ -26,7 +26,8 @@ from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.free_space import LatticeVolume
-from gnrecon.fit.local_solve import Hyperparameters, PatchSystem
+from gnrecon.fit.local_solve import PatchSystem
+from gnrecon.fit.model_selection import Hyperparameters
 from gnrecon.fit.objective import FieldProblem, ObjectiveTerm, Scene, data_terms, distance_term
 from gnrecon.fit.parameters import InitialisationParameters, PenaltyFitParameters, SingleNetworkParameters
 from gnrecon.fit.penalties.regularisers import Jet, PenaltyTerm, Regulariser, SineSum, minimise_penalised

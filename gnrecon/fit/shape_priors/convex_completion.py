@@ -47,7 +47,8 @@ def completed_convex(
     if samples.estimated:
         beneath = np.setdiff1d(np.arange(len(points)), hull.vertices)
         own[beneath] = normals[cKDTree(more).query(points[beneath])[1]]
-    return replace(samples, points=np.concatenate([points, more]), normals=np.concatenate([own, normals]))
+    points, normals = np.concatenate([points, more]), np.concatenate([own, normals])
+    return replace(samples, points=points, normals=normals, deviations=None)
 
 
 def _outward(points: Float, hull: ConvexHull) -> Int:

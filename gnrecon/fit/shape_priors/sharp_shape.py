@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnrecon.fit.local_solve import Hyperparameters
+from gnrecon.fit.model_selection import Hyperparameters
 from gnrecon.fit.shape_priors.bilateral_filter import BilateralFilter
 from gnrecon.fit.shape_priors.edge_completion import EdgeCompletion
 from gnrecon.fit.shape_priors.hole_completion import HoleCompletion, complete_holes
@@ -96,7 +96,7 @@ class SharpShape:
         completed = _resampled(points, normals, parameters) or _completed(edges, p)
         if completed is None:
             return None
-        samples = replace(samples, points=completed[0], normals=completed[1])
+        samples = replace(samples, points=completed[0], normals=completed[1], deviations=None)
         return cls(samples, averaging, snapped, holes, p)
 
 
