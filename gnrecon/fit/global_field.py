@@ -4,7 +4,8 @@ A linear field is solved (`linear_field`) and, side by side, a network of severa
 regularisation (`global_network`). The network is the global field where it predicts the validation points and the sign
 of free space better, by more than chance: on organic scans nearly always. A thin wall that sparse points hardly show
 may be lost on its way, and noise may hide that it is better; then the linear field remains, as it does in draft
-quality. With curvature penalties the global field is the linear one, on which they are then minimised.
+quality. With curvature penalties the global field is the linear one, on which they are then minimised. What it leaves
+over at the points is the data of the local fields (`FieldResiduals`).
 """
 
 from __future__ import annotations

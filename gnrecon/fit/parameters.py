@@ -119,7 +119,7 @@ class NetworkTermParameters:
     far_eikonal_deviation: float = 0.3  # of |grad f| in the box, where a distance has kinks
     robust_degrees_of_freedom: float = 4.0  # of Student's t distribution of the data (Lange, Little and Taylor 1989)
     least_deviation: float = 1e-3  # in disk radii and radians; below, rounding would decide
-    # Radians, of normals that were estimated from neighbourhoods, and from all points of a sparse scan.
+    # Radians, of normals that were estimated from neighbourhoods, and from all points of a sparse scan with noise.
     least_estimated_deviation: float = 0.3
     least_sparse_deviation: float = 0.6
     least_slope: float = 0.3  # of the field along a normal, in a distance |f| / slope
