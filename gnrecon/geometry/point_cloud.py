@@ -147,6 +147,11 @@ class Samples:
         Whether the points have no noise that matters, where normals were estimated by it; see `spline_patches`.
     deviations : array of shape (N,), optional
         Standard deviations of estimated normals along each tangent, radians, where they are known.
+
+    Raises
+    ------
+    InputError
+        When there are not as many deviations as points.
     """
 
     points: Float
@@ -157,6 +162,10 @@ class Samples:
     noise: float | None = None
     clean: bool | None = None
     deviations: Float | None = None
+
+    def __post_init__(self) -> None:
+        if self.deviations is not None and len(self.deviations) != len(self.points):
+            raise InputError(f"{len(self.points)} points cannot go with {len(self.deviations)} deviations.")
 
     def __repr__(self) -> str:
         held_out = "" if self.held_out is None else f", {len(self.held_out):,} held out"
@@ -169,6 +178,10 @@ class Samples:
         """Return the samples of the given rows (a mask of shape (N,), or indices), with all else as it is."""
         deviations = None if self.deviations is None else self.deviations[rows]
         return replace(self, points=self.points[rows], normals=self.normals[rows], deviations=deviations)
+
+    def replaced(self, points: Float, normals: Float) -> Samples:
+        """Return other points and normals, of shape (N, 3), of the same scan, whose deviations are not known."""
+        return replace(self, points=points, normals=normals, deviations=None)
 
     def appended(self, points: Float, normals: Float) -> Samples:
         """Return the samples with more of them, of shape (M, 3), whose normals are as sure as most."""

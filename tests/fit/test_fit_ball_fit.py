@@ -96,3 +96,13 @@ def test_the_fit_of_few_points_of_a_ball_is_a_ball() -> None:
     # A curvature penalty decides how the surface goes on between the points.
     _, smoothed = fit(scan(80), FitOptions(quality="draft", smooth="strain=1e-6"))
     assert "ball" not in smoothed.status
+
+
+def test_normals_of_a_ball_are_known_however_unsure_they_were() -> None:
+    unsure = replace(scan(80), estimated=True, clean=True, deviations=np.full(80, 0.2))
+    ball = BallFit.of(unsure)
+    assert ball is not None
+    assert ball.samples.deviations is None
+    assert not ball.samples.estimated
+    places = FRAME.to_world(CENTER + RADIUS * directions(2000, 3))
+    assert np.abs(fit(unsure, FitOptions(quality="draft"))[0].sdf(places)).max() < 2e-5 * FRAME.scale

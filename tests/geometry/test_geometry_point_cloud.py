@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gnrecon.geometry.arrays import Int, Mask
 from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.runtime.errors import InputError
 
 
 @pytest.mark.parametrize("rows", [np.array([2, 0]), np.array([True, False, True])])
@@ -33,3 +36,7 @@ def test_the_normals_of_more_samples_are_as_sure_as_most() -> None:
     assert more.deviations is not None
     np.testing.assert_array_equal(more.deviations, [0.3, 0.1, 0.2, 0.2, 0.2])
     assert Samples(points, normals, samples.frame).appended(points, normals).deviations is None
+    # Of other points, nothing is known.
+    assert samples.replaced(points[:1], normals[:1]).deviations is None
+    with pytest.raises(InputError, match="1 points cannot go with 3 deviations"):
+        replace(samples, points=points[:1])

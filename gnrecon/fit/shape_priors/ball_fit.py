@@ -49,8 +49,8 @@ class BallFit:
             return None
         more = filled[away > parameters.min_spacing_share * np.sqrt(4 * np.pi / len(filled))]
         directions = np.concatenate([outward, more])
-        on = replace(samples, points=sphere.center + sphere.radius * directions, normals=directions, estimated=False)
-        return cls(on, samples.frame.scale * sphere.radius)
+        on = samples.replaced(sphere.center + sphere.radius * directions, directions)
+        return cls(replace(on, estimated=False), samples.frame.scale * sphere.radius)
 
 
 def _fitted_sphere(points: Float, normals: Float, parameters: BallFitParameters) -> Sphere | None:

@@ -9,8 +9,6 @@ Source: Vlachos, Peters, Boyd and Mitchell, Curved PN triangles (2001). Entry: `
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
@@ -47,8 +45,7 @@ def completed_convex(
     if samples.estimated:
         beneath = np.setdiff1d(np.arange(len(points)), hull.vertices)
         own[beneath] = normals[cKDTree(more).query(points[beneath])[1]]
-    points, normals = np.concatenate([points, more]), np.concatenate([own, normals])
-    return replace(samples, points=points, normals=normals, deviations=None)
+    return samples.replaced(np.concatenate([points, more]), np.concatenate([own, normals]))
 
 
 def _outward(points: Float, hull: ConvexHull) -> Int:

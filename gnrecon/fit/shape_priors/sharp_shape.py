@@ -11,7 +11,7 @@ Entry: `SharpShape.of`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -96,7 +96,7 @@ class SharpShape:
         completed = _resampled(points, normals, parameters) or _completed(edges, p)
         if completed is None:
             return None
-        samples = replace(samples, points=completed[0], normals=completed[1], deviations=None)
+        samples = samples.replaced(*completed)
         return cls(samples, averaging, snapped, holes, p)
 
 
