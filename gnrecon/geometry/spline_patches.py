@@ -93,7 +93,7 @@ def smoothest_normals(
     if len(some) < len(points):
         patches = _SplinePatches(scaled, np.arange(len(points)), parameters)
         exact = patches.fit(normals, 0.0)
-    return SmoothestNormals(exact.normals, patches.deviations(exact.normals))
+    return SmoothestNormals(exact.normals, patches.deviations(exact))
 
 
 def _regions(points: Float, parameters: SplineParameters) -> Int:
@@ -104,12 +104,21 @@ def _regions(points: Float, parameters: SplineParameters) -> Int:
     return np.unique(cKDTree(points).query(centers, parameters.region_points)[1])
 
 
+# Ratio, amplitude and log likelihood of some patches, each of shape (B,).
+_Likeliest = tuple[Float, Float, Float]
+
+
 @dataclass(frozen=True)
 class _Fit:
-    """Unit normals of least energy, of shape (N, 3), and their log likelihood, but for a constant."""
+    """Unit normals of least energy, of shape (N, 3), and of each group the likeliest of its patches for them."""
 
     normals: Float
-    log_likelihood: float
+    likeliest: list[_Likeliest]
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the normals, but for a constant."""
+        return sum(float(density.sum()) for _, _, density in self.likeliest)
 
 
 class _SplinePatches:
@@ -144,20 +153,19 @@ class _SplinePatches:
         noise : standard deviation, in the unit of the points
         """
         for _ in range(self.parameters.rounds):
-            amplitudes = self._likeliest(normals, noise)
-            pairs = list(zip(self._groups, amplitudes, strict=True))
+            pairs = list(zip(self._groups, self._likeliest(normals, noise), strict=True))
             normals = self._minimum(self._map(lambda pair: pair[0].form(*pair[1][:2]), pairs), normals)
-        return _Fit(normals, sum(float(one[2].sum()) for one in self._likeliest(normals, noise)))
+        return _Fit(normals, self._likeliest(normals, noise))
 
-    def deviations(self, normals: Float) -> Float:
-        """Return the standard deviations, of shape (N,), of the normals of least energy for points without noise."""
-        pairs = list(zip(self._groups, self._likeliest(normals, 0.0), strict=True))
-        variances = self._map(lambda pair: pair[0].first_variances(normals, *pair[1][:2]), pairs)
+    def deviations(self, fit: _Fit) -> Float:
+        """Return the standard deviations of a fit's normals, of shape (N,), where all points are centers."""
+        pairs = list(zip(self._groups, fit.likeliest, strict=True))
+        variances = self._map(lambda pair: pair[0].first_variances(fit.normals, *pair[1][:2]), pairs)
         deviations: Float = np.sqrt(np.concatenate(variances))
         return deviations
 
-    def _likeliest(self, normals: Float, noise: float) -> list[tuple[Float, Float, Float]]:
-        """Return the likeliest ratio and amplitude and the log likelihood of the patches of each group."""
+    def _likeliest(self, normals: Float, noise: float) -> list[_Likeliest]:
+        """Return the likeliest of the patches of each group."""
         return self._map(lambda group: group.likeliest(normals, noise), self._groups)
 
     def _minimum(self, forms: list[Float], normals: Float) -> Float:
@@ -201,7 +209,7 @@ class _Group:
         self.mixed = axes.transpose(0, 2, 1) @ inverse[:, :k, k : 4 * k]
         self.least = inverse[:, k : 4 * k, k : 4 * k].copy()
 
-    def likeliest(self, normals: Float, noise: float) -> tuple[Float, Float, Float]:
+    def likeliest(self, normals: Float, noise: float) -> _Likeliest:
         """Return the likeliest ratio, the amplitude and the log likelihood of each patch, of shape (B,)."""
         k = self.near.shape[1]
         freedom = 4 * k - 4 - 2 * k

@@ -99,6 +99,9 @@ def prepare(
     lengths = (spacing, smooth_scan)
     apart, width = (x if x is None else parse_reach(str(x), mean_spacing(cleaned.points), units) for x in lengths)
     oriented, moved = _smooth(oriented, width, parameters)
+    if moved is not None:
+        # What was found of points that lay elsewhere.
+        orientation = replace(orientation, clean=None, deviations=None)
     kept = thin(oriented, fraction=fraction, max_points=max_points, spacing=apart, method=subsample, seed=seed)
     if len(kept) < (least := parameters.least_points):
         raise UsageError(f"Subsampling leaves {len(kept)} points, but a surface needs at least {least}.")
@@ -106,7 +109,7 @@ def prepare(
     counts = replace(counts, normals=orientation.how, confidence=orientation.confidence, flipped=orientation.flipped)
     message = "Kept %d of %d points, %d for validation; normals: %s."
     _log.info(message, len(kept), len(cloud), len(held_out), orientation.how)
-    return _in_unit_ball(kept, held_out, orientation, smoothed=moved is not None), counts
+    return _in_unit_ball(kept, held_out, orientation), counts
 
 
 def _clear_of_few(
@@ -163,7 +166,7 @@ def _smooth(cloud: PointCloud, width: float | None, parameters: IngestParameters
     return replace(cloud, points=points + centre, normals=normals), moved
 
 
-def _in_unit_ball(kept: PointCloud, held_out: PointCloud, orientation: Orientation, *, smoothed: bool) -> Samples:
+def _in_unit_ball(kept: PointCloud, held_out: PointCloud, orientation: Orientation) -> Samples:
     """Return the samples of a fit, with the validation points in the same frame."""
     assert kept.normals is not None
     frame, held = Frame.of(kept.points), None
@@ -176,6 +179,5 @@ def _in_unit_ball(kept: PointCloud, held_out: PointCloud, orientation: Orientati
         # The two sides of a thin sheet would look like noise; one of them shows it.
         layer = points[normals @ np.linalg.eigh(normals.T @ normals)[1][:, -1] > 0.5]
     noise = estimate_noise(layer, mean_spacing(layer)).deviation if len(layer) >= 16 else None
-    clean = None if smoothed else orientation.clean
-    deviations = None if smoothed or orientation.deviations is None else kept.attributes["deviations"].astype(float)
-    return Samples(points, normals, frame, held, orientation.estimated, noise, clean, deviations)
+    deviations = None if orientation.deviations is None else kept.attributes["deviations"].astype(float)
+    return Samples(points, normals, frame, held, orientation.estimated, noise, orientation.clean, deviations)
