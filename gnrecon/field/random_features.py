@@ -59,7 +59,14 @@ class Features:
 
     def to(self, dtype: torch.dtype) -> Features:
         """Return the same features in another precision."""
-        return Features(self.frequencies.to(dtype), self.phases.to(dtype))
+        if dtype == self.frequencies.dtype:
+            return self
+        return self._single if dtype == torch.float32 else Features(self.frequencies.to(dtype), self.phases.to(dtype))
+
+    @cached_property
+    def _single(self) -> Features:
+        """The features in single precision."""
+        return Features(self.frequencies.float(), self.phases.float())
 
     def precise_enough(self, trace: float, *, most_single_trace: float = 1e5) -> Features:
         """Return the features in single precision where its rounding is far less than a prior's ones, or as they are.
@@ -72,6 +79,11 @@ class Features:
     def first(self, count: int) -> Features:
         """Return the first of the features, at most so many."""
         return Features(self.frequencies[:count], self.phases[:count])
+
+    @cached_property
+    def products(self) -> Tensor:
+        """Inner products of the frequencies, of shape (m, m)."""
+        return self.frequencies @ self.frequencies.T
 
     @cached_property
     def _affine(self) -> Tensor:

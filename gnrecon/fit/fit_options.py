@@ -21,7 +21,7 @@ NORMAL_RESIDUALS: dict[str, Residual] = {
     "cosine": normal_cosine,
 }
 # Features of each local field.
-QUALITIES = {"draft": 300, "normal": 600, "high": 1000}
+QUALITIES = {"draft": 150, "normal": 300, "high": 500}
 SEARCHES = ("auto", "damping", "geodesic", "line")
 OPTIMISERS = {"gn": "Gauss-Newton", "adam": "Adam", "lbfgs": "L-BFGS"}
 
@@ -43,7 +43,7 @@ class FitOptions:
         three units per point, at least 1,000 and at most 2,000, or beyond 8,000 points with one unit for four points,
         at most 3,000.
     quality : ``"draft"``, ``"normal"`` or ``"high"``
-        Features of each local field: 300, 600 or 1,000. In draft quality, the global field is linear.
+        Features of each local field: 150, 300 or 500. In draft quality, the global field is linear.
     normals : ``"vector"``, ``"projection"``, ``"cosine"``, or a name that another package brings
         Residual of the given normals; see `gnrecon.residuals.constraints`.
     optimiser : ``"gn"``, ``"adam"`` or ``"lbfgs"``

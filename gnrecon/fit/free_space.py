@@ -1,14 +1,17 @@
-"""Samples of free space around the data of one cube, and what they ask of its correction.
+"""Samples of free space around the data of cubes, and what they ask of their corrections.
 
 Far from the data a field is to be about the coarse distance. Nearer to it, down to where points no longer tell the side
 by the winding number, it must at least keep that sign: without such samples, points that contradict each other, as in
 a narrow crease, pull the correction so far beyond the surface that a wart grows next to it.
+
+The samples are nodes of one lattice that belongs to the partition, as samples at random would miss most warts, which
+are no larger than the length of the features. Neighbouring cubes share the nodes where they overlap, and each node is
+looked at once for a whole group of cubes (`GroupSpace`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,8 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.field.cube_lattice import CubeLattice, NodeGrid, equal_rows
 from gnrecon.field.networks import Siren
-from gnrecon.field.partition_of_unity import Detail
+from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.parameters import FreeSpaceParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -86,42 +90,18 @@ class Volume:
         """Return no samples."""
         return cls(np.zeros((0, 3)), *np.zeros((5, 0)))
 
-    def rows(self) -> tuple[Float, Float, Float, Float, Float, Float]:
+    def arrays(self) -> tuple[Float, Float, Float, Float, Float, Float]:
         """Return all six arrays."""
         return self.points, self.wanted, self.lower, self.upper, self.zero, self.distance
 
-
-@dataclass(frozen=True)
-class CubeLattice:
-    """The nodes of a cubic lattice in a cube, in blocks: at `offsets`, of shape (K, 3), from `corners`, (C, 3).
-
-    Corners are relative to the cube's centre. A sum of sines at all nodes takes the sines of corners and offsets alone,
-    see `Stencil`.
-    """
-
-    center: Float
-    corners: Float
-    offsets: Float
-
-    @classmethod
-    def of(cls, center: Float, reach: float, step: float, shift: Float, *, block: int = 4) -> CubeLattice:
-        """Return nodes at most `step` apart, in a cube of half an edge `reach`; `shift`, of shape (3,), is in steps."""
-        blocks = math.ceil(2 * reach / step / block)
-        step = 2 * reach / (blocks * block)
-        corners, offsets = (
-            np.stack(np.meshgrid(*3 * [np.arange(float(count))], indexing="ij"), axis=-1).reshape(-1, 3)
-            for count in (blocks, block)
-        )
-        return cls(center, step * (block * corners + shift) - reach, step * offsets)
-
-    def nodes(self) -> Float:
-        """Return all nodes, of shape (C K, 3), block by block."""
-        return self.center + (self.corners[:, None] + self.offsets).reshape(-1, 3)
+    def take(self, rows: Int | Mask) -> Volume:
+        """Return some of the samples."""
+        return Volume(*(values[rows] for values in self.arrays()))
 
 
 @dataclass(frozen=True)
 class LatticeVolume:
-    """Samples at some nodes of a lattice, of shape (Q,) as rows of `nodes`."""
+    """Samples at some nodes of a lattice, of shape (Q,) as rows of the nodes."""
 
     volume: Volume
     lattice: CubeLattice
@@ -129,117 +109,213 @@ class LatticeVolume:
 
     def sums(self, features: Features, length: float) -> Callable[[Tensor], Tensor]:
         """Return the function from amplitudes, (m,), to sums of features of a length about the centre, (Q,)."""
-        stencil = features.stencil(self.lattice.offsets / length)
-        corners = torch.as_tensor(self.lattice.corners, device=features.phases.device)
-        phases = features.phase(corners, torch.zeros_like(corners[0]), length)
-        rows = torch.as_tensor(self.rows, device=phases.device)
-        return lambda amplitudes: stencil.sums(phases, amplitudes.to(phases)).flatten()[rows]
-
-
-class _Samples(NamedTuple):
-    """Places, of shape (Q, 3), their rows, the nearest point's distance, its disk's radius, and the winding number."""
-
-    rows: Int
-    places: Float
-    distance: Float
-    disks: Float
-    winding: Float
-
-    def take(self, some: Mask) -> _Samples:
-        """Return some of the samples."""
-        rows, *values = self
-        return _Samples(rows[some], *(value[some] for value in values))
+        rows = torch.as_tensor(self.rows, device=features.phases.device)
+        return lambda amplitudes: self.lattice.sums(features, length, amplitudes)[rows]
 
 
 @dataclass(frozen=True)
-class CubeSpace:
-    """The space of one cube, of which samples are drawn.
+class Surroundings:
+    """What free space is measured with.
 
     Parameters
     ----------
-    center, reach : of the cube, reach being half of its edge, unit coordinates
     box : where the field is fitted
-    tree, disks : of the points in and around the cube, or of all: a k-d tree, and the radius of the disk of each
+    tree, disks : of the points around, or of all: a k-d tree, and the radius of the disk of each
     dipoles : of all points
     network, theta : the global field in unit coordinates
-    rng : draws the samples
     coarser : local fields that are added to the global one, if there are some
-    parameters : FreeSpaceParameters
     signed_by : returns other signed distances than the coarse ones, for places and these, where a penalty fills holes
+    parameters : FreeSpaceParameters
     """
 
-    center: Float
-    reach: float
     box: Box
     tree: Any
     disks: Float
     dipoles: DipoleTree
     network: Siren
     theta: Tensor
-    rng: np.random.Generator
     coarser: Detail | None = None
-    parameters: FreeSpaceParameters = FreeSpaceParameters()
     signed_by: Callable[[Float, Float], Float] | None = None
+    parameters: FreeSpaceParameters = FreeSpaceParameters()
+
+    def value(self, x: Float) -> Float:
+        """Return the field at places, of shape (Q, 3), in single precision: bounds are wide."""
+        theta = self.theta.float()
+        value: Float = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
+        return value if self.coarser is None else value + self.coarser.value(x)
+
+    def clear(self, x: Float, disks: float, gap: float, most: float) -> tuple[Int, Float, Float]:
+        """Return rows of places, of shape (Q, 3), that are clear of the data, their distances, and the data's disks.
+
+        Clear is farther than so many radii of these disks, plus a gap, and nearer than `most`.
+        """
+        distance, nearest = self.tree.query(x, distance_upper_bound=most)
+        # A place with no point within that distance has a row beyond the last.
+        rows = np.flatnonzero(np.isfinite(distance))
+        distance, radii = distance[rows], self.disks[nearest[rows]]
+        kept = distance > disks * radii + gap
+        return rows[kept], distance[kept], radii[kept]
+
+
+class _Nodes(NamedTuple):
+    """What is known at some nodes of a group: the row of each node, -1 where nothing is, of shape (X, Y, Z)."""
+
+    rows: Int
+    volume: Volume
+
+
+@dataclass(frozen=True)
+class GroupSpace:
+    """Samples of the space of a group of cubes.
+
+    Parameters
+    ----------
+    around : what they are measured with
+    keys : of the cubes, of shape (B, 3)
+    grid : the lattice
+    length : longest of the cubes' features, over which a correction fades
+    noise : standard deviation of the points' positions
+    """
+
+    around: Surroundings
+    keys: Int
+    grid: NodeGrid
+    length: float
+    noise: float
+
+    @classmethod
+    def of(
+        cls, around: Surroundings, partition: Partition, keys: Int, lengths: Sequence[float], noise: float
+    ) -> GroupSpace:
+        """Return the space of cubes with features of these lengths."""
+        grid = NodeGrid.of(partition, around.parameters.near_step_lengths * min(lengths))
+        return cls(around, keys, grid, max(lengths), noise)
+
+    def with_length(self, key: Int, length: float) -> GroupSpace:
+        """Return this space if it is fine and wide enough for a cube with features of a length, or one of the cube."""
+        if length <= self.length and self.grid.step <= self.around.parameters.near_step_lengths * length:
+            return self
+        return GroupSpace.of(self.around, self.grid.partition, key[None], [length], self.noise)
+
+    @cached_property
+    def far(self) -> _Nodes:
+        """Every other node along each axis, where it lies clear of the data."""
+        limits = self.around.parameters
+        every = np.ix_(*((first + np.arange(size)) % limits.far_stride == 0 for first, size in self._extent))
+        some = np.zeros_like(self._needed)
+        some[every] = self._needed[every]
+        return self._nodes(some, limits.clearance_disk_radii, 0.0, np.inf, limits.sign_bound_share)
+
+    @cached_property
+    def near(self) -> _Nodes:
+        """The nodes about the data, where the sign is certain."""
+        limits = self.around.parameters
+        clear, most = limits.near_clearance_noises * self.noise, self.reach(self.length)
+        bounds = limits.near_clearance_disk_radii, clear, most, limits.near_bound_share
+        return self._nodes(self._needed, *bounds, certain=True)
+
+    def reach(self, length: float) -> float:
+        """Return how far from the data the nodes near it are looked at, for features of a length."""
+        limits = self.around.parameters
+        return limits.near_reach_lengths * length + limits.near_clearance_noises * self.noise
+
+    def at(self, key: Int) -> tuple[slice, slice, slice]:
+        """Return the nodes of a cube among those of the group, whole blocks of them."""
+        first, size = self.grid.first(key) - self._first, self.grid.blocks * self.grid.block
+        x, y, z = (slice(int(start), int(start) + size) for start in first)
+        return x, y, z
+
+    @cached_property
+    def _first(self) -> Int:
+        """First node of the group, in nodes from the partition's origin."""
+        return self.grid.first(self.keys.min(axis=0))
+
+    @property
+    def _extent(self) -> list[tuple[int, int]]:
+        """First node and number of nodes along each axis."""
+        sizes = np.ptp(self.keys, axis=0) * self.grid.count + self.grid.blocks * self.grid.block
+        return [(int(first), int(size)) for first, size in zip(self._first, sizes, strict=True)]
+
+    @cached_property
+    def _needed(self) -> Mask:
+        """Which nodes are in a cube, and in the box where the field is fitted."""
+        needed = np.zeros([size for _, size in self._extent], dtype=bool)
+        edge = self.grid.count + 2 * self.grid.beyond
+        for x, y, z in self.grid.first(self.keys) - self._first:
+            needed[x : x + edge, y : y + edge, z : z + edge] = True
+        box = self.around.box
+        for axis, (first, size) in enumerate(self._extent):
+            along = self.grid.partition.origin[axis] + self.grid.step * (first + np.arange(size) + 0.5)
+            out = (along <= box.lower[axis]) | (along >= box.upper[axis])
+            np.moveaxis(needed, axis, 0)[out] = False
+        return needed
+
+    def _nodes(
+        self, some: Mask, disks: float, gap: float, most: float, bound_share: float, certain: bool = False
+    ) -> _Nodes:
+        """Return what is known at some of the nodes, those that are clear of the data, and of a certain sign if asked.
+
+        For `disks`, `gap` and `most` see `Surroundings.clear`.
+        """
+        nodes = np.argwhere(some)
+        x = self.grid.places(nodes + self._first)
+        kept, distance, radii = self.around.clear(x, disks, gap, most)
+        nodes, x = nodes[kept], x[kept]
+        winding = self._winding(nodes, x, distance)
+        if certain:
+            kept = np.flatnonzero(is_sign_certain(winding))
+            nodes, x = nodes[kept], x[kept]
+            distance, radii, winding = distance[kept], radii[kept], winding[kept]
+        # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
+        signed = sign_of_winding(winding) * np.sqrt(distance**2 - radii**2)
+        if self.around.signed_by is not None:
+            signed = self.around.signed_by(x, signed)
+        rows = np.full(some.shape, -1, dtype=np.int32)
+        rows[tuple(nodes.T)] = np.arange(len(nodes))
+        own, limits = self.around.value(x), self.around.parameters
+        return _Nodes(rows, Volume.around(x, own, signed, winding, distance, bound_share, parameters=limits))
+
+    def _winding(self, nodes: Int, x: Float, distance: Float, *, part_cells: int = 2) -> Float:
+        """Return the winding number of the data at nodes, of shape (Q, 3), seen from parts of so many cells an edge."""
+        dipoles, winding = self.around.dipoles, np.empty(len(x))
+        sizes = np.array([size for _, size in self._extent])
+        parts = np.rint(sizes / (part_cells * self.grid.count)).astype(np.int64).clip(1)
+        for some in equal_rows(nodes * parts // sizes):
+            lower, upper = x[some].min(axis=0), x[some].max(axis=0)
+            center = (lower + upper) / 2
+            places, moments, disks = dipoles.dipoles_for(center, float((upper - lower).max()) / 2)
+            # Seen from the centre, distances to dipoles near by keep their digits in single precision.
+            winding[some] = winding_number(x[some] - center, places - center, moments, disks, dtype=torch.float32)
+        centred: Float = dipoles.sides.centred(winding, distance)
+        return centred
+
+
+@dataclass(frozen=True)
+class CubeSpace:
+    """The space of one cube of a group."""
+
+    group: GroupSpace
+    key: Int
+
+    @property
+    def center(self) -> Float:
+        """Of the cube, unit coordinates."""
+        return self.group.grid.partition.center(self.key)
+
+    @property
+    def reach(self) -> float:
+        """Half of the cube's edge."""
+        return self.group.grid.partition.reach
 
     def far(self) -> Volume:
         """Return samples of the whole cube that lie clear of the data."""
-        limits = self.parameters
-        x = self.center + self.reach * self.rng.uniform(-1.0, 1.0, (limits.volume_samples, 3))
-        samples = self._clear(x, limits.clearance_disk_radii, 0.0)
-        own = self.network.value(self.theta, torch.as_tensor(samples.places).to(self.theta))
-        return self._volume(samples, own, limits.sign_bound_share)
+        rows = self.group.grid.by_blocks(self.group.far.rows[self.group.at(self.key)])
+        return self.group.far.volume.take(rows[(rows >= 0) & self.group.grid.inside])
 
-    def near(self, length: float, noise: float) -> LatticeVolume:
-        """Return samples all over the space about the data where the sign is certain, at the nodes of a lattice.
-
-        Samples drawn at random would miss most warts, which are no larger than the length of the features.
-
-        Parameters
-        ----------
-        length : of the correction's features, over which it fades
-        noise : standard deviation of the points' positions
-        """
-        limits = self.parameters
-        lattice = CubeLattice.of(self.center, self.reach, limits.near_step_lengths * length, self.rng.random(3))
-        clear = limits.near_clearance_noises * noise
-        most = limits.near_reach_lengths * length + clear
-        samples = self._clear(lattice.nodes(), limits.near_clearance_disk_radii, clear, most)
-        certain = samples.take(is_sign_certain(samples.winding))
-        # Bounds are wide, so that single precision is enough for the field.
-        theta = self.theta.float()
-        corners, offsets = (torch.as_tensor(x).to(theta) for x in (self.center + lattice.corners, lattice.offsets))
-        own = self.network.around(theta, offsets)(corners).flatten()[certain.rows]
-        return LatticeVolume(self._volume(certain, own, limits.near_bound_share), lattice, certain.rows)
-
-    @cached_property
-    def _seen_dipoles(self) -> tuple[Float, Float, Float]:
-        """Dipoles, seen from the centre: distances to those near by keep their digits in single precision."""
-        places, moments, radii = self.dipoles.dipoles_for(self.center, self.reach)
-        return places - self.center, moments, radii
-
-    def _clear(self, x: Float, clear_disks: float, clear: float, most: float = np.inf) -> _Samples:
-        """Return those of the places, of shape (Q, 3), that are far enough from the data, and nearer to it than `most`.
-
-        Far enough is so many radii of the data's disks, plus a length.
-        """
-        rows = np.flatnonzero(((x > self.box.lower) & (x < self.box.upper)).all(axis=1))
-        distance, nearest = self.tree.query(x[rows], distance_upper_bound=most)
-        # A place with no point within that distance has a row beyond the last.
-        found = np.isfinite(distance)
-        rows, distance, disks = rows[found], distance[found], self.disks[nearest[found]]
-        kept = distance > clear_disks * disks + clear
-        rows, distance, disks = rows[kept], distance[kept], disks[kept]
-        winding = winding_number(x[rows] - self.center, *self._seen_dipoles, dtype=torch.float32)
-        return _Samples(rows, x[rows], distance, disks, self.dipoles.sides.centred(winding, distance))
-
-    def _volume(self, samples: _Samples, own: Tensor, bound_share: float) -> Volume:
-        """Return what is known at the samples, where the global field is `own`, of shape (Q,)."""
-        _, x, distance, disks, winding = samples
-        # A surface seen through points is nearer than these: see `gnrecon.geometry.signed_distance`.
-        signed = sign_of_winding(winding) * np.sqrt(distance**2 - disks**2)
-        if self.signed_by is not None:
-            signed = self.signed_by(x, signed)
-        value = own.double().cpu().numpy()
-        if self.coarser is not None:
-            value += self.coarser.value(x)
-        return Volume.around(x, value, signed, winding, distance, bound_share, parameters=self.parameters)
+    def near(self, length: float) -> LatticeVolume:
+        """Return samples all over the space about the data where the sign is certain, for features of a length."""
+        group = self.group.with_length(self.key, length)
+        rows = group.grid.by_blocks(group.near.rows[group.at(self.key)])
+        places = np.flatnonzero((rows >= 0) & group.grid.inside)
+        places = places[group.near.volume.distance[rows[places]] < group.reach(length)]
+        return LatticeVolume(group.near.volume.take(rows[places]), group.grid.lattice, places)

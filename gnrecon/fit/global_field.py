@@ -136,7 +136,7 @@ class FieldResiduals:
     def patch(self, rows: Int, center: Float, volume: Volume, device: str) -> Patch:
         """Return the patch of some rows, with samples of the volume."""
         turn = self.normals[rows] - self.gradient[rows]
-        arrays = (self.points[rows], -self.value[rows], turn, *volume.rows(), center)
+        arrays = (self.points[rows], -self.value[rows], turn, *volume.arrays(), center)
         patch = Patch(*(torch.as_tensor(values, device=device) for values in arrays))
         if self.deviations is None:
             return patch

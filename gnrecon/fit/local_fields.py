@@ -9,24 +9,24 @@ corrects it near the data (`local_solve`), with a length scale and noise that va
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gnrecon.field.cube_lattice import cube_groups
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.free_space import CubeSpace
+from gnrecon.fit.free_space import CubeSpace, GroupSpace, Surroundings
 from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_solve import Patch, PatchSystem, precise_enough
 from gnrecon.fit.model_selection import Hyperparameters, patch_likelihood
 from gnrecon.fit.parameters import CoarserFieldParameters, FreeSpaceParameters, LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.octree import DipoleTree
 from gnrecon.geometry.signed_distance import is_sign_certain, kd_tree_order, sample_near_surface, winding_number
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
@@ -161,10 +161,44 @@ def cube_length(
     return hyperparameters.length * min(max(float(np.median(disks) / radius), 1.0), most_length_stretch)
 
 
-def cube_generator(seed: int, key: Int) -> np.random.Generator:
-    """Return the generator of a cube's own random numbers, the same in whichever order cubes are solved."""
-    # The 3 separates them from others of the fit with the same seed.
-    return np.random.default_rng([seed, 3, *(int(number) + 1 for number in key)])
+def solve_group(
+    residuals: FieldResiduals,
+    keys: Int,
+    rows: Sequence[Int],
+    around: Surroundings,
+    partition: Partition,
+    features: Features,
+    hyperparameters: Hyperparameters,
+    density: tuple[Float, float],
+    device: str,
+    penalties: SurfacePenalties | None = None,
+    *,
+    least_points: int = LocalFieldParameters.least_points,
+    parameters: LocalFieldParameters = LocalFieldParameters(),
+) -> list[tuple[float, Tensor] | None]:
+    """Return the result of `solve_cube` for the cubes of a group, or None for one that holds too few points.
+
+    Parameters
+    ----------
+    residuals, features, hyperparameters, device, penalties : as in `solve_cube`
+    keys, rows : of the cubes, of shape (B, 3), and of the points that each is fitted to
+    around : what the group's free space is measured with
+    partition : whose cubes they are
+    density : array of shape (N,), the radius of the disk that each point stands for, and the median of all
+    least_points : of a cube
+    """
+    disks, radius = density
+    solved = [number for number, some in enumerate(rows) if len(some) >= least_points]
+    found: list[tuple[float, Tensor] | None] = [None] * len(keys)
+    if not solved:
+        return found
+    stretch = parameters.most_length_stretch
+    lengths = [cube_length(hyperparameters, disks[rows[n]], radius, most_length_stretch=stretch) for n in solved]
+    space = GroupSpace.of(around, partition, keys[solved], lengths, hyperparameters.position)
+    for number, length in zip(solved, lengths, strict=True):
+        cube = residuals, rows[number], length, CubeSpace(space, keys[number]), features, hyperparameters, device
+        found[number] = solve_cube(*cube, penalties, parameters=parameters)
+    return found
 
 
 def solve_cube(
@@ -202,7 +236,7 @@ def solve_cube(
     system = PatchSystem(patch, features, length, size)
     if hyperparameters.robust:
         system = system.reweighted(position, angle)
-    near = space.near(length, position)
+    near = space.near(length)
     if penalties is None:
         return length, system.solve_with_bounds(position, angle, near)
     return length, penalties.penalise_cube(features, length, space.center, space.reach, hyperparameters, system, near)
@@ -248,12 +282,10 @@ class _Cubes:
 
     sdf: NeuralSDF
     residuals: FieldResiduals
-    dipoles: DipoleTree
-    coarser: Detail | None
+    around: Surroundings
     hyperparameters: Hyperparameters
     features: Features
     partition: Partition
-    seed: int
     device: str
     penalties: SurfacePenalties | None
     parameters: LocalFieldParameters
@@ -272,58 +304,50 @@ class _Cubes:
     ) -> _Cubes:
         """Return the cubes of a length scale, each with `count` features."""
         like = torch.zeros(0, dtype=torch.float64, device=device)
-        cell = parameters.cube_edge_lengths * hyperparameters.length
+        edge = parameters.cube_edge_lengths
+        if penalties is not None:
+            edge, count = parameters.penalised_edge_lengths, parameters.penalised_feature_ratio * count
+        cell = edge * hyperparameters.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
         partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
-        features, seed = Features.draw(count, rng, like), int(rng.integers(2**32))
+        features = Features.draw(count, rng, like)
         # Free space asks for no more than single precision.
         coarser = None if sdf.detail is None else sdf.detail.to(torch.float32)
-        data = residuals, residuals.dipoles, coarser
-        return cls(sdf, *data, hyperparameters, features, partition, seed, device, penalties, parameters)
+        density, signed_by = residuals.density, None if penalties is None else penalties.volume_distances
+        measured = residuals.dipoles, sdf.field, sdf.theta, coarser, signed_by
+        around = Surroundings(sdf.box, density.tree, density.disks, *measured)
+        return cls(sdf, residuals, around, hyperparameters, features, partition, device, penalties, parameters)
 
     def detail(self, advance: ProgressCallback) -> Detail:
         """Fit all cubes that hold data."""
         keys, _ = self.partition.members(self.residuals.points)
-        density, hyperparameters, limits = self.residuals.density, self.hyperparameters, self.parameters
-        reach = self.partition.reach + limits.data_margin_disk_radii * density.radius
+        groups = cube_groups(keys, self.parameters.group_cells)
+        # One array for all: small ones between the large ones of a group would keep freed memory from being used again.
+        lengths = np.full(len(keys), np.nan)
+        amplitudes = self.features.phases.new_zeros(len(keys), len(self.features))
 
-        def solved(number: int, least_points: int = limits.least_points) -> tuple[float, Tensor] | None:
-            """Return the length and amplitudes of a cube, or None where it holds too few points."""
-            center = self.partition.center(keys[number])
-            rows = self.residuals.within(center, reach)
-            if len(rows) < least_points:
-                return None
-            disks, stretch = density.disks[rows], limits.most_length_stretch
-            length = cube_length(hyperparameters, disks, density.radius, most_length_stretch=stretch)
-            space = self._space(keys[number], center)
-            cube = self.residuals, rows, length, space, self.features, hyperparameters, self.device
-            return solve_cube(*cube, self.penalties, parameters=limits)
+        def solve(rows: Int, *, least_points: int = LocalFieldParameters.least_points) -> None:
+            for row, cube in zip(rows, self._solved(keys[rows], least_points), strict=True):
+                if cube is not None:
+                    lengths[row], amplitudes[row] = cube
 
         # In threads for a GPU too: the CPU looks for the points around a cube and sums their winding numbers.
-        cubes = map_in_threads(solved, range(len(keys)), advance=advance)
-        if not any(cubes):
+        map_in_threads(solve, groups, advance=advance)
+        if np.isnan(lengths).all():
             # A few points that are far apart: a cube of one is better than none.
-            cubes = [solved(number, 1) for number in range(len(keys))]
-        kept = [number for number, cube in enumerate(cubes) if cube is not None]
-        lengths, amplitudes = zip(*filter(None, cubes), strict=True)
+            for rows in groups:
+                solve(rows, least_points=1)
+        kept = np.flatnonzero(np.isfinite(lengths))
         _log.info("Fitted %d local fields; %d cubes had too few points.", len(kept), len(keys) - len(kept))
-        noise = hyperparameters.position, hyperparameters.angle
-        fitted = keys[kept], np.array(lengths), self.features, torch.stack(amplitudes)
+        noise = self.hyperparameters.position, self.hyperparameters.angle
+        fitted = keys[kept], lengths[kept], self.features, amplitudes[kept]
         return Detail(self.partition, *fitted, *noise, coarser=self.sdf.detail)
 
-    def _space(self, key: Int, center: Float) -> CubeSpace:
-        """Return the space of a cube."""
-        sdf, density = self.sdf, self.residuals.density
-        return CubeSpace(
-            center,
-            self.partition.reach,
-            sdf.box,
-            density.tree,
-            density.disks,
-            self.dipoles,
-            sdf.field,
-            sdf.theta,
-            cube_generator(self.seed, key),
-            self.coarser,
-            signed_by=None if self.penalties is None else self.penalties.volume_distances,
-        )
+    def _solved(self, keys: Int, least_points: int) -> list[tuple[float, Tensor] | None]:
+        """Return the length and amplitudes of each cube of a group, or None where it holds too few points."""
+        density, limits = self.residuals.density, self.parameters
+        reach = self.partition.reach + limits.data_margin_disk_radii * density.radius
+        rows = [self.residuals.within(self.partition.center(key), reach) for key in keys]
+        group = self.residuals, keys, rows, self.around, self.partition, self.features, self.hyperparameters
+        rest = (density.disks, density.radius), self.device, self.penalties
+        return solve_group(*group, *rest, least_points=least_points, parameters=limits)

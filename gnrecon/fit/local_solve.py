@@ -13,7 +13,7 @@ and Recht (2007) and observations of the gradient.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -114,14 +114,14 @@ class PatchSystem:
         """J^T J and J^T y of the gradients.
 
         The rows of an axis are cosines C times the features' slopes S along it, and all axes have one noise: J^T J is
-        the Hadamard product of C^T C and S S^T, a third of the work of three products.
+        the Hadamard product of C^T C and S^T S, a third of the work of three products.
         """
         wanted, slopes = self._patch.gradient, self._features.frequencies / self._length
         weighted = partial(_weighted, self._patch.weights_of_normals)
         cosines = ((weighted(z.cos(), rows), weighted(wanted[rows], rows)) for rows, z in self._phases())
         product, along = self._sums(cosines, 3)
         slopes = slopes.to(product)
-        return product.mul_(slopes @ slopes.T), (along * slopes).sum(dim=1)
+        return product.mul_(self._features.products.to(product)).div_(self._length**2), (along * slopes).sum(dim=1)
 
     @cached_property
     def _deviation(self) -> Tensor:
@@ -144,11 +144,18 @@ class PatchSystem:
         wanted, deviation = self._patch.wanted, self._deviation
         return self._sums([(self._sines / deviation[:, None].to(self._sines), wanted / deviation)])
 
-    def _phases(self) -> Iterator[tuple[slice, Tensor]]:
-        """Yield rows of points with the features' phases there, of shape (N, m)."""
-        patch = self._patch
-        for rows in slices(len(patch.value), LocalSolveParameters.chunk_points):
-            yield rows, self._features.phase(patch.points[rows], patch.center, self._length)
+    def _phases(self) -> Iterable[tuple[slice, Tensor]]:
+        """Return rows of points with the features' phases there, of shape (N, m)."""
+        chunks = slices(len(self._patch.value), LocalSolveParameters.chunk_points)
+        return ((rows, self._phase(rows)) for rows in chunks) if len(chunks) > 1 else self._few_phases
+
+    @cached_property
+    def _few_phases(self) -> list[tuple[slice, Tensor]]:
+        """These of few points."""
+        return [(slice(None), self._phase(slice(None)))]
+
+    def _phase(self, rows: slice) -> Tensor:
+        return self._features.phase(self._patch.points[rows], self._patch.center, self._length)
 
     def _sums(self, chunks: Iterable[tuple[Tensor, Tensor]], *columns: int) -> tuple[Tensor, Tensor]:
         """Return J^T J, in its lower triangle, and J^T y of chunks of rows J with their targets y, of `columns`."""
@@ -190,7 +197,9 @@ class PatchSystem:
         least, most = (lower + patch.zero) / 2, (upper + patch.zero) / 2
         if near is not None:
             sums_near = near.sums(self._free, self._length)
-            points, _, low, high, zero, off = (torch.as_tensor(values).to(patch.value) for values in near.volume.rows())
+            points, _, low, high, zero, off = (
+                torch.as_tensor(values).to(patch.value) for values in near.volume.arrays()
+            )
             places, distance = torch.cat([places, points]), torch.cat([distance, off])
             lower, upper = torch.cat([lower, low]), torch.cat([upper, high])
             least = torch.cat([least, torch.where(low.isfinite(), zero, low)])

@@ -19,8 +19,7 @@ class TwoLevelParameters:
     global_field_points: int = 5000  # most that the global field is fitted to: few units resolve no more
     validation_one_in: int = 6  # one point in so many is a validation point
     most_validation_points: int = 2000  # where the local fields are not solved by blocks; more change no choice
-    # Up to which the network takes its last steps on all points: with more, local fields make up for those left out.
-    most_refitted_points: int = 800
+    most_refitted_points: int = 800  # up to which the network sees all in its last steps: more, local fields fit well
     global_time_share: float = 0.4  # of the whole fit, measured, for the progress bar
 
 
@@ -28,9 +27,12 @@ class TwoLevelParameters:
 class LocalFieldParameters:
     """The cubes of local corrections (`fit.local_fields`, `fit.blocks`)."""
 
-    cube_edge_lengths: float = 5.0  # in length scales: longer cubes need more features, shorter ones overlap too much
+    cube_edge_lengths: float = 3.5  # in length scales: longer cubes need more features, shorter ones overlap more
+    penalised_edge_lengths: float = 5.0  # of cubes under curvature penalties, as seams of more cubes bend the surface
+    penalised_feature_ratio: int = 2  # of their features and those of other cubes
     data_margin_disk_radii: float = 2.0  # a cube is also fitted to data so far beyond it
     least_points: int = 4  # of a cube; fewer do not define a surface
+    group_cells: int = 4  # edge of the boxes whose cubes share their samples of free space, in cells; a power of two
     most_length_stretch: float = 4.0  # most a cube's length scale may exceed the scan's where points are sparse
     length_features: int = 300  # most that the likelihood of a length is computed with
     length_step: float = 2.0**0.5  # between the lengths of which a cube's own data chooses
@@ -47,7 +49,7 @@ class CoarserFieldParameters:
     most_length_radii: float = 0.25  # of theirs: longer features are those of the global field
     least_rms_noises: float = 10.0  # that the global field is wrong by, over the noise: more noise hides steps
     point_share: float = 1 / 3  # of the points, that they are fitted to
-    features: int = 300  # of each
+    features: int = 300
     gap_samples: int = 10_000  # of space about the points
     gap_spread_lengths: float = 2.0  # standard deviation of their distance along each axis
     least_gap_samples: int = 2  # of an uncertain sign, clear of the points, which a closed scan has none of
@@ -55,11 +57,11 @@ class CoarserFieldParameters:
 
 @dataclass(frozen=True)
 class FreeSpaceParameters:
-    """Samples of free space in a cube (`fit.free_space`)."""
+    """Samples of free space in a cube (`fit.free_space`), at the nodes of a lattice."""
 
-    volume_samples: int = 400  # of a whole cube
     clearance_disk_radii: float = 3.5  # their least distance from the data: nearer, the coarse distance is none
-    near_step_lengths: float = 0.41  # of the lattice about the data on which wrong signs are looked for
+    near_step_lengths: float = 0.41  # at most, of the lattice, on which wrong signs are looked for about the data
+    far_stride: int = 2  # nodes between those that are samples of the whole cube
     near_reach_lengths: float = 1.5  # from the noisy data to its farthest samples; beyond, corrections have faded
     near_clearance_disk_radii: float = 1.0  # their least distance; nearer, points do not tell the side
     near_clearance_noises: float = 3.0  # and so many standard deviations of the points' noise more
@@ -264,9 +266,8 @@ class ModelSelectionParameters:
     least_patches: int = 10
     most_patches: int = 80
     patch_validation_points: int = 20  # that each patch predicts
-    # Points up to which estimated normals are ignored, and the errors of points are taken for independent. Normals of
-    # denser scans are means over little of the surface; and where many scans do not quite match, a field that winds
-    # through all of them has the least distances and the largest evidence.
+    # Points up to which estimated normals are ignored, and errors taken for independent. Normals of denser scans are
+    # means over little of the surface; where scans do not quite match, a field through all of them is the likeliest.
     sparse_points: int = 20_000
     most_patch_points: int = 2500  # more change no score, and time grows with the square of the length
     features: int = 300

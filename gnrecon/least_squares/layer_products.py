@@ -220,8 +220,9 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
         for rows in chunks:
             product += rows.T @ rows
         return product
-    # The last blocks come first: they take longest, and threads that share them end at the same time.
-    blocks = slices(size, block_columns)[::-1]
+    # The last blocks come first: they take longest, and threads that share them end at the same time. A small product
+    # is one, as a matrix by its own transpose takes half of the time of another product.
+    blocks = [slice(0, size)] if size <= 2 * block_columns else slices(size, block_columns)[::-1]
     for rows in chunks:
         # Threads share the blocks and no sum, so that the result is the same for any number of them.
         map_in_threads(partial(_add_block, product, rows), blocks)
@@ -247,4 +248,5 @@ def _add_block(product: Tensor, rows: Tensor, block: slice) -> None:
     before = slice(0, block.start)
     columns = rows[:, block].T
     product[block, block] += matmul(columns, rows[:, block])
-    product[block, before] += matmul(columns, rows[:, before])
+    if block.start:
+        product[block, before] += matmul(columns, rows[:, before])

@@ -9,8 +9,9 @@ import numpy.typing as npt
 import pytest
 import torch
 
+from gnrecon.field.cube_lattice import CubeLattice
 from gnrecon.field.random_features import Features
-from gnrecon.fit.free_space import CubeLattice, LatticeVolume, Volume
+from gnrecon.fit.free_space import LatticeVolume, Volume
 from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_fields import solve_cube
 from gnrecon.fit.model_selection import Hyperparameters
@@ -28,7 +29,7 @@ class NoSpace:
         return Volume.none()
 
     def near(self, *_: float) -> LatticeVolume:
-        return LatticeVolume(Volume.none(), CubeLattice(*np.zeros((3, 1, 3))), np.zeros(0, dtype=np.int64))
+        return LatticeVolume(Volume.none(), CubeLattice(*np.zeros((2, 1, 3))), np.zeros(0, dtype=np.int64))
 
 
 def sheet(wavelength: float, rng: np.random.Generator) -> FieldResiduals:

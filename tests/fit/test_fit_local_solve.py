@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from gnrecon.field.cube_lattice import CubeLattice
 from gnrecon.field.random_features import Features
-from gnrecon.fit.free_space import CubeLattice, LatticeVolume, Volume
+from gnrecon.fit.free_space import LatticeVolume, Volume
 from gnrecon.fit.local_solve import LocalRowSystem, Patch, PatchSystem, patch_system
 from gnrecon.fit.parameters import LocalSolveParameters
 
@@ -192,7 +193,7 @@ def at_nodes(patch: Patch, samples: Volume) -> LatticeVolume:
     """Samples at all nodes of a lattice, each in a block of its own."""
     center = patch.center.numpy()
     return LatticeVolume(
-        samples, CubeLattice(center, samples.points - center, np.zeros((1, 3))), np.arange(len(samples.points))
+        samples, CubeLattice(samples.points - center, np.zeros((1, 3))), np.arange(len(samples.points))
     )
 
 

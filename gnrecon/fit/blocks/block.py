@@ -1,9 +1,9 @@
-"""Solves one block of a large fit: its cubes, each from the points around it only.
+"""Solves one block of a large fit: its cubes, in groups, each from the points around it only.
 
 A block is a task: it is identified by its work folder and number, reads its data from there, and writes its result
-there. So it can be solved in any process that sees the folder, in any order, and again after it was lost. Each cube has
-a random generator of its own, seeded with its key, and uses the same points and far field in whichever block it is: how
-cubes are assigned to blocks, and blocks to processes, changes no digit of the result. Entry: `solve_block`.
+there. So it can be solved in any process that sees the folder, in any order, and again after it was lost. A block holds
+whole groups of cubes, and a group uses the same points and far field in whichever block it is: how groups are assigned
+to blocks, and blocks to processes, changes no digit of the result. Entry: `solve_block`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from gnrecon.field.cube_lattice import cube_groups
 from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
-from gnrecon.fit.free_space import CubeSpace
+from gnrecon.fit.free_space import Surroundings
 from gnrecon.fit.global_field import FieldResiduals
-from gnrecon.fit.local_fields import cube_generator, cube_length, solve_cube
+from gnrecon.fit.local_fields import solve_group
 from gnrecon.fit.model_selection import Hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int
@@ -56,7 +57,7 @@ class BlockSolver:
     ends : array of shape (K + 1,), first cube of each block
     dipoles : of all points
     network, theta, box : the global field in unit coordinates
-    partition, features, hyperparameters, seed, device : as in `gnrecon.fit.local_fields`
+    partition, features, hyperparameters, device : as in `gnrecon.fit.local_fields`
     """
 
     residuals: FieldResiduals
@@ -73,7 +74,6 @@ class BlockSolver:
     partition: Partition
     features: Features
     hyperparameters: Hyperparameters
-    seed: int
     device: str
 
     @classmethod
@@ -101,60 +101,44 @@ class BlockSolver:
             partition=Partition(array("origin"), facts["cell"], facts["overlap"]),
             features=Features(frequencies, phases),
             hyperparameters=Hyperparameters(**facts["hyperparameters"]),
-            seed=facts["seed"],
             device=device,
         )
 
     def solve(self, number: int) -> Arrays:
         """Return the cubes of a block that hold enough points: their rows among all cubes, lengths and amplitudes."""
+        first = self.ends[number]
+        keys = self.keys[first : self.ends[number + 1]]
         # An empty first array gives the shape where no cube holds enough points.
         kept, lengths, amplitudes = [], [], [np.zeros((0, len(self.features)))]
-        for cube in range(self.ends[number], self.ends[number + 1]):
-            solved = self._solve_cube(self.keys[cube])
-            if solved is not None:
-                kept.append(cube)
-                lengths.append(solved[0])
-                amplitudes.append(solved[1][None])
+        for rows in cube_groups(keys, LocalFieldParameters.group_cells):
+            for row, cube in zip(rows, self._solve_group(keys[rows]), strict=True):
+                if cube is not None:
+                    kept.append(first + row)
+                    lengths.append(cube[0])
+                    amplitudes.append(cube[1].cpu().numpy()[None])
         return {
             "cubes": np.array(kept, dtype=np.int64),
             "lengths": np.array(lengths, dtype=np.float64),
             "amplitudes": np.concatenate(amplitudes),
         }
 
-    def _solve_cube(self, key: Int) -> tuple[float, Float] | None:
-        """Return the length and amplitudes of a cube, or None where it holds too few points."""
-        center, nearby = self.partition.center(key), self._nearby_points(key)
+    def _solve_group(self, keys: Int) -> list[tuple[float, torch.Tensor] | None]:
+        """Return the length and amplitudes of each cube of a group, or None where it holds too few points."""
+        nearby = self._nearby_points(keys)
+        tree = cKDTree(self.residuals.points[nearby])
+        around = Surroundings(self.box, tree, self.disks[nearby], self.dipoles, self.network, self.theta)
         reach = self.partition.reach + LocalFieldParameters.data_margin_disk_radii * self.radius
-        rows = nearby[(np.abs(self.residuals.points[nearby] - center) <= reach).all(axis=1)]
-        if len(rows) < LocalFieldParameters.least_points:
-            return None
-        length = cube_length(self.hyperparameters, self.disks[rows], self.radius)
-        space = self._space(key, center, nearby)
-        cube = self.residuals, rows, length, space, self.features, self.hyperparameters, self.device
-        length, amplitudes = solve_cube(*cube)
-        return length, amplitudes.cpu().numpy()
+        found = tree.query_ball_point(self.partition.center(keys), reach, p=np.inf)
+        rows = [nearby[np.sort(np.array(some, dtype=np.int64))] for some in found]
+        group = self.residuals, keys, rows, around, self.partition, self.features, self.hyperparameters
+        return solve_group(*group, (self.disks, self.radius), self.device)
 
-    def _nearby_points(self, key: Int) -> Int:
-        """Return the rows of the points in a cell and its neighbours, in order: all points of the cube."""
+    def _nearby_points(self, keys: Int) -> Int:
+        """Return the rows of the points in the cells of cubes and their neighbours, in order: all points of theirs."""
         # A cube and its margin reach less than a cell beyond its own cell.
-        keys = key + neighbour_offsets()
-        codes = np.sort(morton_codes(keys[(keys >= 0).all(axis=1)]))
+        near = np.unique((keys[:, None] + neighbour_offsets()).reshape(-1, 3), axis=0)
+        codes = np.sort(morton_codes(near[(near >= 0).all(axis=1)]))
         # Cells without points have no code among the occupied ones.
         at = np.minimum(np.searchsorted(self.cells, codes), len(self.cells) - 1)
         at = at[self.cells[at] == codes]
         return ranges(self.first[at], self.first[at + 1])
-
-    def _space(self, key: Int, center: Float, nearby: Int) -> CubeSpace:
-        """Return the space of a cube, near which the points have these rows."""
-        points = self.residuals.points
-        return CubeSpace(
-            center,
-            self.partition.reach,
-            self.box,
-            cKDTree(points[nearby]),
-            self.disks[nearby],
-            self.dipoles,
-            self.network,
-            self.theta,
-            cube_generator(self.seed, key),
-        )

@@ -169,7 +169,7 @@ def _occupied_cubes(partition: Partition, points: Float, *, lookup_points: int =
 def _divided(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) -> tuple[Int, Int]:
     """Return the cubes in the order of their blocks, of shape (B, 3), and the first of each block, with the end.
 
-    A cube counts the points of its own cell, not those of its overlap.
+    A cube counts the points of its own cell, not those of its overlap. Blocks consist of whole groups.
     """
     # Keys begin at -1, as cubes below the first cell overlap it; Morton codes begin at 0.
     codes = morton_codes(keys + 1)
@@ -179,7 +179,11 @@ def _divided(keys: Int, cells: npt.NDArray[np.uint64], first: Int, most: int) ->
     at = np.minimum(np.searchsorted(cells, own), len(cells) - 1)
     held = (cells[at] == own) & (keys >= 0).all(axis=1)
     counts = np.where(held, first[at + 1] - first[at], 0)
-    return keys, np.array([0, *(block.stop for block in octree_blocks(codes, counts, most))])
+    # A code without its last bits is that of the cube's group.
+    bits = 3 * (LocalFieldParameters.group_cells.bit_length() - 1)
+    groups, start = np.unique(codes >> np.uint64(bits), return_index=True)
+    blocks = octree_blocks(groups, np.add.reduceat(counts, start), most)
+    return keys, np.array([0, *np.append(start, len(codes))[[block.stop for block in blocks]]])
 
 
 def _assembled(
