@@ -37,6 +37,11 @@ _log = logging.getLogger(__name__)
 PenaltiesFor = Callable[[float], SurfacePenalties]
 """Returns the curvature penalties for features of a length scale, in radii."""
 
+SolveDetail = Callable[
+    [NeuralSDF, FieldResiduals, Hyperparameters, int, np.random.Generator, str, ProgressCallback], Detail
+]
+"""Solves local fields; the arguments are the first ones of `fit_detail`."""
+
 
 def fit_detail(
     sdf: NeuralSDF,
@@ -48,6 +53,7 @@ def fit_detail(
     advance: ProgressCallback = ignore_progress,
     shape: PenaltiesFor | None = None,
     *,
+    solve_elsewhere: SolveDetail | None = None,
     parameters: LocalFieldParameters = LocalFieldParameters(),
 ) -> Detail:
     """Return the local fields that are added to a global field, with coarser ones where a clean scan has gaps.
@@ -62,6 +68,7 @@ def fit_detail(
     device : a torch device
     advance : called with the share that is done
     shape : gives the curvature penalties for the length scale of the local fields
+    solve_elsewhere : solves them in other processes, where there are no penalties and no coarser fields
     """
     _log.info(
         "Local fields: length scale %.3g radii, noise %.2g radii and %.2g radians; %d features each.",
@@ -75,7 +82,10 @@ def fit_detail(
     if penalties is None and _needs_coarser(residuals, hyperparameters, rng.spawn(1)[0]):
         coarser = _coarser(sdf, residuals, hyperparameters, rng.spawn(1)[0], device, parameters)
         sdf, residuals = replace(sdf, detail=coarser), residuals.after(coarser)
-    return _Cubes.of(sdf, residuals, hyperparameters, features, rng, device, penalties, parameters).detail(advance)
+    fitted = sdf, residuals, hyperparameters, features, rng, device
+    if solve_elsewhere is not None and penalties is None and sdf.detail is None:
+        return solve_elsewhere(*fitted, advance)
+    return _Cubes.of(*fitted, penalties, parameters).detail(advance)
 
 
 def _needs_coarser(

@@ -21,7 +21,7 @@ import numpy as np
 
 from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit.blocks.block_parameters import BlockParameters
-from gnrecon.fit.blocks.solve import fit_large
+from gnrecon.fit.blocks.solve import fit_large, solve_by_blocks
 from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
@@ -246,7 +246,9 @@ class _Steps:
         cubes = self.parameters.local_fields
         advance(cubes.selection_time_share)
         fitted = (sdf, residuals, hyperparameters, options.features, rng, options.device, advance, penalties)
-        return sdf, fit_detail(*fitted, parameters=cubes)
+        # However many threads there are, so that the result does not depend on their number.
+        by_processes = len(residuals) >= BlockParameters.process_points and options.device == "cpu"
+        return sdf, fit_detail(*fitted, solve_elsewhere=solve_by_blocks if by_processes else None, parameters=cubes)
 
     def _fit_global(self, completed: _Data, advance: ProgressCallback) -> GlobalField:
         """Return the global field that is fitted to completed data."""

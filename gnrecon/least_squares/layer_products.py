@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 
 import torch
 from torch import Tensor
@@ -215,14 +215,14 @@ def gram(chunks: Iterable[Tensor], size: int, like: Tensor, *, block_columns: in
     block_columns : columns of a block on the CPU; large enough for fast matrix products, and small enough that little
         is computed above the diagonal. A GPU has one product in the time of a few blocks
     """
-    product = torch.zeros(size, size, dtype=like.dtype, device=like.device)
-    if like.device.type != "cpu":
-        for rows in chunks:
-            product += rows.T @ rows
-        return product
-    # The last blocks come first: they take longest, and threads that share them end at the same time. A small product
-    # is one, as a matrix by its own transpose takes half of the time of another product.
-    blocks = [slice(0, size)] if size <= 2 * block_columns else slices(size, block_columns)[::-1]
+    if like.device.type != "cpu" or size <= 2 * block_columns:
+        # One product: of a matrix by its own transpose, it takes half of the time of another one.
+        products = (matmul(rows.T, rows).to(like.dtype) for rows in chunks)
+        first = next(products, None)
+        return like.new_zeros(size, size) if first is None else reduce(torch.Tensor.add_, products, first)
+    product = like.new_zeros(size, size)
+    # The last blocks come first: they take longest, and threads that share them end at the same time.
+    blocks = slices(size, block_columns)[::-1]
     for rows in chunks:
         # Threads share the blocks and no sum, so that the result is the same for any number of them.
         map_in_threads(partial(_add_block, product, rows), blocks)
@@ -248,5 +248,4 @@ def _add_block(product: Tensor, rows: Tensor, block: slice) -> None:
     before = slice(0, block.start)
     columns = rows[:, block].T
     product[block, block] += matmul(columns, rows[:, block])
-    if block.start:
-        product[block, before] += matmul(columns, rows[:, before])
+    product[block, before] += matmul(columns, rows[:, before])

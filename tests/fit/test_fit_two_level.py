@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from gnrecon.export import curvatures
+from gnrecon.field.partition_of_unity import Detail
 from gnrecon.field.random_features import Features
 from gnrecon.fit import FitOptions, NeuralSDF, Uncertainty, fit, local_fields
 from gnrecon.fit import two_level as adaptive
+from gnrecon.fit.blocks.block_parameters import BlockParameters
+from gnrecon.fit.blocks.solve import solve_by_blocks
 from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.model_selection import _smoothest, select_hyperparameters
 from gnrecon.fit.parameters import ModelSelectionParameters, SurfaceLikelihoodParameters
@@ -149,6 +153,34 @@ def test_other_scans_get_no_coarser_fields(noise: float, gap: bool, rng: np.rand
     sdf, _ = fit(Samples(moved, scan.normals, FRAME), FitOptions(quality="draft"))
     assert sdf.detail is not None
     assert sdf.detail.coarser is None
+
+
+def test_processes_solve_the_local_fields_of_many_points(
+    clean: tuple[Samples, NeuralSDF], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples, here = clean
+    solved: list[int] = []
+
+    def counted(*given: Any) -> Detail:
+        solved.append(len(given[1]))
+        return solve_by_blocks(*given)
+
+    monkeypatch.setattr(adaptive, "solve_by_blocks", counted)
+    monkeypatch.setattr(BlockParameters, "process_points", len(samples))
+    elsewhere, _ = fit(samples, FitOptions(quality="draft"))
+    assert solved == [len(samples)]
+    assert elsewhere.detail is not None
+    assert here.detail is not None
+    np.testing.assert_array_equal(elsewhere.detail.keys, here.detail.keys)
+    x = FRAME.to_world(samples.points)
+    np.testing.assert_allclose(elsewhere.sdf(x), here.sdf(x), atol=1e-6)
+    # Neither fields under penalties nor those over coarser ones are solved so.
+    gap = with_gap(samples)[0]
+    monkeypatch.setattr(BlockParameters, "process_points", len(gap))
+    monkeypatch.setattr(local_fields, "_needs_coarser", lambda *_: True)
+    for options in (FitOptions(quality="draft"), FitOptions(quality="draft", smooth="strain=1e-4")):
+        assert fit(gap, options)[0].detail is not None
+    assert len(solved) == 1
 
 
 def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:

@@ -5,7 +5,7 @@ the points around it from there (`block`), in a process of its own or on a clust
 processes nor the size of the blocks changes the result. Besides the points, memory holds the data of one block for each
 process. The sign of free space is that of the winding number of all points, by a tree of dipoles (`tree`): a subset of
 a few thousand points, as for smaller scans, would leave it uncertain within many spacings of a large one.
-Entry: `fit_large`.
+Entries: `fit_large`, and `solve_by_blocks` where length and noise are known.
 """
 
 from __future__ import annotations
@@ -76,25 +76,48 @@ def fit_large(
     hyperparameters = select_hyperparameters(residuals, held, residuals.density.radius, rng, options.device)
     chosen = LocalFieldParameters.selection_time_share
     advance(chosen)
-    like = torch.zeros(0, dtype=torch.float64, device=options.device)
-    features = Features.draw(options.features, rng, like)
+    field = sdf, residuals, hyperparameters, options.features, rng, options.device, subrange(advance, chosen, 1.0)
+    return solve_by_blocks(*field, options.seed, folder, scheduler, block_points)
+
+
+def solve_by_blocks(
+    sdf: NeuralSDF,
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
+    features: int,
+    rng: np.random.Generator,
+    device: str,
+    advance: ProgressCallback = ignore_progress,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    scheduler: str | None = None,
+    block_points: int = BlockParameters.block_points,
+) -> Detail:
+    """Return the local fields to add to a global field, for known hyperparameters.
+
+    Parameters
+    ----------
+    sdf, residuals, hyperparameters : the global field, its residuals at the samples, and their length and noise
+    features : of each cube
+    seed : of the fit, which the work folder notes
+    rng, device, advance, folder, scheduler, block_points : as in `fit_large`, which says what it raises, too
+    """
+    drawn = Features.draw(features, rng, torch.zeros(0, dtype=torch.float64, device=device))
     # Offset by a part of a cell that no regular scan shares, as in `gnrecon.fit.local_fields`.
-    edge = LocalFieldParameters.cube_edge_lengths
-    partition = Partition(
-        residuals.points.min(axis=0) - 0.137 * edge * hyperparameters.length, edge * hyperparameters.length
-    )
-    arrays, facts = _task_data(sdf, residuals, hyperparameters, features, partition, block_points)
+    cell = LocalFieldParameters.cube_edge_lengths * hyperparameters.length
+    partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
+    arrays, facts = _task_data(sdf, residuals, hyperparameters, drawn, partition, block_points)
     with _work_folder(folder) as path:
-        work = WorkFolder.open(path, arrays, facts | {"seed": options.seed})
+        work = WorkFolder.open(path, arrays, facts | {"seed": seed})
         count = len(arrays["ends"]) - 1
         # A resumed fit finds the blocks of earlier runs.
         missing = [number for number in range(count) if not work.is_solved(number)]
         if scheduler is not None and missing:
-            solve_on_cluster(work, missing, scheduler, subrange(advance, chosen, 1.0))
+            solve_on_cluster(work, missing, scheduler, advance)
         else:
             # As many processes as threads: the option, or by default the cores.
-            solve_blocks(work, missing, worker_count(), options.device, subrange(advance, chosen, 1.0))
-        return _assembled(work, count, arrays["keys"], partition, features, hyperparameters)
+            solve_blocks(work, missing, worker_count(), device, advance)
+        return _assembled(work, count, arrays["keys"], partition, drawn, hyperparameters)
 
 
 @contextmanager
