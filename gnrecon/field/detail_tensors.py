@@ -17,8 +17,8 @@ _COARSER = "coarser."
 
 
 def plain_name(name: str) -> str:
-    """Return the name that a tensor of the coarser detail has in the detail that it is added to; others as they are."""
-    return name.removeprefix(_COARSER)
+    """Return the name that a tensor of a coarser detail has in the finest one; others as they are."""
+    return name[name.rfind(_COARSER) + len(_COARSER) :] if name.startswith(_COARSER) else name
 
 
 def detail_tensors(detail: Detail) -> dict[str, Tensor]:
@@ -69,6 +69,6 @@ def detail_of(
         raise InputError(f"{path} holds local fields whose lengths are out of range.")
     partition = Partition(lattice[:3], float(lattice[3]), float(lattice[4]))
     of_all = Features(frequencies, phases)
-    rest = {plain_name(name): tensor for name, tensor in tensors.items() if name.startswith(_COARSER)}
+    rest = {name.removeprefix(_COARSER): tensor for name, tensor in tensors.items() if name.startswith(_COARSER)}
     noises = float(noise[0]), float(noise[1])
     return Detail(partition, keys, lengths, of_all, amplitudes, *noises, coarser=detail_of(path, rest))

@@ -24,10 +24,20 @@ from gnrecon.field.cube_lattice import CubeLattice, NodeGrid, equal_rows
 from gnrecon.field.networks import Siren
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
-from gnrecon.fit.parameters import FreeSpaceParameters
+from gnrecon.fit.parameters import CoarserFieldParameters, FreeSpaceParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.octree import DipoleTree
-from gnrecon.geometry.signed_distance import Box, film_distance, is_sign_certain, sign_of_winding, winding_number
+from gnrecon.geometry.signed_distance import (
+    Box,
+    Density,
+    film_distance,
+    is_sign_certain,
+    kd_tree_order,
+    sample_near_surface,
+    sign_of_winding,
+    winding_number,
+)
+from gnrecon.runtime.chunks import slices
 
 
 @dataclass(frozen=True)
@@ -281,11 +291,7 @@ class GroupSpace:
         sizes = np.array([size for _, size in self._extent])
         parts = np.rint(sizes / (part_cells * self.grid.count)).astype(np.int64).clip(1)
         for some in equal_rows(nodes * parts // sizes):
-            lower, upper = x[some].min(axis=0), x[some].max(axis=0)
-            center = (lower + upper) / 2
-            places, moments, disks = dipoles.dipoles_for(center, float((upper - lower).max()) / 2)
-            # Seen from the centre, distances to dipoles near by keep their digits in single precision.
-            winding[some] = winding_number(x[some] - center, places - center, moments, disks, dtype=torch.float32)
+            winding[some] = _winding_of(x[some], dipoles)
         centred: Float = dipoles.sides.centred(winding, distance)
         return centred
 
@@ -319,3 +325,43 @@ class CubeSpace:
         places = np.flatnonzero((rows >= 0) & group.grid.inside)
         places = places[group.near.volume.distance[rows[places]] < group.reach(length)]
         return LatticeVolume(group.near.volume.take(rows[places]), group.grid.lattice, places)
+
+
+def has_gaps(
+    points: Float,
+    density: Density,
+    dipoles: DipoleTree,
+    length: float,
+    rng: np.random.Generator,
+    *,
+    group: int = 64,
+    parameters: CoarserFieldParameters = CoarserFieldParameters(),
+) -> bool:
+    """Return whether there are places about the data, some lengths wide, where no sign is certain.
+
+    Parameters
+    ----------
+    points, density, dipoles : array of shape (N, 3), and of these points
+    length : of local fields
+    rng : draws the places
+    group : places whose winding number is summed together
+    """
+    spread = parameters.gap_spread_lengths * length
+    x = sample_near_surface(points, spread, parameters.gap_samples, rng)
+    distance, nearest = density.tree.query(x)
+    clear = distance > FreeSpaceParameters.clearance_disk_radii * density.disks[nearest]
+    x, distance = x[clear], distance[clear]
+    order, found = kd_tree_order(x), 0
+    for rows in (order[some] for some in slices(len(x), group)):
+        winding = _winding_of(x[rows], dipoles)
+        found += int((~is_sign_certain(dipoles.sides.centred(winding, distance[rows]))).sum())
+    return found >= parameters.least_gap_samples
+
+
+def _winding_of(x: Float, dipoles: DipoleTree) -> Float:
+    """Return the winding number, of shape (Q,), at places that lie together, of shape (Q, 3)."""
+    lower, upper = x.min(axis=0), x.max(axis=0)
+    center = (lower + upper) / 2
+    places, moments, disks = dipoles.dipoles_for(center, float((upper - lower).max()) / 2)
+    # Seen from the centre, distances to dipoles near by keep their digits in single precision.
+    return winding_number(x - center, places - center, moments, disks, dtype=torch.float32)

@@ -9,6 +9,7 @@ corrects it near the data (`local_solve`), with a length scale and noise that va
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,15 +21,13 @@ from gnrecon.field.cube_lattice import cube_groups
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.field_model import NeuralSDF
-from gnrecon.fit.free_space import CubeSpace, GroupSpace, Surroundings
+from gnrecon.fit.free_space import CubeSpace, GroupSpace, Surroundings, has_gaps
 from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_solve import Patch, PatchSystem, precise_enough
 from gnrecon.fit.model_selection import Hyperparameters, patch_likelihood
-from gnrecon.fit.parameters import CoarserFieldParameters, FreeSpaceParameters, LocalFieldParameters
+from gnrecon.fit.parameters import CoarserFieldParameters, LocalFieldParameters
 from gnrecon.fit.penalties.surface_penalties import SurfacePenalties
 from gnrecon.geometry.arrays import Float, Int
-from gnrecon.geometry.signed_distance import is_sign_certain, kd_tree_order, sample_near_surface, winding_number
-from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
@@ -53,10 +52,10 @@ def fit_detail(
     advance: ProgressCallback = ignore_progress,
     shape: PenaltiesFor | None = None,
     *,
-    solve_elsewhere: SolveDetail | None = None,
+    solve: SolveDetail | None = None,
     parameters: LocalFieldParameters = LocalFieldParameters(),
 ) -> Detail:
-    """Return the local fields that are added to a global field, with coarser ones where a clean scan has gaps.
+    """Return the local fields that are added to a global field, with coarser ones where `with_coarser` adds some.
 
     Parameters
     ----------
@@ -68,7 +67,7 @@ def fit_detail(
     device : a torch device
     advance : called with the share that is done
     shape : gives the curvature penalties for the length scale of the local fields
-    solve_elsewhere : solves them in other processes, where there are no penalties and no coarser fields
+    solve : solves them in other processes, where there are no penalties
     """
     _log.info(
         "Local fields: length scale %.3g radii, noise %.2g radii and %.2g radians; %d features each.",
@@ -79,24 +78,41 @@ def fit_detail(
     )
     advance = subrange(advance, parameters.selection_time_share, 1.0)
     penalties = None if shape is None else shape(hyperparameters.length)
-    if penalties is None and _needs_coarser(residuals, hyperparameters, rng.spawn(1)[0]):
-        coarser = _coarser(sdf, residuals, hyperparameters, rng.spawn(1)[0], device, parameters)
-        sdf, residuals = replace(sdf, detail=coarser), residuals.after(coarser)
+    if penalties is not None:
+        return _Cubes.of(sdf, residuals, hyperparameters, features, rng, device, penalties, parameters).detail(advance)
+    sdf, residuals = with_coarser(sdf, residuals, hyperparameters, rng, device, parameters=parameters)
     fitted = sdf, residuals, hyperparameters, features, rng, device
-    if solve_elsewhere is not None and penalties is None and sdf.detail is None:
-        return solve_elsewhere(*fitted, advance)
-    return _Cubes.of(*fitted, penalties, parameters).detail(advance)
+    return _Cubes.of(*fitted, None, parameters).detail(advance) if solve is None else solve(*fitted, advance)
 
 
-def _needs_coarser(
+def with_coarser(
+    sdf: NeuralSDF,
+    residuals: FieldResiduals,
+    hyperparameters: Hyperparameters,
+    rng: np.random.Generator,
+    device: str,
+    *,
+    parameters: LocalFieldParameters = LocalFieldParameters(),
+) -> tuple[NeuralSDF, FieldResiduals]:
+    """Return the global field with coarser local fields, where a clean scan needs them, and its residuals.
+
+    They bridge gaps. And they bring the field so near to the surface of a dense scan that its cubes reach it: where the
+    global field has its zero level beyond all of them, as between the legs of an animal, that stays as a wart.
+    """
+    for level in range(_coarser_levels(residuals, hyperparameters, rng.spawn(1)[0]), 0, -1):
+        coarser = _coarser(sdf, residuals, hyperparameters, level, rng.spawn(1)[0], device, parameters)
+        sdf, residuals = replace(sdf, detail=coarser), residuals.after(replace(coarser, coarser=None))
+    return sdf, residuals
+
+
+def _coarser_levels(
     residuals: FieldResiduals,
     hyperparameters: Hyperparameters,
     rng: np.random.Generator,
     *,
-    group: int = 64,
     parameters: CoarserFieldParameters = CoarserFieldParameters(),
-) -> bool:
-    """Return whether coarser corrections are to bridge gaps: places next to the data where no sign is certain.
+) -> int:
+    """Return how many levels of coarser corrections a scan needs, each of a longer length than the next.
 
     On a noisy scan they would add an error of their own, and noise hides the steps that they are to avoid.
 
@@ -104,34 +120,25 @@ def _needs_coarser(
     ----------
     residuals : at the points
     hyperparameters : of the scan
-    rng : draws the places
-    group : places whose winding number is summed together
+    rng : draws places in which gaps show
     """
-    length = hyperparameters.length
-    if len(residuals) < parameters.least_points or parameters.length_ratio * length > parameters.most_length_radii:
-        return False
+    length, ratio = hyperparameters.length, parameters.length_ratio
+    if len(residuals) < parameters.least_points or ratio * length > parameters.most_length_radii:
+        return 0
     if residuals.rms < parameters.least_rms_noises * hyperparameters.position:
-        return False
-    density, dipoles = residuals.density, residuals.dipoles
-    spread = parameters.gap_spread_lengths * length
-    x = sample_near_surface(residuals.points, spread, parameters.gap_samples, rng)
-    distance, nearest = density.tree.query(x)
-    clear = distance > FreeSpaceParameters.clearance_disk_radii * density.disks[nearest]
-    x, distance = x[clear], distance[clear]
-    order, found = kd_tree_order(x), 0
-    for rows in (order[some] for some in slices(len(x), group)):
-        lower, upper = x[rows].min(axis=0), x[rows].max(axis=0)
-        center = (lower + upper) / 2
-        places, moments, radii = dipoles.dipoles_for(center, float((upper - lower).max()) / 2)
-        winding = winding_number(x[rows] - center, places - center, moments, radii, dtype=torch.float32)
-        found += int((~is_sign_certain(dipoles.sides.centred(winding, distance[rows]))).sum())
-    return found >= parameters.least_gap_samples
+        return 0
+    misfit = float(np.quantile(np.abs(residuals.value), 1.0 - parameters.far_share))
+    if misfit > length:
+        most = math.floor(math.log(parameters.most_length_radii / length, ratio))
+        return min(math.ceil(math.log(misfit / length, ratio)), most)
+    return int(has_gaps(residuals.points, residuals.density, residuals.dipoles, length, rng))
 
 
 def _coarser(
     sdf: NeuralSDF,
     residuals: FieldResiduals,
     hyperparameters: Hyperparameters,
+    level: int,
     rng: np.random.Generator,
     device: str,
     limits: LocalFieldParameters,
@@ -140,15 +147,19 @@ def _coarser(
 ) -> Detail:
     """Return local fields of a longer length, fitted to a part of the points; parameters as those of `fit_detail`.
 
+    The first level is that of the least length.
+
     What they do not resolve is noise to them. The likeliest noise is chosen, but no less than the scan's.
     """
-    some = residuals.take(np.flatnonzero(rng.random(len(residuals)) < parameters.point_share))
-    length = parameters.length_ratio * hyperparameters.length
+    # As many points in a cube of each level.
+    share = parameters.point_share / parameters.length_ratio ** (2 * (level - 1))
+    some = residuals.take(np.flatnonzero(rng.random(len(residuals)) < share))
+    length = parameters.length_ratio**level * hyperparameters.length
     position, angle = patch_likelihood(some, some.density.radius, rng, device).likeliest(length)
     position, angle = max(position, hyperparameters.position), max(angle, hyperparameters.angle)
     chosen = Hyperparameters(length, position, angle, robust=hyperparameters.robust)
     found = _Cubes.of(sdf, some, chosen, parameters.features, rng, device, None, limits).detail(ignore_progress)
-    _log.info("The scan has gaps: coarser local fields of length scale %.3g radii bridge them.", length)
+    _log.info("Coarser local fields of length scale %.3g radii are fitted first.", length)
     return found
 
 

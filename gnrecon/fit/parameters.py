@@ -1,8 +1,7 @@
 """Tuning constants of the fit, one frozen dataclass for each method; `FitParameters` holds those of the default fit.
 
-A radius is that of the scan, which lies in the unit ball. A spacing is the median distance between neighbouring points,
-and a disk radius that of the disk that one point stands for. Values without a source were chosen on the benchmark
-shapes of docs/benchmarks.md.
+A radius is that of the scan, which lies in the unit ball. A spacing is the median distance between neighbours, and a
+disk radius that of the disk of one point. Values without a source were chosen on the shapes of docs/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -42,13 +41,14 @@ class LocalFieldParameters:
 
 @dataclass(frozen=True)
 class CoarserFieldParameters:
-    """Local fields of longer lengths, on which those of a clean scan with gaps are fitted (`fit.local_fields`)."""
+    """Local fields of longer lengths, on which those of a clean scan may be fitted (`fit.local_fields`)."""
 
     least_points: int = 500  # of the scan: between fewer, gaps are nothing special
     length_ratio: float = 3.0  # of their length scale and the scan's
     most_length_radii: float = 0.25  # of theirs: longer features are those of the global field
     least_rms_noises: float = 10.0  # that the global field is wrong by, over the noise: more noise hides steps
-    point_share: float = 1 / 3  # of the points, that they are fitted to
+    far_share: float = 0.01  # of the points, that may be a length of the scan's, or more, off the global field
+    point_share: float = 1 / 3  # of the points, that those of the least length are fitted to
     features: int = 300
     gap_samples: int = 10_000  # of space about the points
     gap_spread_lengths: float = 2.0  # standard deviation of their distance along each axis

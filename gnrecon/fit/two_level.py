@@ -248,7 +248,7 @@ class _Steps:
         fitted = (sdf, residuals, hyperparameters, options.features, rng, options.device, advance, penalties)
         # However many threads there are, so that the result does not depend on their number.
         by_processes = len(residuals) >= BlockParameters.process_points and options.device == "cpu"
-        return sdf, fit_detail(*fitted, solve_elsewhere=solve_by_blocks if by_processes else None, parameters=cubes)
+        return sdf, fit_detail(*fitted, solve=solve_by_blocks if by_processes else None, parameters=cubes)
 
     def _fit_global(self, completed: _Data, advance: ProgressCallback) -> GlobalField:
         """Return the global field that is fitted to completed data."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,11 +11,15 @@ import pytest
 import torch
 
 from gnrecon.field.cube_lattice import CubeLattice
+from gnrecon.field.networks import Siren
 from gnrecon.field.random_features import Features
+from gnrecon.fit import NeuralSDF, local_fields
 from gnrecon.fit.free_space import LatticeVolume, Volume
 from gnrecon.fit.global_field import FieldResiduals
 from gnrecon.fit.local_fields import solve_cube
 from gnrecon.fit.model_selection import Hyperparameters
+from gnrecon.geometry.point_cloud import Frame, Samples
+from gnrecon.geometry.signed_distance import Box
 
 Float = npt.NDArray[np.float64]
 NOISE = Hyperparameters(0.4, 0.01, 0.1, by_place=True)
@@ -82,3 +87,30 @@ def test_a_flat_global_field_gets_its_slope_where_the_prior_leaves_room_for_it(r
         slopes.append(float(np.mean(0.2 + side * along.numpy())))
     assert slopes[0] < 0.3
     assert slopes[1] == pytest.approx(1.0, abs=0.15)
+
+
+def test_corrections_reach_as_far_as_the_global_field_is_off(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    # A global field without any surface, and a dense scan of a ball, whose cubes are thinner than it is off.
+    points = rng.standard_normal((10_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    samples = Samples(points, points.copy(), Frame(np.zeros(3), 1.0))
+    field = Siren((8,))
+    theta = torch.zeros(field.layout.count, dtype=torch.float64)
+    theta[-1] = 0.08
+    sdf = NeuralSDF(field, theta, samples.frame, Box.around(points, 0.1))
+    inside = 0.95 * points[:2000]
+    right = []
+    for levels in (None, 0):
+        if levels is not None:
+            monkeypatch.setattr(local_fields, "_coarser_levels", lambda *_: 0)
+        belief = Hyperparameters(0.025, 1e-3, 0.05)
+        detail = local_fields.fit_detail(
+            sdf, FieldResiduals.of(sdf, samples), belief, 200, np.random.default_rng(0), "cpu"
+        )
+        whole = replace(sdf, detail=detail)
+        assert np.abs(whole.sdf(points)).mean() < 2e-4
+        right.append(float((whole.sdf(inside) < 0).mean()))
+    assert right[0] > 0.99
+    assert right[1] < 0.9

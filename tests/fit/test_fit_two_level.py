@@ -18,7 +18,7 @@ from gnrecon.fit import two_level as adaptive
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.blocks.solve import solve_by_blocks
 from gnrecon.fit.global_field import FieldResiduals
-from gnrecon.fit.model_selection import _smoothest, select_hyperparameters
+from gnrecon.fit.model_selection import Hyperparameters, _smoothest, select_hyperparameters
 from gnrecon.fit.parameters import ModelSelectionParameters, SurfaceLikelihoodParameters
 from gnrecon.geometry.point_cloud import Frame, Samples
 from gnrecon.runtime.errors import InputError
@@ -138,7 +138,7 @@ def test_a_gap_of_a_clean_scan_is_bridged_by_coarser_fields(monkeypatch: pytest.
     assert bridged.detail is not None
     assert bridged.detail.coarser is not None
     assert np.median(bridged.detail.coarser.lengths) > 2 * np.median(bridged.detail.lengths)
-    monkeypatch.setattr(local_fields, "_needs_coarser", lambda *_: False)
+    monkeypatch.setattr(local_fields, "_coarser_levels", lambda *_: 0)
     plain = fit(scan, FitOptions(quality="draft"))[0]
     x = FRAME.to_world(unseen.points)
     assert np.abs(bridged.sdf(x)).mean() < 0.8 * np.abs(plain.sdf(x)).mean()
@@ -153,6 +153,23 @@ def test_other_scans_get_no_coarser_fields(noise: float, gap: bool, rng: np.rand
     sdf, _ = fit(Samples(moved, scan.normals, FRAME), FitOptions(quality="draft"))
     assert sdf.detail is not None
     assert sdf.detail.coarser is None
+
+
+@pytest.mark.parametrize(
+    ("far", "noise", "levels"),
+    [(0.5, 1e-4, 0), (1.5, 1e-4, 1), (2.9, 1e-4, 1), (5.0, 1e-4, 2), (1e3, 1e-4, 2), (5.0, 0.02, 0)],
+)
+def test_fields_that_are_lengths_off_their_points_are_corrected_by_coarser_ones_first(
+    clean: tuple[Samples, NeuralSDF], far: float, noise: float, levels: int, rng: np.random.Generator
+) -> None:
+    samples, length = clean[0], 0.02
+    value = length * np.where(rng.random(len(samples)) < 0.02, far, 0.1)
+    residuals = FieldResiduals(samples.points, samples.normals, value, samples.normals)
+    belief = Hyperparameters(length, noise, 0.05)
+    # Those of the longest length are no longer than a quarter of the scan: 0.18.
+    assert local_fields._coarser_levels(residuals, belief, rng) == levels
+    one_far = replace(residuals, value=np.where(np.arange(len(value)), 0.1 * length, far * length))
+    assert local_fields._coarser_levels(one_far, belief, rng) == 0
 
 
 def test_processes_solve_the_local_fields_of_many_points(
@@ -174,13 +191,23 @@ def test_processes_solve_the_local_fields_of_many_points(
     np.testing.assert_array_equal(elsewhere.detail.keys, here.detail.keys)
     x = FRAME.to_world(samples.points)
     np.testing.assert_allclose(elsewhere.sdf(x), here.sdf(x), atol=1e-6)
-    # Neither fields under penalties nor those over coarser ones are solved so.
-    gap = with_gap(samples)[0]
-    monkeypatch.setattr(BlockParameters, "process_points", len(gap))
-    monkeypatch.setattr(local_fields, "_needs_coarser", lambda *_: True)
-    for options in (FitOptions(quality="draft"), FitOptions(quality="draft", smooth="strain=1e-4")):
-        assert fit(gap, options)[0].detail is not None
-    assert len(solved) == 1
+    assert fit(samples, FitOptions(quality="draft", smooth="strain=1e-4"))[0].detail is not None
+    assert len(solved) == 1  # those under penalties are solved here
+
+
+def test_processes_know_coarser_fields(clean: tuple[Samples, NeuralSDF], monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = with_gap(clean[0])[0]
+    monkeypatch.setattr(local_fields, "_coarser_levels", lambda *_: 2)
+    here, _ = fit(samples, FitOptions(quality="draft"))
+    monkeypatch.setattr(BlockParameters, "process_points", len(samples))
+    elsewhere, _ = fit(samples, FitOptions(quality="draft"))
+    assert here.detail is not None
+    assert elsewhere.detail is not None
+    lengths = [[float(np.median(level.lengths)) for level in sdf.detail.levels] for sdf in (here, elsewhere)]  # type: ignore[union-attr]
+    assert lengths[0] == lengths[1]
+    np.testing.assert_allclose(np.array(lengths[0])[1:] / lengths[0][0], [3.0, 9.0], rtol=0.2)
+    x = FRAME.to_world(samples.points + 0.02 * samples.normals)
+    np.testing.assert_allclose(elsewhere.sdf(x), here.sdf(x), atol=1e-5)
 
 
 def test_equal_seeds_give_equal_fields(clean: tuple[Samples, NeuralSDF]) -> None:
@@ -212,13 +239,18 @@ def test_a_field_with_coarser_detail_is_saved_and_read(clean: tuple[Samples, Neu
     features = Features(2 * detail.features.frequencies, 1 + detail.features.phases)
     changed = {"keys": detail.keys + 1, "lengths": 3 * detail.lengths, "amplitudes": 2 * detail.amplitudes}
     coarser = replace(detail, features=features, **changed)
-    two, path = replace(sdf, detail=replace(detail, coarser=coarser)), tmp_path / "two.gnr"
-    x = FRAME.to_world(samples.points + 0.01)
-    two.save(path)
-    again = NeuralSDF.load(path)
-    np.testing.assert_array_equal(again.sdf(x), two.sdf(x))
-    assert np.abs(two.sdf(x) - sdf.sdf(x)).max() > 1e-6
-    assert again.parameters == two.parameters == 2 * sdf.parameters - len(sdf.theta)
+    others = Features(3 * detail.features.frequencies, 2 + detail.features.phases)
+    changed = {"keys": detail.keys - 1, "lengths": 9 * detail.lengths, "amplitudes": 3 * detail.amplitudes}
+    coarsest = replace(detail, features=others, **changed)
+    two = replace(sdf, detail=replace(detail, coarser=coarser))
+    three = replace(sdf, detail=replace(detail, coarser=replace(coarser, coarser=coarsest)))
+    x, path = FRAME.to_world(samples.points + 0.01), tmp_path / "levels.gnr"
+    for levels, (one, fewer) in enumerate(((two, sdf), (three, two)), 2):
+        one.save(path, overwrite=True)
+        again = NeuralSDF.load(path)
+        np.testing.assert_array_equal(again.sdf(x), one.sdf(x))
+        assert np.abs(one.sdf(x) - fewer.sdf(x)).max() > 1e-6
+        assert again.parameters == one.parameters == levels * (sdf.parameters - len(sdf.theta)) + len(sdf.theta)
 
 
 def test_a_detail_that_does_not_fit_together_is_refused(clean: tuple[Samples, NeuralSDF], tmp_path: Path) -> None:

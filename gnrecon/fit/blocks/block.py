@@ -16,8 +16,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from gnrecon.field.cube_lattice import cube_groups
+from gnrecon.field.detail_tensors import detail_of
 from gnrecon.field.networks import Siren
-from gnrecon.field.partition_of_unity import Partition, neighbour_offsets
+from gnrecon.field.partition_of_unity import Detail, Partition, neighbour_offsets
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.store import Arrays, WorkFolder
 from gnrecon.fit.free_space import Surroundings
@@ -57,6 +58,7 @@ class BlockSolver:
     ends : array of shape (K + 1,), first cube of each block
     dipoles : of all points
     network, theta, box : the global field in unit coordinates
+    coarser : local fields that are added to it, if there are some
     partition, features, hyperparameters, device : as in `gnrecon.fit.local_fields`
     """
 
@@ -71,6 +73,7 @@ class BlockSolver:
     network: Siren
     theta: torch.Tensor
     box: Box
+    coarser: Detail | None
     partition: Partition
     features: Features
     hyperparameters: Hyperparameters
@@ -86,6 +89,8 @@ class BlockSolver:
         frequencies, phases, theta = (
             torch.tensor(np.array(array(name)), device=device) for name in ("frequencies", "phases", "theta")
         )
+        tensors = {name: torch.tensor(np.array(array(name)), device=device) for name in facts["coarser"]}
+        coarser = detail_of(work.folder, tensors)
         return cls(
             residuals=residuals,
             disks=array("disks"),
@@ -98,6 +103,8 @@ class BlockSolver:
             network=Siren(tuple(facts["widths"])),
             theta=theta,
             box=Box(*array("box")),
+            # Free space asks for no more than single precision.
+            coarser=None if coarser is None else coarser.to(torch.float32),
             partition=Partition(array("origin"), facts["cell"], facts["overlap"]),
             features=Features(frequencies, phases),
             hyperparameters=Hyperparameters(**facts["hyperparameters"]),
@@ -126,7 +133,7 @@ class BlockSolver:
         """Return the length and amplitudes of each cube of a group, or None where it holds too few points."""
         nearby = self._nearby_points(keys)
         tree = cKDTree(self.residuals.points[nearby])
-        around = Surroundings(self.box, tree, self.disks[nearby], self.dipoles, self.network, self.theta)
+        around = Surroundings(self.box, tree, self.disks[nearby], self.dipoles, self.network, self.theta, self.coarser)
         reach = self.partition.reach + LocalFieldParameters.data_margin_disk_radii * self.radius
         found = tree.query_ball_point(self.partition.center(keys), reach, p=np.inf)
         rows = [nearby[np.sort(np.array(some, dtype=np.int64))] for some in found]

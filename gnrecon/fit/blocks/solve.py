@@ -13,7 +13,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from gnrecon.field.detail_tensors import detail_tensors
 from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.block_parameters import BlockParameters
@@ -29,6 +30,7 @@ from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import FieldResiduals
+from gnrecon.fit.local_fields import with_coarser
 from gnrecon.fit.model_selection import Hyperparameters, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -76,6 +78,7 @@ def fit_large(
     hyperparameters = select_hyperparameters(residuals, held, residuals.density.radius, rng, options.device)
     chosen = LocalFieldParameters.selection_time_share
     advance(chosen)
+    sdf, residuals = with_coarser(sdf, residuals, hyperparameters, rng, options.device)
     field = sdf, residuals, hyperparameters, options.features, rng, options.device, subrange(advance, chosen, 1.0)
     return solve_by_blocks(*field, options.seed, folder, scheduler, block_points)
 
@@ -97,7 +100,8 @@ def solve_by_blocks(
 
     Parameters
     ----------
-    sdf, residuals, hyperparameters : the global field, its residuals at the samples, and their length and noise
+    sdf, residuals, hyperparameters : the global field, with coarser local ones if it has some, its residuals at the
+        samples, and their length and noise
     features : of each cube
     seed : of the fit, which the work folder notes
     rng, device, advance, folder, scheduler, block_points : as in `fit_large`, which says what it raises, too
@@ -117,7 +121,7 @@ def solve_by_blocks(
         else:
             # As many processes as threads: the option, or by default the cores.
             solve_blocks(work, missing, worker_count(), device, advance)
-        return _assembled(work, count, arrays["keys"], partition, drawn, hyperparameters)
+        return replace(_assembled(work, count, arrays["keys"], partition, drawn, hyperparameters), coarser=sdf.detail)
 
 
 @contextmanager
@@ -147,6 +151,7 @@ def _task_data(
         _occupied_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points
     )
     dipoles = DipoleTree.of(residuals.points, *scene_dipoles(residuals.points, residuals.normals, density.disks))
+    coarser = {} if sdf.detail is None else {name: part.numpy() for name, part in detail_tensors(sdf.detail).items()}
     arrays = {
         "points": residuals.points[order],
         "normals": residuals.normals[order],
@@ -164,6 +169,7 @@ def _task_data(
         "phases": features.phases.cpu().numpy(),
         **({} if residuals.deviations is None else {"deviations": residuals.deviations[order]}),
         **dipoles.arrays(),
+        **coarser,
     }
     facts = {
         "widths": list(sdf.field.widths),
@@ -174,6 +180,7 @@ def _task_data(
         "radius": density.radius,
         "hyperparameters": asdict(hyperparameters),
         "deviations": residuals.deviations is not None,
+        "coarser": list(coarser),
     }
     return arrays, facts
 
