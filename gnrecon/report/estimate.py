@@ -4,8 +4,8 @@ Processor seconds, fitted to runs with one thread of scans of 500 to 100,000 poi
 organic shapes and range scans, in three qualities and at three resolutions:
 
     start  2.5 s, and 1 s for each 40,000 points that are read
-    fit    7 s (points / 500)^0.33 (0.4 for the network, except in draft quality, + 0.51 + 0.09 (features / 600)^2)
-    mesh   6.5 s (cells / 256)^2.9 (0.7 + 0.3 features / 600)
+    fit    7 s (points / 500)^0.33 (0.4 for the network, except in draft quality, + 0.51 + 0.09 (features / 300)^2)
+    mesh   6.5 s (cells / 256)^2.9 (0.7 + 0.3 features / 300)
 
 A resolution of the user's own is taken as it is, while noise may lower the usual one: so the power is above two. Two
 idle cores take 0.7 of the sum. Nine of ten runs were within a factor of 1.8 of what is expected on one machine: smooth

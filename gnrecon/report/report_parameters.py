@@ -21,7 +21,7 @@ class CostModel:
     mesh_seconds: float = 6.5  # measured: mesh of `mesh_cells` with `detail_features`
     mesh_cells: int = 256  # the usual resolution of 10,000 points and more
     mesh_exponent: float = 2.9  # slope of log time over log cells, where noise may lower the usual resolution
-    detail_features: int = 600  # features per cube with --quality normal
+    detail_features: int = 300  # features per cube with --quality normal
     two_core_share: float = 0.7  # share of the processor seconds that pass on two idle cores; more cores help little
     fit_memory_mb: float = 550.0  # measured: fits of a few hundred points, with two threads
     dense_fit_memory_mb: float = 350.0  # measured: what a fit of `dense_fit_points` or more takes more, at most
