@@ -145,9 +145,7 @@ def _coarser(
     *,
     parameters: CoarserFieldParameters = CoarserFieldParameters(),
 ) -> Detail:
-    """Return local fields of a longer length, fitted to a part of the points; parameters as those of `fit_detail`.
-
-    The first level is that of the least length.
+    """Return local fields of a longer length, which grows with the level, fitted to a part of the points.
 
     What they do not resolve is noise to them. The likeliest noise is chosen, but no less than the scan's.
     """
@@ -180,6 +178,31 @@ def cube_length(
     most_length_stretch : most that a cube's length scale may exceed the scan's
     """
     return hyperparameters.length * min(max(float(np.median(disks) / radius), 1.0), most_length_stretch)
+
+
+def feature_count(
+    features: int,
+    length: float,
+    radius: float,
+    *,
+    usual_length_radii: float = 2.0,
+    parameters: LocalFieldParameters = LocalFieldParameters(),
+) -> int:
+    """Return the number of features of each cube, which fill the space of its data as densely for short lengths.
+
+    Parameters
+    ----------
+    features : of a cube of the usual length
+    length : of the features
+    radius : median of the disks' radii; a cube's data reaches some of these beyond it, which are more short lengths
+    usual_length_radii : in these radii, at which and above there are as many features as that
+    """
+
+    def width(lengths_per_radius: float) -> float:
+        inner = (1.0 + Partition.overlap) * parameters.cube_edge_lengths
+        return inner + 2 * parameters.data_margin_disk_radii * lengths_per_radius
+
+    return math.ceil(features * max(1.0, width(radius / length) / width(1.0 / usual_length_radii)) ** 3)
 
 
 def solve_group(
@@ -326,7 +349,9 @@ class _Cubes:
         """Return the cubes of a length scale, each with `count` features."""
         like = torch.zeros(0, dtype=torch.float64, device=device)
         edge = parameters.cube_edge_lengths
-        if penalties is not None:
+        if penalties is None:
+            count = feature_count(count, hyperparameters.length, residuals.density.radius, parameters=parameters)
+        else:
             edge, count = parameters.penalised_edge_lengths, parameters.penalised_feature_ratio * count
         cell = edge * hyperparameters.length
         # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.

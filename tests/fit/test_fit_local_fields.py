@@ -114,3 +114,10 @@ def test_corrections_reach_as_far_as_the_global_field_is_off(
         right.append(float((whole.sdf(inside) < 0).mean()))
     assert right[0] > 0.99
     assert right[1] < 0.9
+
+
+def test_short_lengths_have_more_features_and_long_ones_no_fewer() -> None:
+    counts = [local_fields.feature_count(300, length, 0.1) for length in (0.1, 0.14, 0.2, 0.8)]
+    assert counts[0] > counts[1] > counts[2] == counts[3] == 300
+    # Data reaches two disks beyond a cube of 4.55 lengths: 7.4 lengths of 1.4 disks, and 6.55 of two.
+    assert counts[1] == pytest.approx(300 * (7.407 / 6.55) ** 3, abs=1)

@@ -30,7 +30,7 @@ from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import FieldResiduals
-from gnrecon.fit.local_fields import with_coarser
+from gnrecon.fit.local_fields import feature_count, with_coarser
 from gnrecon.fit.model_selection import Hyperparameters, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
@@ -106,22 +106,23 @@ def solve_by_blocks(
     seed : of the fit, which the work folder notes
     rng, device, advance, folder, scheduler, block_points : as in `fit_large`, which says what it raises, too
     """
-    drawn = Features.draw(features, rng, torch.zeros(0, dtype=torch.float64, device=device))
+    count = feature_count(features, hyperparameters.length, residuals.density.radius)
+    drawn = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
     # Offset by a part of a cell that no regular scan shares, as in `gnrecon.fit.local_fields`.
     cell = LocalFieldParameters.cube_edge_lengths * hyperparameters.length
     partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
     arrays, facts = _task_data(sdf, residuals, hyperparameters, drawn, partition, block_points)
     with _work_folder(folder) as path:
         work = WorkFolder.open(path, arrays, facts | {"seed": seed})
-        count = len(arrays["ends"]) - 1
+        blocks = len(arrays["ends"]) - 1
         # A resumed fit finds the blocks of earlier runs.
-        missing = [number for number in range(count) if not work.is_solved(number)]
+        missing = [number for number in range(blocks) if not work.is_solved(number)]
         if scheduler is not None and missing:
             solve_on_cluster(work, missing, scheduler, advance)
         else:
             # As many processes as threads: the option, or by default the cores.
             solve_blocks(work, missing, worker_count(), device, advance)
-        return replace(_assembled(work, count, arrays["keys"], partition, drawn, hyperparameters), coarser=sdf.detail)
+        return replace(_assembled(work, blocks, arrays["keys"], partition, drawn, hyperparameters), coarser=sdf.detail)
 
 
 @contextmanager
