@@ -26,7 +26,7 @@ from gnrecon.version import __version__
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
-FORMAT = "gnrecon-work-1"
+FORMAT = "gnrecon-work-2"
 """Of the manifest; a change of the arrays or their meaning needs another."""
 
 
