@@ -68,9 +68,14 @@ class NodeGrid:
         return math.floor(self.partition.overlap / 2 * self.count + 0.5)
 
     @property
+    def edge(self) -> int:
+        """Nodes along each edge of a cube."""
+        return self.count + 2 * self.beyond
+
+    @property
     def blocks(self) -> int:
         """Blocks along each edge of a cube."""
-        return -(-(self.count + 2 * self.beyond) // self.block)
+        return -(-self.edge // self.block)
 
     def first(self, keys: Int) -> Int:
         """Return the first node of cubes, of shape (B, 3), in nodes from the partition's origin."""
@@ -94,8 +99,8 @@ class NodeGrid:
     @cached_property
     def inside(self) -> Mask:
         """Which nodes of the blocks are in the cube, block by block."""
-        edge = np.arange(self.blocks * self.block) < self.count + 2 * self.beyond
-        return self.by_blocks(edge[:, None, None] & edge[:, None] & edge)
+        along = np.arange(self.blocks * self.block) < self.edge
+        return self.by_blocks(along[:, None, None] & along[:, None] & along)
 
     def by_blocks(self, values: npt.NDArray[Value]) -> npt.NDArray[Value]:
         """Return values at a cube's nodes, of shape (blocks * block,) * 3, in the order of the blocks, flat."""

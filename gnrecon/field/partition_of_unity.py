@@ -54,6 +54,14 @@ class Partition:
     cell: float
     overlap: float = 0.3
 
+    @classmethod
+    def about(cls, x: Float, cell: float) -> Partition:
+        """Return the cubes about points, of shape (N, 3): all of their keys are at least -1.
+
+        The lattice is off the points by a part of a cell that no regular scan shares, so that no face runs along them.
+        """
+        return cls(x.min(axis=0) - 0.137 * cell, cell)
+
     @property
     def reach(self) -> float:
         """Half the edge of a widened cube."""

@@ -250,7 +250,7 @@ class GroupSpace:
     def _needed(self) -> Mask:
         """Which nodes are in a cube, and in the box where the field is fitted."""
         needed = np.zeros([size for _, size in self._extent], dtype=bool)
-        edge = self.grid.count + 2 * self.grid.beyond
+        edge = self.grid.edge
         for x, y, z in self.grid.first(self.keys) - self._first:
             needed[x : x + edge, y : y + edge, z : z + edge] = True
         box = self.around.box

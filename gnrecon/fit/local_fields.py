@@ -353,9 +353,7 @@ class _Cubes:
             count = feature_count(count, hyperparameters.length, residuals.density.radius, parameters=parameters)
         else:
             edge, count = parameters.penalised_edge_lengths, parameters.penalised_feature_ratio * count
-        cell = edge * hyperparameters.length
-        # Off the data by a part of a cell that no regular scan shares, so that no face of the lattice runs along it.
-        partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
+        partition = Partition.about(residuals.points, edge * hyperparameters.length)
         features = Features.draw(count, rng, like)
         # Free space asks for no more than single precision.
         coarser = None if sdf.detail is None else sdf.detail.to(torch.float32)

@@ -91,3 +91,12 @@ def test_no_points_have_no_members(partition: Partition) -> None:
     keys, members = partition.members(np.zeros((0, 3)))
     assert keys.shape == (0, 3)
     assert members == []
+
+
+def test_cubes_about_points_have_keys_from_minus_one_on_and_no_face_through_a_grid(rng: np.random.Generator) -> None:
+    steps = np.stack(np.meshgrid(*3 * [np.arange(-3, 4)], indexing="ij"), axis=-1).reshape(-1, 3)
+    for points, cell in ((0.5 * steps, 0.5), (rng.uniform(2.0, 3.0, (300, 3)), 0.2)):
+        keys, _ = Partition.about(points, cell).members(points)
+        assert keys.min() >= -1
+    inside = (0.5 * steps - Partition.about(0.5 * steps, 0.5).origin) / 0.5 % 1.0
+    assert np.minimum(inside, 1.0 - inside).min() > 0.1

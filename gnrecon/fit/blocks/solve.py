@@ -34,9 +34,8 @@ from gnrecon.fit.local_fields import feature_count, with_coarser
 from gnrecon.fit.model_selection import Hyperparameters, select_hyperparameters
 from gnrecon.fit.parameters import LocalFieldParameters
 from gnrecon.geometry.arrays import Float, Int, Mask
-from gnrecon.geometry.octree import DipoleTree, morton_codes, octree_blocks
+from gnrecon.geometry.octree import morton_codes, octree_blocks
 from gnrecon.geometry.point_cloud import Samples
-from gnrecon.geometry.signed_distance import scene_dipoles
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import worker_count
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
@@ -108,9 +107,7 @@ def solve_by_blocks(
     """
     count = feature_count(features, hyperparameters.length, residuals.density.radius)
     drawn = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
-    # Offset by a part of a cell that no regular scan shares, as in `gnrecon.fit.local_fields`.
-    cell = LocalFieldParameters.cube_edge_lengths * hyperparameters.length
-    partition = Partition(residuals.points.min(axis=0) - 0.137 * cell, cell)
+    partition = Partition.about(residuals.points, LocalFieldParameters.cube_edge_lengths * hyperparameters.length)
     arrays, facts = _task_data(sdf, residuals, hyperparameters, drawn, partition, block_points)
     with _work_folder(folder) as path:
         work = WorkFolder.open(path, arrays, facts | {"seed": seed})
@@ -151,7 +148,7 @@ def _task_data(
     keys, ends = _divided(
         _occupied_cubes(partition, residuals.points), cells, np.append(first, len(codes)), block_points
     )
-    dipoles = DipoleTree.of(residuals.points, *scene_dipoles(residuals.points, residuals.normals, density.disks))
+    dipoles = residuals.dipoles
     coarser = {} if sdf.detail is None else {name: part.numpy() for name, part in detail_tensors(sdf.detail).items()}
     arrays = {
         "points": residuals.points[order],
