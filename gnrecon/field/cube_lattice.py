@@ -86,6 +86,22 @@ class NodeGrid:
         places: Float = self.partition.origin + self.step * (nodes + 0.5)
         return places
 
+    def in_blocks(self, nodes: Int, stride: int) -> tuple[Float, Float, Int, Int]:
+        """Return the blocks that hold some of every `stride` nodes, of shape (Q, 3).
+
+        Returns
+        -------
+        centers, offsets : arrays of shape (C, 3) and (K, 3), of the blocks, and of their nodes from these
+        block, inner : arrays of shape (Q,), the rows of these that each node has
+        """
+        edge, every = self.block * stride, np.arange(self.block)
+        blocks = nodes // edge
+        _, rows, of = np.unique(_codes(blocks), return_index=True, return_inverse=True)
+        middle = stride * (self.block - 1) / 2
+        offsets = np.stack(np.meshgrid(*3 * [stride * every - middle], indexing="ij"), axis=-1).reshape(-1, 3)
+        inner = np.ravel_multi_index(tuple((nodes % edge // stride).T), 3 * (self.block,))
+        return self.places(edge * blocks[rows] + middle), self.step * offsets, of, inner
+
     @cached_property
     def lattice(self) -> CubeLattice:
         """The nodes of a cube."""
@@ -117,6 +133,12 @@ def equal_rows(values: Int) -> list[Int]:
     """Return the rows of an array of shape (B, 3) that are equal, for each different row in their order."""
     if not len(values):
         return []
-    codes = np.ravel_multi_index(tuple((values - values.min(axis=0)).T), tuple(np.ptp(values, axis=0) + 1))
+    codes = _codes(values)
     order = np.argsort(codes, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+
+
+def _codes(values: Int) -> Int:
+    """Return a number for each row of an array of shape (B, 3), in the rows' order."""
+    codes: Int = np.ravel_multi_index(tuple((values - values.min(axis=0)).T), tuple(np.ptp(values, axis=0) + 1))
+    return codes

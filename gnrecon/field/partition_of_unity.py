@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gnrecon.field.field_parameters import FieldParameters
-from gnrecon.field.random_features import Features
+from gnrecon.field.random_features import Features, Stencil
 from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.runtime.chunks import slices
 from gnrecon.runtime.parallel import map_in_threads
@@ -303,13 +303,14 @@ class Detail:
         by_cube = np.flatnonzero(cubes >= 0)
         by_cube = by_cube[np.argsort(cubes[by_cube], kind="stable")]
         rows, cubes = rows[by_cube], cubes[by_cube]
-        values = np.zeros((len(x), len(offsets)))
+        values, stencils = np.zeros((len(x), len(offsets))), dict[float, Stencil]()
         for some in np.split(np.arange(len(cubes)), np.flatnonzero(np.diff(cubes)) + 1) if len(cubes) else []:
             cube, near = cubes[some[0]], rows[some]
             center, length = self.partition.center(self.keys[cube]), float(self.lengths[cube])
-            stencil = self.features.stencil(offsets / length)
+            if length not in stencils:
+                stencils[length] = self.features.stencil(offsets / length)
             phase = self.features.phase(torch.as_tensor(x[near]), torch.as_tensor(center), length)
-            own = stencil.sums(phase, self.amplitudes[cube]).double().cpu().numpy()
+            own = stencils[length].sums(phase, self.amplitudes[cube]).double().cpu().numpy()
             points = torch.as_tensor((x[near][:, None] + offsets).reshape(-1, 3))
             weight = next(self.partition.weight(points, torch.as_tensor(center), 0)).numpy()
             # A centre is paired with a cube once, so no row occurs twice.

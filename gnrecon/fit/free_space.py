@@ -148,11 +148,14 @@ class Surroundings:
     signed_by: Callable[[Float, Float], Float] | None = None
     parameters: FreeSpaceParameters = FreeSpaceParameters()
 
-    def value(self, x: Float) -> Float:
-        """Return the field at places, of shape (Q, 3), in single precision: bounds are wide."""
+    def value(self, grid: NodeGrid, nodes: Int, stride: int) -> Float:
+        """Return the field at some of every `stride` nodes, of shape (Q, 3), in single precision: bounds are wide."""
         theta = self.theta.float()
-        value: Float = self.network.value(theta, torch.as_tensor(x).to(theta)).double().cpu().numpy()
-        return value if self.coarser is None else value + self.coarser.value(x)
+        value: Float = self.network.value(theta, torch.as_tensor(grid.places(nodes)).to(theta)).double().cpu().numpy()
+        if self.coarser is None or not len(nodes):
+            return value
+        center, offsets, block, inner = grid.in_blocks(nodes, stride)
+        return value + self.coarser.value_around(center, offsets)[block, inner]
 
     def clear(self, x: Float, disks: float, gap: float, most: float) -> tuple[Int, Float, Float]:
         """Return rows of places, of shape (Q, 3), that are clear of the data, their distances, and the data's disks.
@@ -214,7 +217,8 @@ class GroupSpace:
         every = np.ix_(*((first + np.arange(size)) % limits.far_stride == 0 for first, size in self._extent))
         some = np.zeros_like(self._needed)
         some[every] = self._needed[every]
-        return self._nodes(some, limits.clearance_disk_radii, 0.0, np.inf, limits.sign_bound_share)
+        bounds = limits.clearance_disk_radii, 0.0, np.inf, limits.sign_bound_share
+        return self._nodes(some, *bounds, stride=limits.far_stride)
 
     @cached_property
     def near(self) -> _Nodes:
@@ -261,11 +265,18 @@ class GroupSpace:
         return needed
 
     def _nodes(
-        self, some: Mask, disks: float, gap: float, most: float, bound_share: float, certain: bool = False
+        self,
+        some: Mask,
+        disks: float,
+        gap: float,
+        most: float,
+        bound_share: float,
+        certain: bool = False,
+        stride: int = 1,
     ) -> _Nodes:
-        """Return what is known at some of the nodes, those that are clear of the data, and of a certain sign if asked.
+        """Return what is known at some of every `stride` nodes, those that are clear of the data.
 
-        For `disks`, `gap` and `most` see `Surroundings.clear`.
+        For `disks`, `gap` and `most` see `Surroundings.clear`; `certain` asks for those of a certain sign.
         """
         nodes = np.argwhere(some)
         x = self.grid.places(nodes + self._first)
@@ -282,7 +293,7 @@ class GroupSpace:
             signed = self.around.signed_by(x, signed)
         rows = np.full(some.shape, -1, dtype=np.int32)
         rows[tuple(nodes.T)] = np.arange(len(nodes))
-        own, limits = self.around.value(x), self.around.parameters
+        own, limits = self.around.value(self.grid, nodes + self._first, stride), self.around.parameters
         return _Nodes(rows, Volume.around(x, own, signed, winding, distance, bound_share, parameters=limits))
 
     def _winding(self, nodes: Int, x: Float, distance: Float, *, part_cells: int = 2) -> Float:

@@ -52,6 +52,16 @@ def test_values_at_nodes_are_in_the_order_of_the_blocks() -> None:
         np.testing.assert_allclose(grid.by_blocks(grid.places(nodes)[..., axis]), expected[:, axis], atol=1e-12)
 
 
+@pytest.mark.parametrize("stride", [1, 2])
+def test_nodes_are_found_in_their_blocks(stride: int, rng: np.random.Generator) -> None:
+    grid = NodeGrid.of(CELLS, 0.1)
+    nodes = stride * rng.integers(-20, 20, (100, 3))
+    centers, offsets, block, inner = grid.in_blocks(nodes, stride)
+    assert offsets.shape == (grid.block**3, 3)
+    assert len(centers) == len({tuple(node) for node in (nodes // (grid.block * stride)).tolist()})
+    np.testing.assert_allclose(centers[block] + offsets[inner], grid.places(nodes), atol=1e-12)
+
+
 def test_groups_are_boxes_of_cells() -> None:
     keys = np.array([[-1, -1, -1], [2, 2, 2], [3, 2, 2], [0, 0, 0], [-1, 3, 0], [6, 2, 2]])
     groups = cube_groups(keys, 4)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gnrecon.field.partition_of_unity import Partition
+from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.free_space import CubeSpace, GroupSpace, Surroundings
 from gnrecon.fit.parameters import FreeSpaceParameters
@@ -120,6 +120,20 @@ def test_a_cube_of_a_group_has_the_samples_that_it_has_alone(around: Surrounding
             np.testing.assert_array_equal(found.points, other.points)
             np.testing.assert_allclose(found.lower, other.lower, rtol=0.05)
             np.testing.assert_allclose(found.upper, other.upper, rtol=0.05)
+
+
+def test_the_field_at_the_nodes_has_its_coarser_part(around: Surroundings, rng: np.random.Generator) -> None:
+    features = Features.draw(40, rng, torch.zeros(0, dtype=torch.float64))
+    cells = Partition(CENTER - 1.0, 0.9)
+    keys, _ = cells.members(CENTER + 0.6 * rng.uniform(-1, 1, (200, 3)))
+    lengths = np.where(keys[:, 0] > 0, 0.3, 0.2)
+    coarser = Detail(cells, keys, lengths, features, 0.1 * torch.as_tensor(rng.standard_normal((len(keys), 40))), 0, 0)
+    plain, corrected = (space_of(each) for each in (around, replace(around, coarser=coarser)))
+    for one, other in ((plain.far(), corrected.far()), (plain.near(LENGTH).volume, corrected.near(LENGTH).volume)):
+        np.testing.assert_array_equal(one.points, other.points)
+        # The zero level is where the correction cancels the field.
+        np.testing.assert_allclose(other.zero - one.zero, -coarser.value(one.points), atol=1e-9)
+        assert np.abs(other.zero).max() > 0.05
 
 
 def test_sums_at_the_nodes_are_those_of_the_features(space: CubeSpace, rng: np.random.Generator) -> None:
