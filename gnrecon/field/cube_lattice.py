@@ -100,7 +100,7 @@ class NodeGrid:
         middle = stride * (self.block - 1) / 2
         offsets = np.stack(np.meshgrid(*3 * [stride * every - middle], indexing="ij"), axis=-1).reshape(-1, 3)
         inner = np.ravel_multi_index(tuple((nodes % edge // stride).T), 3 * (self.block,))
-        return self.places(edge * blocks[rows] + middle), self.step * offsets, of, inner
+        return self.places(edge * blocks[rows]) + self.step * middle, self.step * offsets, of, inner
 
     @cached_property
     def lattice(self) -> CubeLattice:

@@ -14,7 +14,9 @@ sums of sine features whose output weights solve linear least-squares problems. 
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ import numpy as np
 from gnrecon.field.partition_of_unity import Detail
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.blocks.solve import fit_large, solve_by_blocks
+from gnrecon.fit.blocks.workers import Workers, workers_for
 from gnrecon.fit.consistency import find_outliers, flip_contradicted_normals
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
@@ -82,21 +85,25 @@ def fit_two_level(
             f"smooth, fill and prior are for fits of fewer than {BlockParameters.large_scan_points} points without a "
             "work folder; thin the scan with --max-points."
         )
-    steps = _Steps(options, by_blocks, rng, parameters, callback)
-    share = parameters.two_level.global_time_share
-    ball = steps.detect_ball(samples)
-    data, flipped_share = steps.prepare(samples if ball is None else ball.samples)
-    data, first, outliers = steps.fit_global(data, subrange(advance, 0.0, share))
-    if first.solution.interrupted:
-        status = f"{first.solution.status} This is the smooth global field alone."
-        return first.sdf, replace(first.solution, status=status)
-    sdf, penalties = steps.apply_penalties(first, data)
-    try:
-        rest = subrange(advance, share, 1.0)
-        sdf, detail = steps.fit_local(first, sdf, data, penalties, outliers > 0, rest, folder, scheduler)
-    except KeyboardInterrupt:
-        status = "Interrupted before the local fields were solved: this is the smooth global field alone."
-        return sdf, replace(first.solution, status=status, interrupted=True)
+    # By the number of points alone, so that the result does not depend on the number of threads.
+    by_processes = by_blocks or len(samples) >= BlockParameters.process_points
+    starting = by_processes and scheduler is None and not options.regularisers
+    with workers_for(options.device) if starting else nullcontext() as workers:
+        steps = _Steps(options, by_blocks, by_processes, rng, parameters, callback)
+        share = parameters.two_level.global_time_share
+        ball = steps.detect_ball(samples)
+        data, flipped_share = steps.prepare(samples if ball is None else ball.samples)
+        data, first, outliers = steps.fit_global(data, subrange(advance, 0.0, share))
+        if first.solution.interrupted:
+            status = f"{first.solution.status} This is the smooth global field alone."
+            return first.sdf, replace(first.solution, status=status)
+        sdf, penalties = steps.apply_penalties(first, data)
+        try:
+            rest = subrange(advance, share, 1.0)
+            sdf, detail = steps.fit_local(first, sdf, data, penalties, outliers > 0, rest, folder, scheduler, workers)
+        except KeyboardInterrupt:
+            status = "Interrupted before the local fields were solved: this is the smooth global field alone."
+            return sdf, replace(first.solution, status=status, interrupted=True)
     summary = replace(
         _summary(detail, data, options),
         flipped_share=flipped_share,
@@ -163,6 +170,7 @@ class _Steps:
 
     options: FitOptions
     by_blocks: bool
+    by_processes: bool
     rng: np.random.Generator
     parameters: FitParameters
     callback: Callback | None = None
@@ -228,11 +236,12 @@ class _Steps:
         advance: ProgressCallback,
         folder: str | Path | None,
         scheduler: str | None,
+        workers: Workers | None,
     ) -> tuple[NeuralSDF, Detail]:
         """Return the global field and the local ones."""
         options, rng = self.options, self.rng
         if self.by_blocks:
-            return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler)
+            return sdf, fit_large(sdf, data.samples, data.held_out, options, rng, folder, advance, scheduler, workers)
         residuals = FieldResiduals.of(sdf, data.samples)
         if data.sharp is not None:
             hyperparameters = data.sharp.hyperparameters
@@ -246,9 +255,9 @@ class _Steps:
         cubes = self.parameters.local_fields
         advance(cubes.selection_time_share)
         fitted = (sdf, residuals, hyperparameters, options.features, rng, options.device, advance, penalties)
-        # However many threads there are, so that the result does not depend on their number.
-        by_processes = len(residuals) >= BlockParameters.process_points and options.device == "cpu"
-        return sdf, fit_detail(*fitted, solve=solve_by_blocks if by_processes else None, parameters=cubes)
+        by_processes = self.by_processes and options.device == "cpu"
+        solve = partial(solve_by_blocks, workers=workers) if by_processes else None
+        return sdf, fit_detail(*fitted, solve=solve, parameters=cubes)
 
     def _fit_global(self, completed: _Data, advance: ProgressCallback) -> GlobalField:
         """Return the global field that is fitted to completed data."""

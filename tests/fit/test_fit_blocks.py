@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import threadpoolctl
 import torch
@@ -71,12 +73,13 @@ def fitted(
     scheduler: str | None = None,
     advance: ProgressCallback = ignore_progress,
     samples: Samples | None = None,
+    with_workers: workers.Workers | None = None,
 ) -> tuple[NeuralSDF, Detail]:
     samples = samples or ellipsoid()
     sdf, rng = constant_field(samples), np.random.default_rng(0)
     held = np.arange(COUNT) % 6 == 0
-    options = FitOptions(quality="draft")
-    return sdf, large.fit_large(sdf, samples, held, options, rng, folder, advance, scheduler, block_points)
+    data = sdf, samples, held, FitOptions(quality="draft"), rng
+    return sdf, large.fit_large(*data, folder, advance, scheduler, with_workers, block_points)
 
 
 @pytest.fixture(autouse=True)
@@ -110,8 +113,8 @@ def same(one: Detail, other: Detail) -> bool:
 
 
 def test_neither_blocks_nor_processes_change_a_digit(whole: Detail, tmp_path: Path) -> None:
-    with threads(2):
-        _, parts = fitted(tmp_path, block_points=150)
+    with workers.started_workers(3) as several:
+        _, parts = fitted(tmp_path, block_points=150, with_workers=several)
     blocks = len(WorkFolder(tmp_path).array("ends")) - 1
     assert blocks > 8
     assert same(whole, parts)
@@ -290,7 +293,7 @@ def test_another_runs_folder_is_refused(tmp_path: Path) -> None:
     [
         ("exit 3", FitError, "ended with status 3"),
         ("kill -9 $$", MemoryLimitError, "killed by signal 9"),
-        ("echo InputError: lost", FitError, "could not be solved: InputError: lost"),
+        ("echo InputError: lost > /proc/self/fd/${3#*,}", FitError, "could not be solved: InputError: lost"),
     ],
 )
 def test_a_process_that_fails_ends_the_fit(
@@ -300,9 +303,50 @@ def test_a_process_that_fails_ends_the_fit(
     program.write_text(f"#!/bin/sh\n{words}\n")
     program.chmod(0o755)
     monkeypatch.setattr(workers.sys, "executable", str(program))
-    monkeypatch.setattr(workers, "_affordable_processes", lambda: 2)
-    with pytest.raises(error, match=sentence):
-        workers.solve_blocks(WorkFolder(tmp_path), [0, 1, 2], 2, "cpu", ignore_progress)
+    with workers.started_workers(2) as started, pytest.raises(error, match=sentence):
+        workers.solve_blocks(WorkFolder(tmp_path), [0, 1, 2], started, "cpu", ignore_progress)
+
+
+def test_a_forked_process_that_dies_ends_the_fit(tmp_path: Path) -> None:
+    with workers.started_workers(3) as started:
+        children = forked(started)
+        assert len(children) == 2
+        children[1].kill()
+        assert started.first.wait(20) == -signal.SIGKILL
+        with pytest.raises(MemoryLimitError, match="killed by signal 9"):
+            workers.solve_blocks(WorkFolder(tmp_path), [0, 1, 2], started, "cpu", ignore_progress)
+        assert not psutil.pid_exists(children[0].pid)
+
+
+def test_forked_processes_answer_errors_and_end_with_the_first_one(tmp_path: Path) -> None:
+    with workers.started_workers(2) as started:
+        children = forked(started)
+        for requests, answers in started.pipes:
+            requests.write(json.dumps([str(tmp_path), 0]).encode() + b"\n")
+            assert answers.readline().startswith("InputError: ")
+    assert started.first.poll() is not None
+    assert not psutil.pid_exists(children[0].pid)
+
+
+def forked(started: workers.Workers) -> list[psutil.Process]:
+    """The processes that the first one has forked, once they are there."""
+    first = psutil.Process(started.first.pid)
+    while len(children := first.children()) < len(started.pipes) - 1:
+        assert started.first.poll() is None
+        time.sleep(0.02)
+    return children
+
+
+@pytest.mark.parametrize(
+    ("count", "free", "device", "expected"),
+    [(2, 9, "cpu", 2), (3, 2, "cpu", 2), (1, 9, "cpu", 0), (4, 1, "cpu", 0), (4, 9, "cuda", 0)],
+)
+def test_there_are_as_many_workers_as_threads(
+    count: int, free: int, device: str, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "_affordable_processes", lambda: free)
+    with threads(count), workers.workers_for(device) as started:
+        assert (0 if started is None else len(started.pipes)) == expected
 
 
 def test_a_worker_computes_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -178,9 +178,9 @@ def test_processes_solve_the_local_fields_of_many_points(
     samples, here = clean
     solved: list[int] = []
 
-    def counted(*given: Any) -> Detail:
+    def counted(*given: Any, **named: Any) -> Detail:
         solved.append(len(given[1]))
-        return solve_by_blocks(*given)
+        return solve_by_blocks(*given, **named)
 
     monkeypatch.setattr(adaptive, "solve_by_blocks", counted)
     monkeypatch.setattr(BlockParameters, "process_points", len(samples))

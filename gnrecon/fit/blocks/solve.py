@@ -10,6 +10,7 @@ Entries: `fit_large`, and `solve_by_blocks` where length and noise are known.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from gnrecon.field.partition_of_unity import Detail, Partition
 from gnrecon.field.random_features import Features
 from gnrecon.fit.blocks.block_parameters import BlockParameters
 from gnrecon.fit.blocks.store import WorkFolder
-from gnrecon.fit.blocks.workers import solve_blocks, solve_on_cluster
+from gnrecon.fit.blocks.workers import Workers, solve_blocks, solve_on_cluster
 from gnrecon.fit.field_model import NeuralSDF
 from gnrecon.fit.fit_options import FitOptions
 from gnrecon.fit.global_field import FieldResiduals
@@ -37,7 +38,6 @@ from gnrecon.geometry.arrays import Float, Int, Mask
 from gnrecon.geometry.octree import morton_codes, octree_blocks
 from gnrecon.geometry.point_cloud import Samples
 from gnrecon.runtime.chunks import slices
-from gnrecon.runtime.parallel import worker_count
 from gnrecon.runtime.progress import ProgressCallback, ignore_progress, subrange
 
 
@@ -50,7 +50,8 @@ def fit_large(
     folder: str | Path | None = None,
     advance: ProgressCallback = ignore_progress,
     scheduler: str | None = None,
-    block_points: int = BlockParameters.block_points,
+    workers: Workers | None = None,
+    block_points: int | None = None,
 ) -> Detail:
     """Return the local fields to add to a global field.
 
@@ -63,8 +64,9 @@ def fit_large(
     rng : draws the features
     folder : where the work is saved, so that the same fit can resume; by default a temporary one
     advance : called with the share that is done
-    scheduler : address of a Dask scheduler whose workers see the folder; by default local processes solve the blocks
-    block_points : points of a block at most
+    scheduler : address of a Dask scheduler whose workers see the folder and solve the blocks
+    workers : local processes that do; by default this process solves them
+    block_points : points of a block at most; by default a share of all, so that processes end at about the same time
 
     Raises
     ------
@@ -79,7 +81,7 @@ def fit_large(
     advance(chosen)
     sdf, residuals = with_coarser(sdf, residuals, hyperparameters, rng, options.device)
     field = sdf, residuals, hyperparameters, options.features, rng, options.device, subrange(advance, chosen, 1.0)
-    return solve_by_blocks(*field, options.seed, folder, scheduler, block_points)
+    return solve_by_blocks(*field, options.seed, folder, scheduler, workers, block_points)
 
 
 def solve_by_blocks(
@@ -93,7 +95,8 @@ def solve_by_blocks(
     seed: int = 0,
     folder: str | Path | None = None,
     scheduler: str | None = None,
-    block_points: int = BlockParameters.block_points,
+    workers: Workers | None = None,
+    block_points: int | None = None,
 ) -> Detail:
     """Return the local fields to add to a global field, for known hyperparameters.
 
@@ -103,12 +106,14 @@ def solve_by_blocks(
         samples, and their length and noise
     features : of each cube
     seed : of the fit, which the work folder notes
-    rng, device, advance, folder, scheduler, block_points : as in `fit_large`, which says what it raises, too
+    rng, device, advance, folder, scheduler, workers, block_points : as in `fit_large`, which says what it raises, too
     """
     count = feature_count(features, hyperparameters.length, residuals.density.radius)
     drawn = Features.draw(count, rng, torch.zeros(0, dtype=torch.float64, device=device))
     partition = Partition.about(residuals.points, LocalFieldParameters.cube_edge_lengths * hyperparameters.length)
-    arrays, facts = _task_data(sdf, residuals, hyperparameters, drawn, partition, block_points)
+    arrays, facts = _task_data(
+        sdf, residuals, hyperparameters, drawn, partition, block_points or _most_points(len(residuals))
+    )
     with _work_folder(folder) as path:
         work = WorkFolder.open(path, arrays, facts | {"seed": seed})
         blocks = len(arrays["ends"]) - 1
@@ -117,9 +122,15 @@ def solve_by_blocks(
         if scheduler is not None and missing:
             solve_on_cluster(work, missing, scheduler, advance)
         else:
-            # As many processes as threads: the option, or by default the cores.
-            solve_blocks(work, missing, worker_count(), device, advance)
+            solve_blocks(work, missing, workers, device, advance)
         return replace(_assembled(work, blocks, arrays["keys"], partition, drawn, hyperparameters), coarser=sdf.detail)
+
+
+def _most_points(
+    points: int, *, least_blocks: int = BlockParameters.least_blocks, most: int = BlockParameters.block_points
+) -> int:
+    """Return how many points a block of a scan of so many has at most."""
+    return min(math.ceil(points / least_blocks), most)
 
 
 @contextmanager

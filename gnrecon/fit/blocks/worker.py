@@ -1,37 +1,112 @@
-"""``python -m gnrecon.fit.blocks.worker FOLDER``: solves the blocks of a work folder whose numbers it reads from stdin.
+"""``python -m gnrecon.fit.blocks.worker IN,OUT ...``: a process for each pair of file descriptors, which solves blocks.
 
-The answer to each line is a line: ``done``, or the error. The process ends when its input does, and so with the process
-that started it, however that ends.
+Libraries are imported once: then the first process forks the others. Each reads lines of JSON, ``[folder, block]``, and
+answers each by a line: ``done``, or the error. It ends when its input does, and so with the process that started it,
+however that ends. The first one ends all when it is asked to terminate, and ends as another one did that died.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import sys
+from collections.abc import Sequence
+from types import FrameType
+from typing import NoReturn
 
 from gnrecon.fit.blocks.block import solve_block
+from gnrecon.runtime.interrupts import die_with_parent
 from gnrecon.runtime.parallel import fixed_sums
 
 DONE = "done"
 """Answer of a worker that has solved a block."""
 
 
-def main(folder: str) -> None:
-    """Solve the requested blocks with one thread, so that processes do not compete for cores."""
+class _Forked:
+    """The processes that the first one has forked."""
+
+    def __init__(self) -> None:
+        self._running: list[int] = []
+        signal.signal(signal.SIGTERM, self._terminate)
+        signal.signal(signal.SIGCHLD, self._end_as_another)
+
+    def is_forked(self) -> bool:
+        """Fork a process, and return whether it is this one."""
+        parent = os.getpid()
+        if pid := os.fork():
+            self._running.append(pid)
+            return False
+        for number in (signal.SIGTERM, signal.SIGCHLD):
+            signal.signal(number, signal.SIG_DFL)
+        die_with_parent(parent)
+        return True
+
+    def _kill(self) -> None:
+        """Kill those that run and reap them: where nothing reaps orphans, they would stay as zombies."""
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for pid in self._running:
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+
+    def _terminate(self, number: int, frame: FrameType | None) -> NoReturn:
+        del frame
+        self._kill()
+        os._exit(128 + number)
+
+    def _end_as_another(self, number: int, frame: FrameType | None) -> None:
+        """End as a process did that failed; others have come to the end of their input."""
+        del number, frame
+        for pid in self._running[:]:
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if not ended:
+                continue
+            self._running.remove(pid)
+            code = os.waitstatus_to_exitcode(status)
+            if code != 0:
+                self._kill()
+            if code < 0:
+                os.kill(os.getpid(), -code)
+            if code != 0:
+                os._exit(abs(code))
+
+
+def main(pairs: Sequence[tuple[int, int]]) -> NoReturn:
+    """Solve the requested blocks in this process, and in one more for each further pair of an input and an output."""
     # Ctrl-C reaches the whole process group: the parent decides what ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with fixed_sums(1), os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8") as answers:
-        # Output of libraries must not be taken for an answer.
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        for line in sys.stdin:
+    forked = _Forked()
+    own = next((pair for pair in pairs[1:] if forked.is_forked()), pairs[0])
+    for pair in pairs:
+        if pair != own:
+            os.close(pair[0])
+            os.close(pair[1])
+    code = 1
+    try:
+        _solve_requested(*own)
+        code = 0
+    finally:
+        # Skips what the libraries do at the end, which is slow.
+        os._exit(code)
+
+
+def _solve_requested(requests: int, answers: int) -> None:
+    """Solve the requested blocks with one thread, so that processes do not compete for cores."""
+    with (
+        fixed_sums(1),
+        os.fdopen(requests, encoding="utf-8") as lines,
+        os.fdopen(answers, "w", encoding="utf-8") as output,
+    ):
+        for line in lines:
             try:
-                solve_block(folder, int(line))
+                solve_block(*json.loads(line))
                 answer = DONE
             except Exception as error:  # sent to the parent, which raises it
                 answer = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            print(answer, file=answers, flush=True)
+            print(answer, file=output, flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main([(int(one), int(other)) for one, other in (pair.split(",") for pair in sys.argv[1:])])
