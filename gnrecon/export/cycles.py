@@ -116,6 +116,9 @@ def short_loops(
     # It imports torch, which checking a mesh does not need.
     from gnrecon.runtime.parallel import map_in_threads
 
+    # By V - E + F = 2 (components - genus), with three edges for two faces: without a handle, every loop separates.
+    if len(mesh.vertices) - len(mesh.faces) // 2 == 2 * (1 + int(face_components(mesh).max(initial=-1))):
+        return []
     graph = _Graph.of(mesh, rng)
     crossed = np.unique(graph.ends[graph.signatures != 0])
     sources = _thin(graph.vertices, crossed[sought[crossed]], longest, source_spacing)
