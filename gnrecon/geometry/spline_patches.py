@@ -28,6 +28,7 @@ Firth, *An overview of composite likelihood methods* (2011), for sums over patch
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
@@ -42,7 +43,7 @@ from gnrecon.runtime.chunks import slices
 class SplineParameters:
     """Tuning constants of `smoothest_normals`."""
 
-    most_points: int = 6000  # of a scan, whose forms take 250 MB
+    most_points: int = 6000  # of a scan whose normals are found, as their forms take 250 MB
     patch_points: int = 16  # with 12 normals are off by a twentieth more, with 20 by a fiftieth less
     group_patches: int = 128  # handled at a time, in one thread
     noises_disk_radii: tuple[float, ...] = (0.14, 0.4)  # that are compared with none; below 0.07, none is likelier
@@ -82,18 +83,40 @@ def smoothest_normals(
     normals : array of shape (N, 3), unit vectors, a first guess, which decides the side
     parameters : tuning constants
     """
-    centred = points - points.mean(axis=0)
-    scaled = centred / np.abs(centred).max()
-    some = _regions(scaled, parameters)
-    patches = _SplinePatches(scaled, some, parameters)
+    if not are_exact(points, normals, parameters=parameters):
+        return None
+    patches = _SplinePatches(_scaled(points), np.arange(len(points)), parameters)
     exact = patches.fit(normals, 0.0)
-    for noise in parameters.noises_disk_radii:
-        if patches.fit(normals, noise * patches.radius).log_likelihood > exact.log_likelihood:
-            return None
-    if len(some) < len(points):
-        patches = _SplinePatches(scaled, np.arange(len(points)), parameters)
-        exact = patches.fit(normals, 0.0)
     return SmoothestNormals(exact.normals, patches.deviations(exact))
+
+
+def are_exact(points: Float, normals: Float, *, parameters: SplineParameters = SplineParameters()) -> bool:
+    """Return whether noise is no likelier than none, in some regions of the scan.
+
+    The parameters are those of `smoothest_normals`.
+    """
+    scaled = _scaled(points)
+    centers = _regions(scaled, parameters)
+    # The patches about the centers have no other points than these.
+    used = np.unique(_nearest(scaled, centers, parameters)[1])
+    patches, normals = _SplinePatches(scaled[used], np.searchsorted(used, centers), parameters), normals[used]
+    exact = patches.fit(normals, 0.0).log_likelihood
+    noises = (each * patches.radius for each in parameters.noises_disk_radii)
+    return all(patches.fit(normals, noise).log_likelihood <= exact for noise in noises)
+
+
+def _scaled(points: Float) -> Float:
+    """Return the points in a cube of edge two about their mean."""
+    centred = points - points.mean(axis=0)
+    scaled: Float = centred / np.abs(centred).max()
+    return scaled
+
+
+def _nearest(points: Float, centers: Int, parameters: SplineParameters) -> tuple[Float, Int]:
+    """Return the distances and rows of the points of the patches about some, of shape (B, k), nearest first."""
+    ranks = list(range(1, min(parameters.patch_points, len(points)) + 1))
+    distance, near = cKDTree(points).query(points[centers], ranks)
+    return np.asarray(distance), np.asarray(near)
 
 
 def _regions(points: Float, parameters: SplineParameters) -> Int:
@@ -136,10 +159,9 @@ class _SplinePatches:
 
         self._map = map_in_threads
         self.parameters = parameters
-        ranks = list(range(1, min(parameters.patch_points, len(points)) + 1))
-        distance, near = cKDTree(points).query(points[centers], ranks)
+        distance, near = _nearest(points, centers, parameters)
         reach = distance[:, -1]
-        self.radius = float(np.median(reach)) / len(ranks) ** 0.5
+        self.radius = float(np.median(reach)) / near.shape[1] ** 0.5
         """Of the disk that a point stands for, in the unit of the points."""
         groups = slices(len(centers), parameters.group_patches)
         self._groups = self._map(lambda rows: _Group(points, near[rows], reach[rows], parameters), groups)
@@ -203,11 +225,18 @@ class _Group:
         # The determinant of the whole system is that of A, times that of the linear functions' products.
         self.log_det = np.linalg.slogdet(system)[1] - np.linalg.slogdet(linear.transpose(0, 2, 1) @ linear)[1]
         inverse = np.linalg.inv(system)
-        # A ratio r changes the values' diagonal alone: J - J_gf (1 / r + J_ff)^-1 J_fg, by the eigenvalues of J_ff.
-        values, axes = np.linalg.eigh(inverse[:, :k, :k])
-        self.values = np.maximum(values, 0.0)
-        self.mixed = axes.transpose(0, 2, 1) @ inverse[:, :k, k : 4 * k]
+        self._of_values = inverse[:, :k, : 4 * k].copy()
         self.least = inverse[:, k : 4 * k, k : 4 * k].copy()
+
+    @cached_property
+    def _modes(self) -> tuple[Float, Float]:
+        """The eigenvalues of J_ff, of shape (B, k), and J_fg along its eigenvectors, of shape (B, k, 3k).
+
+        A ratio r changes the values' diagonal alone: J - J_gf (1 / r + J_ff)^-1 J_fg. Without noise, it has no effect.
+        """
+        k = self.near.shape[1]
+        values, axes = np.linalg.eigh(self._of_values[:, :, :k])
+        return np.maximum(values, 0.0), axes.transpose(0, 2, 1) @ self._of_values[:, :, k:]
 
     def likeliest(self, normals: Float, noise: float) -> _Likeliest:
         """Return the likeliest ratio, the amplitude and the log likelihood of each patch, of shape (B,)."""
@@ -215,22 +244,27 @@ class _Group:
         freedom = 4 * k - 4 - 2 * k
         flat = normals[self.near].reshape(len(self.near), -1)
         planes = self._tangent_planes(normals)
-        hessian, off = planes.transpose(0, 2, 1) @ (self.least @ planes), self.mixed @ planes
-        less = off @ np.linalg.solve(hessian, off.transpose(0, 2, 1))
+        hessian = planes.transpose(0, 2, 1) @ (self.least @ planes)
         log_hessian = np.linalg.slogdet(hessian)[1]
         energy = (flat * (self.least @ flat[:, :, None])[:, :, 0]).sum(axis=1)
-        squares = (self.mixed @ flat[:, :, None])[:, :, 0] ** 2
+        if not noise:
+            # The ratio is the least one, and the amplitude is free.
+            amplitudes = np.maximum(energy / freedom, self.parameters.least_amplitude)
+            density = freedom * np.log(amplitudes) + self.log_det + energy / amplitudes + log_hessian
+            return np.full(len(flat), self.parameters.ratios[0]), amplitudes, -0.5 * density
+        values, mixed = self._modes
+        off = mixed @ planes
+        less = off @ np.linalg.solve(hessian, off.transpose(0, 2, 1))
+        squares = (mixed @ flat[:, :, None])[:, :, 0] ** 2
         best = np.full(len(flat), -np.inf)
         ratios, amplitudes = np.full(len(flat), self.parameters.ratios[0]), np.ones(len(flat))
-        for ratio in self.parameters.ratios if noise else self.parameters.ratios[:1]:
+        for ratio in self.parameters.ratios:
             share = self._share(np.full(len(flat), ratio))
             rest = energy - (share * squares).sum(axis=1)
-            # Without noise, the amplitude is free.
-            amplitude = (noise / self.reach) ** 2 / ratio if noise else rest / freedom
-            amplitude = np.maximum(amplitude, self.parameters.least_amplitude)
+            amplitude = np.maximum((noise / self.reach) ** 2 / ratio, self.parameters.least_amplitude)
             root = np.sqrt(share)
             lost = np.linalg.slogdet(np.eye(k) - root[:, :, None] * less * root[:, None, :])[1]
-            log_det = self.log_det + np.log1p((ratio - self.parameters.ratios[0]) * self.values).sum(axis=1)
+            log_det = self.log_det + np.log1p((ratio - self.parameters.ratios[0]) * values).sum(axis=1)
             density = -0.5 * (freedom * np.log(amplitude) + log_det + rest / amplitude + log_hessian + lost)
             better = density > best
             best, ratios = np.where(better, density, best), np.where(better, ratio, ratios)
@@ -239,9 +273,11 @@ class _Group:
 
     def form(self, ratios: Float, amplitudes: Float) -> Float:
         """Return the energies' quadratic forms over their amplitudes, of shape (B, 3k, 3k)."""
-        scaled = self.mixed * self._share(ratios)[:, :, None]
-        forms: Float = (self.least - self.mixed.transpose(0, 2, 1) @ scaled) / amplitudes[:, None, None]
-        return forms
+        forms, shares = self.least, self._share(ratios)
+        if shares.any():
+            mixed = self._modes[1]
+            forms = forms - mixed.transpose(0, 2, 1) @ (mixed * shares[:, :, None])
+        return forms / amplitudes[:, None, None]
 
     def first_variances(self, normals: Float, ratios: Float, amplitudes: Float) -> Float:
         """Return the variance of each patch's first normal along a tangent, of shape (B,), squared radians."""
@@ -272,7 +308,9 @@ class _Group:
     def _share(self, ratios: Float) -> Float:
         """Return what ratios of shape (B,) subtract from a form along the eigenvectors of J_ff, of shape (B, k)."""
         more = (ratios - self.parameters.ratios[0])[:, None]
-        shares: Float = more / (1.0 + more * self.values)
+        if not more.any():
+            return np.zeros(self.near.shape)
+        shares: Float = more / (1.0 + more * self._modes[0])
         return shares
 
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from gnrecon.geometry.arrays import Float
 from gnrecon.geometry.point_cloud import PointCloud
-from gnrecon.geometry.spline_patches import SplineParameters, smoothest_normals
+from gnrecon.geometry.spline_patches import SplineParameters, are_exact, smoothest_normals
 from gnrecon.ingest.ingest_parameters import IngestParameters, OrientationParameters
 from gnrecon.ingest.line_scans import lie_on_lines
 from gnrecon.ingest.normal_agreement import Agreement, agreement_of
@@ -58,7 +58,8 @@ class Orientation:
         surface with outward normals; on an open surface, most neighbours do not face the other way; by origins, the
         line of sight is clear of the tangent plane; None for given signs
     flipped : share in [0, 1] of the given normals that were flipped
-    clean : whether the points have no noise that matters, where that was found with the normals
+    clean : whether the points have no noise that matters, where that is known; of many points, whose normals are not
+        those of the smoothest surface, only True is known
     deviations : array of shape (N,), standard deviations of the normals along each tangent, radians, if they are known
     """
 
@@ -109,13 +110,18 @@ def oriented_normals(
     if seen is not None:
         return Orientation(seen[0], "estimated, oriented by origins", seen[1])
     normals, disorder = _by_shape(centred, axes, along is None, parameters)
-    clean, deviations = None, None
+    clean: bool | None = None
+    deviations = None
     # The nearest points of a point on a line are those of the line, which span no surface.
-    if along is None and len(points) <= most_points and not lie_on_lines(centred, parameters=parameters.lines):
-        smoothest = smoothest_normals(centred, normals)
-        clean = smoothest is not None
-        if smoothest is not None:
-            normals, deviations = smoothest.normals, smoothest.deviations
+    if along is None and not lie_on_lines(centred, parameters=parameters.lines):
+        if len(points) > most_points:
+            # Creases of a dense scan may pass for noise here; its pairs of points tell more.
+            clean = are_exact(centred, normals) or None
+        else:
+            smoothest = smoothest_normals(centred, normals)
+            clean = smoothest is not None
+            if smoothest is not None:
+                normals, deviations = smoothest.normals, smoothest.deviations
     if disorder <= parameters.orientation.most_disorder:
         how, confidence = "estimated", winding_agreement(centred, normals)
         return Orientation(normals, how, confidence, clean=clean, deviations=deviations)

@@ -124,6 +124,15 @@ def test_estimated_normals_of_few_exact_points_are_those_of_the_smoothest_surfac
     assert found.mean() < 0.5 * by_winding.mean()
 
 
+def test_many_points_are_exact_or_it_is_unknown() -> None:
+    points, normals = torus(2000, np.random.default_rng(3))
+    height = 0.01 * np.random.default_rng(4).standard_normal((2000, 1))
+    exact, noisy = (oriented_normals(each, most_points=1000) for each in (points, points + height * normals))
+    assert exact.clean is True
+    assert noisy.clean is None  # heights of pairs of points decide
+    assert exact.deviations is None
+
+
 @pytest.mark.parametrize("name", ["kitten", "mug"])
 def test_real_sparse_clouds_are_oriented_as_the_truth(name: str) -> None:
     points = read_cloud(stored(f"vipss500/{name}.xyz")).points
