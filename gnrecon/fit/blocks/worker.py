@@ -64,13 +64,12 @@ class _Forked:
             if not ended:
                 continue
             self._running.remove(pid)
-            code = os.waitstatus_to_exitcode(status)
-            if code != 0:
-                self._kill()
+            if (code := os.waitstatus_to_exitcode(status)) == 0:
+                continue
+            self._kill()
             if code < 0:
                 os.kill(os.getpid(), -code)
-            if code != 0:
-                os._exit(abs(code))
+            os._exit(abs(code))
 
 
 def main(pairs: Sequence[tuple[int, int]]) -> NoReturn:
