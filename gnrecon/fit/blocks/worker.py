@@ -28,25 +28,27 @@ class _Forked:
     """The processes that the first one has forked."""
 
     def __init__(self) -> None:
-        self._running: list[int] = []
-        signal.signal(signal.SIGTERM, self._terminate)
-        signal.signal(signal.SIGCHLD, self._end_as_another)
+        self._running = set[int]()
 
     def is_forked(self) -> bool:
         """Fork a process, and return whether it is this one."""
         parent = os.getpid()
         if pid := os.fork():
-            self._running.append(pid)
+            self._running.add(pid)
             return False
-        for number in (signal.SIGTERM, signal.SIGCHLD):
-            signal.signal(number, signal.SIG_DFL)
         die_with_parent(parent)
         return True
+
+    def watch(self) -> None:
+        """End with the others, and as one of them that died."""
+        signal.signal(signal.SIGTERM, self._terminate)
+        signal.signal(signal.SIGCHLD, self._end_as_another)
+        self._end_as_another()  # one may have died before
 
     def _kill(self) -> None:
         """Kill those that run and reap them: where nothing reaps orphans, they would stay as zombies."""
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        for pid in self._running:
+        for pid in list(self._running):
             with contextlib.suppress(ProcessLookupError, ChildProcessError):
                 os.kill(pid, signal.SIGKILL)
                 os.waitpid(pid, 0)
@@ -56,14 +58,17 @@ class _Forked:
         self._kill()
         os._exit(128 + number)
 
-    def _end_as_another(self, number: int, frame: FrameType | None) -> None:
+    def _end_as_another(self, number: int = signal.SIGCHLD, frame: FrameType | None = None) -> None:
         """End as a process did that failed; others have come to the end of their input."""
         del number, frame
-        for pid in self._running[:]:
-            ended, status = os.waitpid(pid, os.WNOHANG)
+        for pid in list(self._running):
+            try:
+                ended, status = os.waitpid(pid, os.WNOHANG)
+            except ChildProcessError:  # reaped by the same handler, while it was interrupted here
+                continue
             if not ended:
                 continue
-            self._running.remove(pid)
+            self._running.discard(pid)
             if (code := os.waitstatus_to_exitcode(status)) == 0:
                 continue
             self._kill()
@@ -78,6 +83,8 @@ def main(pairs: Sequence[tuple[int, int]]) -> NoReturn:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     forked = _Forked()
     own = next((pair for pair in pairs[1:] if forked.is_forked()), pairs[0])
+    if own == pairs[0]:
+        forked.watch()
     for pair in pairs:
         if pair != own:
             os.close(pair[0])
