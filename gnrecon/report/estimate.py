@@ -3,15 +3,15 @@
 Processor seconds, fitted to runs with one thread of scans of 500 to 100,000 points, rippled balls, machine parts,
 organic shapes and range scans, in three qualities and at three resolutions:
 
-    start  2.5 s, and 1 s for each 40,000 points that are read
-    fit    7 s (points / 500)^0.33 (0.4 for the network, except in draft quality, + 0.51 + 0.09 (features / 300)^2)
-    mesh   6.5 s (cells / 256)^2.9 (0.7 + 0.3 features / 300)
+    start  2 s, and 1 s for each 40,000 points that are read
+    fit    5 s (1.25 s in draft quality), and 0.5 s for each 1,000 points (0.65 + 0.35 (features / 300)^2)
+    mesh   3.6 s (cells / 256)^2.9 (0.7 + 0.3 features / 300)
 
 A resolution of the user's own is taken as it is, while noise may lower the usual one: so the power is above two. Two
-idle cores take 0.7 of the sum. Nine of ten runs were within a factor of 1.8 of what is expected on one machine: smooth
-shapes take half as long as others with as many points. One machine took 1.5 times as long as another, and the
-constants lie between them. The peak of resident memory was 0.45 to 1 GB in the fit, and in the mesh 0.4 GB and 1.1 to
-2.1 GB (cells / 512)^2, less in a long and thin box; the points themselves matter only from millions on.
+idle cores take 0.7 of the sum. Of 35 runs on an EPYC (Zen 5), nine of ten were within a factor of 1.6 of what is
+expected: smooth shapes take less than others with as many points, scans without normals more. One machine took 1.5
+times as long as another. The peak of resident memory was 0.45 to 1 GB in the fit, and in the mesh 0.4 GB and 1.1 to 2.1
+GB (cells / 512)^2, less in a long and thin box; the points themselves matter only from millions on.
 `./scripts/bench estimate` compares runs with what is expected of them.
 """
 
@@ -74,8 +74,8 @@ def estimate(
         return None
     cells, detail = options.mesh().cells(bounds), fit.features / model.detail_features
     starting = model.start_seconds + read / model.read_points_per_second
-    parts_of_fit = model.network_share * fit.fits_network + (1.0 - model.network_share) * (0.85 + 0.15 * detail**2)
-    fitting = model.fit_seconds * (points / model.fit_points) ** model.fit_exponent * parts_of_fit
+    fitting = model.fit_seconds * (1.0 if fit.fits_network else 1.0 - model.network_share)
+    fitting += model.fit_point_seconds * points * (0.65 + 0.35 * detail**2)
     meshing = model.mesh_seconds * (cells / model.mesh_cells) ** model.mesh_exponent * (0.7 + 0.3 * detail)
     seconds = model.two_core_share * (starting + fitting + meshing)
     mesh_memory = mesh_memory_mb(cells, bounds, model=model)

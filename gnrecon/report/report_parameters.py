@@ -12,13 +12,12 @@ class CostModel:
     Times are processor seconds of one thread, of scans of 500 to 100,000 points at three qualities and resolutions.
     """
 
-    start_seconds: float = 2.5  # measured: imports and the first stages of a small scan
+    start_seconds: float = 2.0  # measured: imports and the first stages of a small scan
     read_points_per_second: float = 40_000.0  # measured: reading and cleaning
-    fit_seconds: float = 7.0  # measured: fit of `fit_points` with `detail_features` and a network
-    fit_points: int = 500  # the smallest cloud measured
-    fit_exponent: float = 0.33  # slope of log time over log points in the measurements
-    network_share: float = 0.4  # of the fit, which draft quality saves
-    mesh_seconds: float = 6.5  # measured: mesh of `mesh_cells` with `detail_features`
+    fit_seconds: float = 5.0  # measured: fit of the global field and of few local ones
+    network_share: float = 0.75  # of it, which draft quality saves
+    fit_point_seconds: float = 0.5e-3  # measured: local fields of each point, with `detail_features`
+    mesh_seconds: float = 3.6  # measured: mesh of `mesh_cells` with `detail_features`
     mesh_cells: int = 256  # the usual resolution of 10,000 points and more
     mesh_exponent: float = 2.9  # slope of log time over log cells, where noise may lower the usual resolution
     detail_features: int = 300  # features per cube with --quality normal

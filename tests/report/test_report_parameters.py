@@ -25,7 +25,9 @@ def test_parameters_are_frozen_and_used(parameters: Any) -> None:
     assert_frozen(parameters)
 
 
-@pytest.mark.parametrize("name", ["start_seconds", "fit_seconds", "mesh_seconds", "two_core_share", "fit_exponent"])
+@pytest.mark.parametrize(
+    "name", ["start_seconds", "fit_seconds", "mesh_seconds", "two_core_share", "fit_point_seconds"]
+)
 def test_the_cost_model_makes_the_estimate(name: str) -> None:
     box, options, model = np.array([[0.0, 0, 0], [1, 1, 1]]), Options(resolution=200), CostModel()
     usual = estimate(2000, 2000, box, options)
