@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gnrecon.field.partition_of_unity import Partition
+from gnrecon.field.partition_of_unity import Partition, lattice_codes
 from gnrecon.field.random_features import Features, Stencil
 from gnrecon.geometry.arrays import Float, Int, Mask
 
@@ -94,21 +94,18 @@ class NodeGrid:
         centers, offsets : arrays of shape (C, 3) and (K, 3), of the blocks, and of their nodes from these
         block, inner : arrays of shape (Q,), the rows of these that each node has
         """
-        edge, every = self.block * stride, np.arange(self.block)
+        edge = self.block * stride
         blocks = nodes // edge
         _, rows, of = np.unique(_codes(blocks), return_index=True, return_inverse=True)
         middle = stride * (self.block - 1) / 2
-        offsets = np.stack(np.meshgrid(*3 * [stride * every - middle], indexing="ij"), axis=-1).reshape(-1, 3)
+        offsets = stride * _places(self.block) - middle
         inner = np.ravel_multi_index(tuple((nodes % edge // stride).T), 3 * (self.block,))
         return self.places(edge * blocks[rows]) + self.step * middle, self.step * offsets, of, inner
 
     @cached_property
     def lattice(self) -> CubeLattice:
         """The nodes of a cube."""
-        corners, offsets = (
-            np.stack(np.meshgrid(*3 * [np.arange(float(count))], indexing="ij"), axis=-1).reshape(-1, 3)
-            for count in (self.blocks, self.block)
-        )
+        corners, offsets = _places(self.blocks), _places(self.block)
         first = (0.5 - self.beyond) * self.step - self.partition.cell / 2
         return CubeLattice(first + self.step * self.block * corners, self.step * offsets)
 
@@ -122,6 +119,11 @@ class NodeGrid:
         """Return values at a cube's nodes, of shape (blocks * block,) * 3, in the order of the blocks, flat."""
         flat: npt.NDArray[Value] = values.reshape(3 * (self.blocks, self.block)).transpose(0, 2, 4, 1, 3, 5).ravel()
         return flat
+
+
+def _places(count: int) -> Float:
+    """Return the places of a lattice of so many along each edge, from its first, of shape (count^3, 3)."""
+    return np.stack(np.meshgrid(*3 * [np.arange(float(count))], indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def cube_groups(keys: Int, edge: int) -> list[Int]:
@@ -140,5 +142,4 @@ def equal_rows(values: Int) -> list[Int]:
 
 def _codes(values: Int) -> Int:
     """Return a number for each row of an array of shape (B, 3), in the rows' order."""
-    codes: Int = np.ravel_multi_index(tuple((values - values.min(axis=0)).T), tuple(np.ptp(values, axis=0) + 1))
-    return codes
+    return lattice_codes(values - values.min(axis=0), np.ptp(values, axis=0) + 1)

@@ -354,7 +354,7 @@ class Detail:
             return np.full(len(keys), -1)
         low, extent, known, row = self._lookup
         inside = ((keys >= low) & (keys < low + extent)).all(axis=1)
-        codes = _codes(keys[inside] - low, extent)
+        codes = lattice_codes(keys[inside] - low, extent)
         at = np.minimum(np.searchsorted(known, codes), len(self) - 1)
         rows = np.full(len(keys), -1)
         rows[inside] = np.where(known[at] == codes, row[at], -1)
@@ -364,12 +364,12 @@ class Detail:
     def _lookup(self) -> tuple[Int, Int, Int, Int]:
         """The smallest key, the extent of the keys along each axis, the sorted codes of the cubes, and their rows."""
         low, extent = self.keys.min(axis=0), np.ptp(self.keys, axis=0) + 1
-        codes = _codes(self.keys - low, extent)
+        codes = lattice_codes(self.keys - low, extent)
         order = np.argsort(codes, kind="stable")
         return low, extent, codes[order], order
 
 
-def _codes(keys: Int, extent: Int) -> Int:
+def lattice_codes(keys: Int, extent: Int) -> Int:
     """Return one number for each key, of shape (N, 3), of a lattice with `extent` cells along each axis."""
     codes: Int = (keys[:, 0] * extent[1] + keys[:, 1]) * extent[2] + keys[:, 2]
     return codes

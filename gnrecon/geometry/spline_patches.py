@@ -83,10 +83,15 @@ def smoothest_normals(
     normals : array of shape (N, 3), unit vectors, a first guess, which decides the side
     parameters : tuning constants
     """
-    if not are_exact(points, normals, parameters=parameters):
+    scaled = _scaled(points)
+    centers = _regions(scaled, parameters)
+    found = _exact_fit(scaled, normals, centers, parameters)
+    if found is None:
         return None
-    patches = _SplinePatches(_scaled(points), np.arange(len(points)), parameters)
-    exact = patches.fit(normals, 0.0)
+    patches, exact = found
+    if len(centers) < len(points):
+        patches = _SplinePatches(scaled, np.arange(len(points)), parameters)
+        exact = patches.fit(normals, 0.0)
     return SmoothestNormals(exact.normals, patches.deviations(exact))
 
 
@@ -96,13 +101,21 @@ def are_exact(points: Float, normals: Float, *, parameters: SplineParameters = S
     The parameters are those of `smoothest_normals`.
     """
     scaled = _scaled(points)
-    centers = _regions(scaled, parameters)
+    return _exact_fit(scaled, normals, _regions(scaled, parameters), parameters) is not None
+
+
+def _exact_fit(
+    points: Float, normals: Float, centers: Int, parameters: SplineParameters
+) -> tuple[_SplinePatches, _Fit] | None:
+    """Return the patches about some points and their fit without noise, or None where noise is likelier."""
     # The patches about the centers have no other points than these.
-    used = np.unique(_nearest(scaled, centers, parameters)[1])
-    patches, normals = _SplinePatches(scaled[used], np.searchsorted(used, centers), parameters), normals[used]
-    exact = patches.fit(normals, 0.0).log_likelihood
-    noises = (each * patches.radius for each in parameters.noises_disk_radii)
-    return all(patches.fit(normals, noise).log_likelihood <= exact for noise in noises)
+    used = np.unique(_nearest(points, centers, parameters)[1])
+    patches, normals = _SplinePatches(points[used], np.searchsorted(used, centers), parameters), normals[used]
+    exact = patches.fit(normals, 0.0)
+    for noise in parameters.noises_disk_radii:
+        if patches.fit(normals, noise * patches.radius).log_likelihood > exact.log_likelihood:
+            return None
+    return patches, exact
 
 
 def _scaled(points: Float) -> Float:
